@@ -60,7 +60,17 @@ def _four(builder: Any, values: Any, lanes: list[int]) -> Any:
 
 @intrinsic
 def repeat(typingctx, a, b, c, d):  # type: ignore[no-untyped-def]
-    """a, b, c, d four times over."""
+    """a, b, c, d four times over.
+
+    Parameters
+    ----------
+    a, b, c, d : float32
+
+    Returns
+    -------
+    Float32x16
+        (a, b, c, d, a, b, ...).
+    """
     single = types.float32
     return float32x16(single, single, single, single), lambda context, builder, signature, values: _four(
         builder, values, [i % 4 for i in range(LANES)]
@@ -69,7 +79,17 @@ def repeat(typingctx, a, b, c, d):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def quads(typingctx, a, b, c, d):  # type: ignore[no-untyped-def]
-    """Four times a, four times b, four times c, four times d."""
+    """Four times a, four times b, four times c, four times d.
+
+    Parameters
+    ----------
+    a, b, c, d : float32
+
+    Returns
+    -------
+    Float32x16
+        (a, a, a, a, b, b, ...).
+    """
     single = types.float32
     return float32x16(single, single, single, single), lambda context, builder, signature, values: _four(
         builder, values, [i // 4 for i in range(LANES)]
@@ -78,7 +98,16 @@ def quads(typingctx, a, b, c, d):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def spread(typingctx, a):  # type: ignore[no-untyped-def]
-    """Sixteen times a."""
+    """Sixteen times a.
+
+    Parameters
+    ----------
+    a : float32
+
+    Returns
+    -------
+    Float32x16
+    """
     return float32x16(types.float32), lambda context, builder, signature, values: _four(
         builder, [values[0]] * 4, [0] * LANES
     )
@@ -96,7 +125,19 @@ def _check(array: Any) -> None:
 
 @intrinsic
 def load(typingctx, array, at):  # type: ignore[no-untyped-def]
-    """The sixteen elements from `at` on; nothing checks that the array has them."""
+    """The sixteen elements from `at` on; nothing checks that the array has them.
+
+    Parameters
+    ----------
+    array : float32 array
+        Contiguous.
+    at : int64
+        Index in its memory.
+
+    Returns
+    -------
+    Float32x16
+    """
     _check(array)
 
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
@@ -107,7 +148,16 @@ def load(typingctx, array, at):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def store(typingctx, array, at, value):  # type: ignore[no-untyped-def]
-    """Put sixteen elements at `at`."""
+    """Put sixteen elements at `at`; nothing checks that the array has them.
+
+    Parameters
+    ----------
+    array : float32 array
+        Contiguous.
+    at : int64
+        Index in its memory.
+    value : Float32x16
+    """
     _check(array)
 
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
@@ -119,7 +169,16 @@ def store(typingctx, array, at, value):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def fold(typingctx, vector):  # type: ignore[no-untyped-def]
-    """(a, b, c, d): the sums of every fourth element, from the first, second, third and fourth on."""
+    """Sums of every fourth element, from the first, second, third and fourth on.
+
+    Parameters
+    ----------
+    vector : Float32x16
+
+    Returns
+    -------
+    a, b, c, d : float32
+    """
 
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         total = values[0]
@@ -135,7 +194,16 @@ def fold(typingctx, vector):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def lanes(typingctx, vector):  # type: ignore[no-untyped-def]
-    """The sixteen elements as a tuple."""
+    """The sixteen elements as a tuple.
+
+    Parameters
+    ----------
+    vector : Float32x16
+
+    Returns
+    -------
+    tuple of float32
+    """
 
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         at = (ir.Constant(ir.IntType(32), i) for i in range(LANES))

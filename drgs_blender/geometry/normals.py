@@ -133,7 +133,20 @@ def _angle(y, x):  # type: ignore[no-untyped-def]
 
 @inlined
 def face_normal(ux, uy, uz, vx, vy, vz):  # type: ignore[no-untyped-def]
-    """Unit normal and the angles of a face with edges u, v at its first corner; zeros if it has no area."""
+    """Unit normal and the angles of a face with edges u, v at its first corner; zeros if it has no area.
+
+    Parameters
+    ----------
+    ux, uy, uz, vx, vy, vz : float32
+        Edges from the first corner to the second and to the third, m.
+
+    Returns
+    -------
+    nx, ny, nz : float32
+        Unit normal.
+    first, second, third : float32
+        Angles at the corners, radians.
+    """
     zero, one = np.float32(0.0), np.float32(1.0)
     uu, vv, uv = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz, ux * vx + uy * vy + uz * vz
     nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
@@ -153,7 +166,20 @@ def face_normal(ux, uy, uz, vx, vy, vz):  # type: ignore[no-untyped-def]
 
 @inlined
 def vertex_normal(weighted, first, last):  # type: ignore[no-untyped-def]
-    """Unit sum of the weighted normals in some rows, always in the same order."""
+    """Vertex normal: the unit sum of weighted normals of face corners, always in the same order.
+
+    Parameters
+    ----------
+    weighted : (3 m, 3) float32 array
+        Normals times angles, vertex by vertex.
+    first, last : int
+        Rows of the vertex, half-open.
+
+    Returns
+    -------
+    nx, ny, nz : float32
+        Unit; +z where they cancel.
+    """
     x = y = z = np.float32(0.0)
     for i in range(first, last):
         x, y, z = x + weighted[i, 0], y + weighted[i, 1], z + weighted[i, 2]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from ..compute.warp.kernels import Launcher
 from ..core.asset.model import PosedSurfels
-from ..core.frame import Camera
+from ..core.frame import Camera, RenderSettings
 from .denoise.demodulation import Signal
 from .denoise.svgf_spatial import denoise
 from .denoise.svgf_temporal import Shot, denoise_next
@@ -18,13 +18,16 @@ from .gbuffer.camera_hits import MeshHits, shade_mesh, trace_camera
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.surfels import tie_to_mesh
 from .integrator.integrate import integrate
-from .points import Radiance
+from .lights.environment import EnvironmentLight
+from .lights.light_sampler import Lights
+from .points import Radiance, ShadingPoints
 from .scene.trace_scene import TraceScene
 from .surfels.raster import SurfelSamples, rasterise
 from .surfels.splats import Splats, prepare
 from .surfels.surfel_bvh import SurfelBVH
 
 Array = np.ndarray
+Arrays = tuple[Array, ...]
 T = TypeVar("T")
 
 
@@ -49,9 +52,13 @@ class RenderBackend:
         """The result of `on_device`, or that of `on_cpu` where there is no device or it has failed."""
         return on_cpu()
 
-    def integrate(self, *arguments: Any, surfels: SurfelBVH | None = None) -> Radiance:
+    def integrate(
+        self, scene: TraceScene, environment: EnvironmentLight, points: ShadingPoints, settings: RenderSettings,
+        noise_index: int, lights: Lights | None = None, part: tuple[int, int] = (0, 1), *,
+        surfels: SurfelBVH | None = None,
+    ) -> Radiance:  # fmt: skip
         """`integrator.integrate.integrate`."""
-        return integrate(*arguments, surfels=surfels)
+        return integrate(scene, environment, points, settings, noise_index, lights, part, surfels=surfels)
 
     def prepare(self, posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
         """`surfels.splats.prepare`."""
@@ -71,9 +78,29 @@ class RenderBackend:
         """`surfels.raster.rasterise`; of what this backend has prepared."""
         return rasterise(splats, y0, y1)
 
-    def tie(self, scene: TraceScene, *arguments: Any) -> None:
-        """`gbuffer.surfels.tie_to_mesh`."""
-        tie_to_mesh(scene, *arguments)
+    def tie(
+        self, scene: TraceScene, rules: tuple[bool, bool], view_of: tuple[Array, Array, int, int], samples: Arrays,
+        keys: Arrays, frames: Arrays, materials: Arrays, seen: Arrays,
+    ) -> None:  # fmt: skip
+        """`gbuffer.surfels.tie_to_mesh`.
+
+        Parameters
+        ----------
+        scene : TraceScene
+        rules : tuple of bool
+            Whether points are tied at all, and whether there is a mesh.
+        view_of : tuple
+            `camera.camera_parameters`, snap windows (m), and the first column and row of the samples.
+        samples : tuple of array
+            Depth, surface and object, see `SurfelSamples`.
+        keys : tuple of array
+            Pixel, sample and flags of the points.
+        frames, materials : tuple of array
+            Written: origin, normal, geometric normal and view of the points; albedo, roughness and metallic.
+        seen : tuple of array
+            Written: position, depth, object, face, place and barycentric coordinates, see `GBuffer`.
+        """
+        tie_to_mesh(scene, rules, view_of, samples, keys, frames, materials, seen)
 
     def denoise(
         self, components: Array, variance: Array, guides: Guides, split: bool, check: Callable[[], None]

@@ -104,7 +104,20 @@ def camera_parameters(camera: Camera, settings: RenderSettings, noise_index: int
 
 @njit
 def pixel_shift(parameters, pixel):  # type: ignore[no-untyped-def]
-    """Toroidal shift (x, y) in [0, 1) of the sub-pixel lattice of `pixel` (index y * width + x)."""
+    """Toroidal shift of the sub-pixel lattice of a pixel.
+
+    Parameters
+    ----------
+    parameters : (PARAMETERS,) float64 array
+        `camera_parameters`.
+    pixel : int64
+        y * width + x in the full picture.
+
+    Returns
+    -------
+    x, y : float64
+        In [0, 1).
+    """
     h = mix(np.uint32(pixel) ^ np.uint32(np.int64(parameters[SEED])))
     g = mix(h ^ GOLDEN)
     return np.float64(h) * 2.0**-32, np.float64(g) * 2.0**-32
@@ -112,7 +125,22 @@ def pixel_shift(parameters, pixel):  # type: ignore[no-untyped-def]
 
 @inlined
 def lattice(shift_x, shift_y, sample, parameters):  # type: ignore[no-untyped-def]
-    """Position of a pixel's sub-pixel sample: in [0, 1) inside the pixel, or `filter_reach` beyond it."""
+    """Position of a pixel's sub-pixel sample: in [0, 1) inside the pixel, or `filter_reach` beyond it.
+
+    Parameters
+    ----------
+    shift_x, shift_y : float64
+        `pixel_shift` of the pixel.
+    sample : int64
+        Sub-pixel sample.
+    parameters : (PARAMETERS,) float64 array
+        `camera_parameters`.
+
+    Returns
+    -------
+    x, y : float64
+        Pixels, from the pixel's upper left corner.
+    """
     x = shift_x + sample / parameters[SUBPIXELS]
     y = shift_y + sample * _GOLDEN_RATIO
     width = parameters[FILTER]
@@ -121,12 +149,21 @@ def lattice(shift_x, shift_y, sample, parameters):  # type: ignore[no-untyped-de
 
 @njit
 def camera_ray(parameters, px, py):  # type: ignore[no-untyped-def]
-    """World-space ray through pixel position (px, py).
+    """Camera ray through a position in the picture, world space.
+
+    Parameters
+    ----------
+    parameters : (PARAMETERS,) float64 array
+        `camera_parameters`.
+    px, py : float64
+        Pixels, from the upper left corner of the full picture.
 
     Returns
     -------
-    ox, oy, oz, dx, dy, dz : float
-        The direction has length 1 along the view axis, so that the ray's parameter is the depth.
+    ox, oy, oz : float64
+        Origin, world, m.
+    dx, dy, dz : float64
+        Direction, world, of length 1 along the view axis, so that the ray's parameter is the depth.
     """
     p = parameters
     x = (px - p[CX]) / p[FX]
@@ -153,7 +190,22 @@ def camera_ray(parameters, px, py):  # type: ignore[no-untyped-def]
 
 @njit
 def sample_ray(parameters, pixel, sample):  # type: ignore[no-untyped-def]
-    """`camera_ray` through sub-pixel sample `sample` of `pixel` (index y * width + x)."""
+    """`camera_ray` through a sub-pixel sample.
+
+    Parameters
+    ----------
+    parameters : (PARAMETERS,) float64 array
+        `camera_parameters`.
+    pixel : int64
+        y * width + x in the full picture.
+    sample : int64
+        Sub-pixel sample.
+
+    Returns
+    -------
+    ox, oy, oz, dx, dy, dz : float64
+        As of `camera_ray`.
+    """
     width = np.int64(parameters[WIDTH])
     shift_x, shift_y = pixel_shift(parameters, pixel)
     jx, jy = lattice(shift_x, shift_y, sample, parameters)

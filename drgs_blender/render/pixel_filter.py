@@ -24,7 +24,20 @@ def check_filter(width: float) -> None:
 
 @inlined
 def filter_position(u, width):  # type: ignore[no-untyped-def]
-    """Sub-pixel coordinate for a random number `u` in [0, 1): in [0, 1) inside the pixel, `filter_reach` beyond it."""
+    """Sub-pixel coordinate by filter importance sampling.
+
+    Parameters
+    ----------
+    u : float64
+        Random number in [0, 1).
+    width : float64
+        Pixels: `RenderSettings.filter_width`; 0: a box.
+
+    Returns
+    -------
+    float64
+        Pixels: in [0, 1) inside the pixel, `filter_reach` beyond it.
+    """
     if width > 0.0:
         return 0.5 + 2.0 * width * _blackman_harris(u)
     # Just below one, so that adding the pixel's index in float32 stays inside the pixel for pictures of 65536 pixels.
@@ -33,7 +46,18 @@ def filter_position(u, width):  # type: ignore[no-untyped-def]
 
 @inlined
 def filter_reach(width):  # type: ignore[no-untyped-def]
-    """Pixels by which positions may lie beyond the pixel."""
+    """Pixels by which positions may lie beyond the pixel.
+
+    Parameters
+    ----------
+    width : float64
+        Pixels: `RenderSettings.filter_width`.
+
+    Returns
+    -------
+    float64
+        Pixels.
+    """
     return max(width - 0.5, 0.0)
 
 

@@ -65,7 +65,7 @@ class ShadingPoints:
     albedo : (n, 3) float32 array
         In [0, 1]; linear Rec.709.
     roughness, metallic : (n,) float32 array
-        In [0, 1]; linear Rec.709.
+        In [0, 1].
     flags : (n,) uint8 array
         SECOND, CATCHER; 0 when not given.
     own : (n,) int32 array

@@ -27,13 +27,32 @@ _UNIT = F(1.0 / 16777216.0)
 
 @inlined
 def luminance(r, g, b):  # type: ignore[no-untyped-def]
-    """Luminance of linear Rec.709."""
+    """Luminance of a colour.
+
+    Parameters
+    ----------
+    r, g, b : float32
+        Linear Rec.709.
+
+    Returns
+    -------
+    float32
+    """
     return F(LUMINANCE[0]) * r + F(LUMINANCE[1]) * g + F(LUMINANCE[2]) * b
 
 
 @inlined
 def mix(x):  # type: ignore[no-untyped-def]
-    """Hash of a uint32 (the "lowbias32" constants of C. Wellons' search)."""
+    """Hash of a uint32 (the "lowbias32" constants of C. Wellons' search).
+
+    Parameters
+    ----------
+    x : uint32
+
+    Returns
+    -------
+    uint32
+    """
     x = U(x ^ (x >> U(16)))
     x = U(x * U(0x7FEB352D))
     x = U(x ^ (x >> U(15)))
@@ -43,7 +62,17 @@ def mix(x):  # type: ignore[no-untyped-def]
 
 @inlined
 def unit(x):  # type: ignore[no-untyped-def]
-    """float32 in [0, 1) from a uint32."""
+    """Random number in [0, 1), of 24 bits.
+
+    Parameters
+    ----------
+    x : uint32
+        Of which the highest 24 bits count.
+
+    Returns
+    -------
+    float32
+    """
     return F(np.int32(x >> U(8))) * _UNIT
 
 
@@ -51,7 +80,19 @@ def unit(x):  # type: ignore[no-untyped-def]
 def scrambled(number, key):  # type: ignore[no-untyped-def]
     """Owen scrambling of a number given with its bits reversed: each digit is flipped by a hash of those above it.
 
-    The hash is Laine and Karras' with the constants of N. Vegdahl's search.
+    The hash is Laine and Karras' (2011) with the constants of N. Vegdahl's search.
+
+    Parameters
+    ----------
+    number : uint32
+        Coordinate of a Sobol' point, bits reversed.
+    key : uint32
+        Of the point set and the dimension.
+
+    Returns
+    -------
+    uint32
+        Bits in their usual order.
     """
     x = U(number)
     x = U(x ^ U(x * U(0x3D20ADEA)))
@@ -104,7 +145,17 @@ def point_set(count: int) -> Array:
 
 @inlined
 def sincos_turns(q):  # type: ignore[no-untyped-def]
-    """sin and cos of 2 pi q, -2 < q < 2, to 4e-7, by minimax polynomials on an eighth of a turn."""
+    """Sine and cosine of an angle in turns, to 4e-7, by minimax polynomials on an eighth of a turn.
+
+    Parameters
+    ----------
+    q : float32
+        Turns, -2 < q < 2.
+
+    Returns
+    -------
+    s, c : float32
+    """
     turn = np.int32(q * F(4.0) + F(8.5)) - np.int32(8)
     x = q - F(turn) * F(0.25)
     y = x * x
@@ -119,7 +170,17 @@ def sincos_turns(q):  # type: ignore[no-untyped-def]
 
 @inlined
 def fast_acos(x):  # type: ignore[no-untyped-def]
-    """acos to 1e-6 radians, by a minimax polynomial; arguments beyond [-1, 1] are clamped."""
+    """acos to 1e-6 radians, by a minimax polynomial; arguments beyond [-1, 1] are clamped.
+
+    Parameters
+    ----------
+    x : float32
+
+    Returns
+    -------
+    float32
+        Radians.
+    """
     a = min(abs(x), ONE)
     p = F(0.08815665) + a * (F(-0.04588359) + a * (F(0.02056646) + a * F(-0.00488817)))
     y = math.sqrt(ONE - a) * (F(1.57079571) + a * (F(-0.21454126) + a * p))
@@ -128,7 +189,17 @@ def fast_acos(x):  # type: ignore[no-untyped-def]
 
 @inlined
 def fast_atan2_turns(y, x):  # type: ignore[no-untyped-def]
-    """atan2 / 2 pi in [-1/2, 1/2] to 3e-7 turns, by a minimax polynomial."""
+    """atan2 / 2 pi in [-1/2, 1/2] to 3e-7 turns, by a minimax polynomial.
+
+    Parameters
+    ----------
+    y, x : float32
+
+    Returns
+    -------
+    float32
+        Turns.
+    """
     ax, ay = abs(x), abs(y)
     large = max(ax, ay)
     t = min(ax, ay) / large if large > ZERO else ZERO
@@ -144,7 +215,18 @@ def fast_atan2_turns(y, x):  # type: ignore[no-untyped-def]
 
 @inlined
 def basis(nx, ny, nz):  # type: ignore[no-untyped-def]
-    """Two unit tangents of a unit normal (Duff et al. 2017)."""
+    """Two unit tangents of a unit normal (Duff et al. 2017): the tangent frame.
+
+    Parameters
+    ----------
+    nx, ny, nz : float32
+        Unit.
+
+    Returns
+    -------
+    ux, uy, uz, vx, vy, vz : float32
+        Unit, in the frame of the normal; with it, a right-handed frame.
+    """
     sign = ONE if nz >= ZERO else -ONE
     a = -ONE / (sign + nz)
     b = nx * ny * a
@@ -153,7 +235,18 @@ def basis(nx, ny, nz):  # type: ignore[no-untyped-def]
 
 @inlined
 def cosine_hemisphere(u, v):  # type: ignore[no-untyped-def]
-    """Direction about +Z with density z / pi."""
+    """Cosine sampling: a direction with pdf z / pi (PBRT A.5.3).
+
+    Parameters
+    ----------
+    u, v : float32
+        Random numbers in [0, 1): azimuth (in turns), square of the radius.
+
+    Returns
+    -------
+    x, y, z : float32
+        Unit, tangent frame (z is the normal).
+    """
     s, c = sincos_turns(u)
     r = math.sqrt(v)
     return r * c, r * s, math.sqrt(max(ZERO, ONE - v))

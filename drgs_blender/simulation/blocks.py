@@ -125,7 +125,20 @@ class Nodes(NamedTuple):
 
 @inlined
 def block_of(gx, gy, gz, bx, by, bz):  # type: ignore[no-untyped-def]
-    """Number of the block of a place, in grid spacings from the origin; -1 if it is outside or not finite."""
+    """Number of the block of a place.
+
+    Parameters
+    ----------
+    gx, gy, gz : float64
+        Place, in grid spacings from the origin.
+    bx, by, bz : int64
+        `Domain.blocks`.
+
+    Returns
+    -------
+    int64
+        -1 if the place is outside or not finite.
+    """
     low = MARGIN + 0.5
     inside = low <= gx < 4 * (bx - 1) + 0.5 and low <= gy < 4 * (by - 1) + 0.5 and low <= gz < 4 * (bz - 1) + 0.5
     if inside:  # not for NaN

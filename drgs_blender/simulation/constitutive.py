@@ -60,7 +60,19 @@ def _compose(f, p, u, a, b, c, v):  # type: ignore[no-untyped-def]
 
 @inlined
 def neo_hookean(f, p, mu, first, tau):  # type: ignore[no-untyped-def]
-    """tau = mu (F F^T - 1) + lambda log(J) 1, for row p, where `f` holds F - 1."""
+    """Neo-Hookean elasticity: Kirchhoff stress tau = mu (F F^T - 1) + lambda log(J) 1 of one particle.
+
+    Parameters
+    ----------
+    f : (n, 9) float32 array
+        Elastic deformation gradient less 1, row-major.
+    p : int64
+        Particle.
+    mu, first : float32
+        Lame's mu and lambda, Pa.
+    tau : (n, 6) float32 array
+        Row `p` is written, Pa: xx, yy, zz, xy, xz, yz.
+    """
     one = np.float32(1.0)
     a, b, c, d, e, g, h, i, k = one + f[p, 0], f[p, 1], f[p, 2], f[p, 3], one + f[p, 4], f[p, 5], f[p, 6], f[p, 7], one + f[p, 8]  # noqa: E501  # fmt: skip
     j = a * (e * k - g * i) - b * (d * k - g * h) + c * (d * i - e * h)

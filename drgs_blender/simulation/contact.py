@@ -82,7 +82,22 @@ class Surface(NamedTuple):
 
 @inlined
 def respond(v, u, n, contact, friction):  # type: ignore[no-untyped-def]
-    """Velocity of matter that moves at v and touches what moves at u, with unit normal n; all (x, y, z)."""
+    """Contact: velocity of matter after it has touched a surface, with Coulomb's friction.
+
+    Parameters
+    ----------
+    v, u, n : tuple of float
+        (x, y, z), world: velocity of the matter and of the surface, m/s; unit normal of the surface, outwards.
+    contact : int64
+        Index in `CONTACTS`.
+    friction : float
+        Coulomb's coefficient, of "separate".
+
+    Returns
+    -------
+    x, y, z : float
+        Velocity, m/s, world.
+    """
     vx, vy, vz = v
     ux, uy, uz = u
     nx, ny, nz = n

@@ -22,13 +22,21 @@ def _turn(spp, sqq, spq, spr, sqr):  # type: ignore[no-untyped-def]
 
 @njit
 def svd3(f, n):  # type: ignore[no-untyped-def]
-    """A = U diag(sigma) V^T, by Jacobi rotations of A^T A in double precision; row n of `f` is A - 1, row-major.
+    """Singular value decomposition A = U diag(sigma) V^T of a 3 x 3 matrix, by Jacobi rotations of A^T A, in double.
+
+    Parameters
+    ----------
+    f : (k, 9) array
+        Rows are A - 1, row-major.
+    n : int64
+        Row.
 
     Returns
     -------
-    u, sigma, v : tuple of float
-        Nine, three and nine, row-major. V is a rotation; sigma is not sorted and not negative; where A mirrors or is
-        singular, so does U or U has a made-up column.
+    u, v : tuple of float
+        Nine each, row-major. V is a rotation; where A mirrors or is singular, so does U or U has a made-up column.
+    sigma : tuple of float
+        Three, not sorted and not negative; between the two.
     """
     a, b, c = 1.0 + float(f[n, 0]), float(f[n, 1]), float(f[n, 2])
     d, e, g = float(f[n, 3]), 1.0 + float(f[n, 4]), float(f[n, 5])

@@ -124,7 +124,18 @@ def _slope(i, j, k, seed):  # type: ignore[no-untyped-def]
 
 @njit
 def noise(x, y, z, seed):  # type: ignore[no-untyped-def]
-    """Gradient noise, from about -1 to 1 and 0 on average, that varies over a distance of 1."""
+    """Gradient noise (Perlin 1985), from about -1 to 1 and 0 on average, that varies over a distance of 1.
+
+    Parameters
+    ----------
+    x, y, z : float64
+        Position, in units of the noise's size.
+    seed : int64
+
+    Returns
+    -------
+    float64
+    """
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
     a, b, c = x - i, y - j, z - k
     u, v, w = a * a * a * (a * (a * 6 - 15) + 10), b * b * b * (b * (b * 6 - 15) + 10), c * c * c * (c * (c * 6 - 15) + 10)  # noqa: E501  # fmt: skip

@@ -38,7 +38,17 @@ BARE = np.float32(0.1)
 
 @inlined
 def weights_of(f):  # type: ignore[no-untyped-def]
-    """Quadratic B-spline weights of three nodes, `f` from the first one in spacings; they sum to 1 as rounded."""
+    """Quadratic B-spline weights of three nodes along an axis; they sum to 1 as rounded.
+
+    Parameters
+    ----------
+    f : float32
+        Distance from the first node, in grid spacings, 0.5 to 1.5.
+
+    Returns
+    -------
+    first, middle, last : float32
+    """
     a, c = _ONE_HALF - f, f - _HALF
     first, last = _HALF * a * a, _HALF * c * c
     return first, (_ONE - first) - last, last
@@ -46,7 +56,26 @@ def weights_of(f):  # type: ignore[no-untyped-def]
 
 @inlined
 def cell_of(x, p, origin, scale):  # type: ignore[no-untyped-def]
-    """The first of the three nodes around a particle along each axis, and how far after it the particle is."""
+    """The first of the three nodes around a particle along each axis.
+
+    Parameters
+    ----------
+    x : (n, 3) float64 array
+        Positions, world, m.
+    p : int64
+        Particle.
+    origin : (3,) float64 array
+        `Domain.origin`, m.
+    scale : float64
+        1 / spacing, 1/m.
+
+    Returns
+    -------
+    i, j, k : int64
+        Node of the domain.
+    fx, fy, fz : float32
+        Distance of the particle from it, in grid spacings.
+    """
     gx, gy, gz = (x[p, 0] - origin[0]) * scale, (x[p, 1] - origin[1]) * scale, (x[p, 2] - origin[2]) * scale
     i, j, k = int(gx - 0.5), int(gy - 0.5), int(gz - 0.5)
     return i, j, k, np.float32(gx - i), np.float32(gy - j), np.float32(gz - k)
@@ -54,7 +83,26 @@ def cell_of(x, p, origin, scale):  # type: ignore[no-untyped-def]
 
 @inlined
 def node_of(neighbour, b, i, j, k):  # type: ignore[no-untyped-def]
-    """Location of node (i, j, k) of block b's scratch: slot and number in the grid, and offset in the scratch."""
+    """Where a node of a block's scratch lies in the grid and in the scratch.
+
+    Parameters
+    ----------
+    neighbour : (b, 27) int32 array
+        `Arrangement.neighbour`.
+    b : int64
+        Block.
+    i, j, k : int64
+        Node of the scratch, 0 to 7.
+
+    Returns
+    -------
+    slot : int32
+        Of `Nodes.values`.
+    number : int64
+        Node of the slot, 0 to 63.
+    offset : int64
+        In the scratch.
+    """
     e = (((i + 3) >> 2) * 3 + ((j + 3) >> 2)) * 3 + ((k + 3) >> 2)
     n = (((i + 3) & 3) * 4 + ((j + 3) & 3)) * 4 + ((k + 3) & 3)
     return neighbour[b, e], n, ((i * 8 + j) * 8 + k) * 4
@@ -89,7 +137,19 @@ def _carried(scratch, base, wx, wy, wz):  # type: ignore[no-untyped-def]
 
 @inlined
 def update_deformation_gradient(f, p, step, gradient):  # type: ignore[no-untyped-def]
-    """F = (1 + step grad v) F, in place, where `f` holds F - 1; the gradient of v row by row."""
+    """Update of the deformation gradient in a step: F becomes (1 + step grad v) F, in place.
+
+    Parameters
+    ----------
+    f : (n, 9) float32 array
+        F - 1, row-major; row `p` is written.
+    p : int64
+        Particle.
+    step : float32
+        Seconds.
+    gradient : tuple of float
+        Nine, of the velocity, 1/s, row-major.
+    """
     g0, g1, g2, g3, g4, g5, g6, g7, g8 = gradient
     h0, h4, h8 = f[p, 0], f[p, 4], f[p, 8]
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = _ONE + h0, f[p, 1], f[p, 2], f[p, 3], _ONE + h4, f[p, 5], f[p, 6], f[p, 7], _ONE + h8  # noqa: E501  # fmt: skip
@@ -106,10 +166,31 @@ def update_deformation_gradient(f, p, step, gradient):  # type: ignore[no-untype
 
 @inlined
 def momentum_of(p, v, affine, tau, m, q, h, fx, fy, fz):  # type: ignore[no-untyped-def]
-    """Momentum that particle p gives to the first node around it, and its increments to the next nodes.
+    """Momentum that a particle gives to the nodes around it (MLS-MPM, Hu et al. 2018), before the B-spline weights.
 
-    They are along x, y and z, row by row: m v + (m C - factor V tau) d, with d from the particle to the node and
-    q = -factor V.
+    It is m v + (m C - factor V tau) d, with d from the particle to the node: linear in the node.
+
+    Parameters
+    ----------
+    p : int64
+        Particle.
+    v, affine, tau : array
+        (n, 3), (n, 9) and (n, 6) float32, see `Particles`.
+    m : float32
+        Mass, kg.
+    q : float32
+        -factor V, with factor = 4 dt / spacing^2.
+    h : float32
+        Grid spacing, m.
+    fx, fy, fz : float32
+        Distance of the particle from the first node, in grid spacings.
+
+    Returns
+    -------
+    mx, my, mz : float32
+        For the first node, kg m/s.
+    a00, a01, a02, a10, a11, a12, a20, a21, a22 : float32
+        What is added per node along x, y and z (columns), row by row, kg m/s.
     """
     a00, a01, a02 = (m * affine[p, 0] + q * tau[p, 0]) * h, (m * affine[p, 1] + q * tau[p, 3]) * h, (m * affine[p, 2] + q * tau[p, 4]) * h  # noqa: E501  # fmt: skip
     a10, a11, a12 = (m * affine[p, 3] + q * tau[p, 3]) * h, (m * affine[p, 4] + q * tau[p, 1]) * h, (m * affine[p, 5] + q * tau[p, 5]) * h  # noqa: E501  # fmt: skip
@@ -122,10 +203,24 @@ def momentum_of(p, v, affine, tau, m, q, h, fx, fy, fz):  # type: ignore[no-unty
 
 @inlined
 def apply_forces(velocity, gain, damping_factor, drag_factor, wind):  # type: ignore[no-untyped-def]
-    """A velocity after a step of the forces that act on all matter alike; vectors as (x, y, z), m/s.
+    """A velocity after a step of the forces that act on all matter alike: gravity, damping, drag.
 
-    Gravity adds `gain`; damping leaves the share `damping_factor`, exp(-dt damping), of all; drag takes the share
-    `drag_factor`, 1 - exp(-dt drag), of what is relative to the wind.
+    Parameters
+    ----------
+    velocity : tuple of float
+        (x, y, z), world, m/s; so the other vectors.
+    gain : tuple of float
+        What gravity adds in the step.
+    damping_factor : float32
+        Share of the velocity that damping leaves, exp(-dt damping).
+    drag_factor : float32
+        Share of the velocity relative to the wind that drag takes, 1 - exp(-dt drag).
+    wind : tuple of float
+
+    Returns
+    -------
+    x, y, z : float32
+        World, m/s.
     """
     x, y, z = velocity
     gx, gy, gz = gain

@@ -1,4 +1,7 @@
-"""Docstrings in numpydoc form: every entry of Parameters, Attributes and Returns has a type and a name that exists."""
+"""Docstrings in numpydoc form: every entry of Parameters, Attributes and Returns has a type and a name that exists.
+
+Where there are no annotations, as in kernels, every parameter has such an entry.
+"""
 
 from __future__ import annotations
 
@@ -125,7 +128,7 @@ def is_union(text: str) -> bool:
 
 
 def is_single(text: str) -> bool:
-    if text in WORDS or text in class_files() or ARRAY.fullmatch(text):
+    if text in WORDS or text in class_files() or ARRAY.fullmatch(text) or re.fullmatch(NUMBER, text):
         return True
     if re.fullmatch(r"[a-z_]\w*(\.\w+)+", text):  # a class of another library, such as argparse.Namespace
         return True
@@ -263,6 +266,37 @@ def test_sections_of_parameters_are_whole(folder: str) -> None:
     assert not found_in(folder, "missing"), "\n".join(found_in(folder, "missing"))
 
 
+#: Of intrinsics: what Numba gives itself.
+OF_NUMBA = {"typing", "typingctx"}
+
+
+def public_functions(node: ast.AST) -> Iterator[ast.FunctionDef]:
+    """Functions and methods of a module that others may call; none that stand in functions."""
+    for inner in getattr(node, "body", ()):
+        if isinstance(inner, ast.FunctionDef) and not inner.name.startswith("_"):
+            yield inner
+        elif isinstance(inner, ast.ClassDef | ast.If | ast.Try):
+            yield from public_functions(inner)
+
+
+def undescribed(module: ast.Module) -> Iterator[str]:
+    """Public functions that leave a parameter without annotation and without an entry."""
+    for node in public_functions(module):
+        a = node.args
+        bare = {x.arg for x in [*a.posonlyargs, *a.args, *a.kwonlyargs] if not x.annotation} - {"self", "cls"}
+        listed = {name for entry in entries(node) if entry.section == "Parameters" for name in entry.names}
+        missing = (parameters(node) if bare - OF_NUMBA else set()) - OF_NUMBA - listed
+        if missing:
+            yield f"{node.lineno}: {node.name} has neither annotation nor entry of {', '.join(sorted(missing))}"
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_parameters_without_annotation_are_described(folder: str) -> None:
+    paths = [path for path in sources() if path.is_relative_to(PACKAGE / folder)]
+    found = [f"{path.relative_to(ROOT)}:{text}" for path in paths for text in undescribed(tree(path))]
+    assert not found, "\n".join(found)
+
+
 @pytest.mark.parametrize("folder", NOT_YET)
 def test_folders_to_do_are_not_done(folder: str) -> None:
     assert found_in(folder, "type"), f"{folder} has types everywhere: take it out of NOT_YET"
@@ -273,6 +307,8 @@ def test_folders_to_do_are_not_done(folder: str) -> None:
     [
         "int",
         "(n, 3) float32 array",
+        "float32",
+        "Path, int64 or tuple",
         "(n, 3) float32 array, optional",
         "(3,) or (n, 3) array",
         "(h, w, 4) uint8 or float32 array",
@@ -330,3 +366,32 @@ def test_faults_are_found() -> None:
         ("type", "9"),
         ("type", "13"),
     ]
+
+
+def test_functions_without_annotations_are_found() -> None:
+    text = '''@njit
+def f(a, b, c):
+    """Sum.
+
+    Parameters
+    ----------
+    a, b : float32
+    """
+
+@njit
+def g(a: int, b: float): ...
+
+@njit
+def _h(a): ...
+
+@intrinsic
+def k(typing, a):
+    """Twice.
+
+    Parameters
+    ----------
+    a : float32
+    """
+    def inner(b): ...
+'''
+    assert list(undescribed(ast.parse(text))) == ["2: f has neither annotation nor entry of c"]

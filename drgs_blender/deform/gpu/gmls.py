@@ -23,7 +23,23 @@ def _gradient(rows: Any, s: Any) -> Any:
 
 
 def carry_points(lane, lanes, room, source, weight, offset, reach, rows, centre, out):  # type: ignore[no-untyped-def]
-    """`gmls._carry`; `source` and `weight` with the point as their last axis."""
+    """`gmls._carry`; `source` and `weight` with the point as their last axis.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+        See `compute.warp.kernels`.
+    source : (k, n) int array
+        Particles of each point.
+    weight : (k, 4, n) float32 array
+    offset : (n, 3) float32 array
+    reach : (n,) float32 array
+        As of `gmls.Weights`.
+    rows, centre : array or tuple
+        `gmls.pack` of the particles.
+    out : tuple of array
+        Points (n, 3), gradients (n, 3, 3) and whether each follows its first particle alone (n,); written.
+    """
     points, gradients, turned = out
     zero = np.float32(0.0)
     for i in range(lane, len(reach), lanes):

@@ -26,7 +26,20 @@ _USABLE = 1e28
 
 
 def weigh_corners(lane, lanes, room, vertices, faces, place, out):  # type: ignore[no-untyped-def]
-    """`geometry._weigh`, one face after the other."""
+    """`geometry._weigh`, one face after the other.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+        See `compute.warp.kernels`.
+    vertices : (n, 3) float32 array
+        Metres.
+    faces : (m, 3) int32 array
+    place : (3 m,) int array
+        Row of each face corner in what is written.
+    out : tuple of array
+        Angle times unit normal of each corner, (3 m, 3) float32; written.
+    """
     (weighted,) = out
     for f in range(lane, len(faces), lanes):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -42,7 +55,21 @@ def weigh_corners(lane, lanes, room, vertices, faces, place, out):  # type: igno
 
 
 def sum_corners(lane, lanes, room, weighted, start, sign, out):  # type: ignore[no-untyped-def]
-    """`geometry._sum`; `sign` -1 turns the normals round."""
+    """Vertex normals, as `geometry._sum`.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+        See `compute.warp.kernels`.
+    weighted : (3 m, 3) float32 array
+        Of `weigh_corners`.
+    start : (n + 1,) int array
+        First row of each vertex.
+    sign : float32
+        1, or -1 to turn the normals round.
+    out : tuple of array
+        Unit normals, (n, 3) float32; written.
+    """
     (normals,) = out
     for v in range(lane, len(normals), lanes):
         x, y, z = vertex_normal(weighted, start[v], start[v + 1])

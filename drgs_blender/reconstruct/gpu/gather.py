@@ -52,7 +52,17 @@ _HIT = ("float32", "int32", "int32", "int32", "float32", "float32", "float32", "
 
 
 def gather_points(lane, lanes, room, points, lobes, plan, occluder, sky, envmap, out):  # type: ignore[no-untyped-def]
-    """`inverse_rendering.estimator.gather`."""
+    """`inverse_rendering.estimator.gather`.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+        See `compute.warp.kernels`.
+    points, lobes, plan, occluder, sky, envmap : Points, Lobes, Plan, Occluder, Sky or EnvMap
+        As of `gather_point`.
+    out : tuple
+        `Sums` and `Samples`; written.
+    """
     sums, samples = out
     for i in range(lane, len(lobes.alpha2), lanes):
         gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples)

@@ -46,13 +46,34 @@ CHANNELS = 16
 
 
 def project_rows(lane, lanes, room, surfels, p, picture, out):  # type: ignore[no-untyped-def]
-    """`projection.project`."""
+    """`projection.project`.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+        See `compute.warp.kernels`; so of all kernels here.
+    surfels, p, picture, out : tuple or array
+        As of `projection.project_surfel`.
+    """
     for i in range(lane, len(surfels[0]), lanes):
         project_surfel(i, surfels, p, picture, out)
 
 
 def list_pairs(lane, lanes, room, box, first, tiles_x, out):  # type: ignore[no-untyped-def]
-    """Tile and surfel of every pair of both, surfel by surfel, row by row of tiles."""
+    """Tile and surfel of every pair of both, surfel by surfel, row by row of tiles.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+    box : (n, 4) int32 array
+        Pixels, see `projection.Projected`.
+    first : array
+        Number of the first pair of each surfel.
+    tiles_x : int
+        Tiles in a row.
+    out : tuple of array
+        Tile and surfel of each pair, int32; written.
+    """
     tile, surfel = out
     for i in range(lane, len(box), lanes):
         pair = first[i]
@@ -81,7 +102,18 @@ def meet(splat: Any, x: Any, y: Any, near: Any, far: Any) -> Any:
 
 
 def blend_pixels(lane, lanes, room, splats, tiles, out):  # type: ignore[no-untyped-def]
-    """The maps of all pixels, as `blend._blend` sums them; neighbouring lanes are of one tile."""
+    """The maps of all pixels, as `blend._blend` sums them; neighbouring lanes are of one tile.
+
+    Parameters
+    ----------
+    lane, lanes : int64
+    room : tuple
+        Memory for sums of features, (CHANNELS,) float32.
+    splats, tiles : tuple
+        In the order of `blend.Splats` and `blend.Tiles`.
+    out : tuple of array
+        Maps, (h, w, FEATURES + channels) float32; written.
+    """
     record, values, box, near, far = splats
     start, listed, tiles_x = tiles
     (maps,) = out
@@ -123,11 +155,17 @@ def pull_pixels(lane, lanes, room, splats, tiles, first, maps, incoming, out):  
 
     Parameters
     ----------
+    lane, lanes, room : int64 or tuple
+    splats, tiles : tuple
+        As of `blend_pixels`.
     first : (m,) array
         First row of each surfel's rectangle in what is written.
     maps : array
         Output of `blend_pixels`.
     incoming : (h, w, G_FEATURES + channels) float32 array
+        Gradients of the loss by the maps.
+    out : tuple of array
+        Transmittance and gradient, two columns, float32; written.
     """
     record, values, box, near, far = splats
     start, listed, tiles_x = tiles
@@ -171,10 +209,17 @@ def sum_pixels(lane, lanes, room, splats, entries, first, maps, incoming, pulls,
 
     Parameters
     ----------
+    lane, lanes, room : int64 or tuple
+    splats : tuple
+        As of `blend_pixels`.
     entries : tuple
         (k,) arrays: surfel, tile and number of each pair, in the order of tiles; tiles in a row.
+    first, maps, incoming : array
+        As of `pull_pixels`.
     pulls : array
         Output of `pull_pixels`.
+    out : tuple of array
+        Gradients of each pair, (pairs, BEFORE + channels) float32; features are added to, the rest is written.
     """
     record, _, box, near, far = splats
     listed, tiles, pairs, tiles_x = entries
@@ -227,7 +272,18 @@ def sum_pixels(lane, lanes, room, splats, entries, first, maps, incoming, pulls,
 
 
 def sum_tiles(lane, lanes, room, slots, first, out):  # type: ignore[no-untyped-def]
-    """Add up the slots of each surfel, `first` (m + 1,) to the next one's, in the order of tiles; a lane a number."""
+    """Add up the gradients of each surfel's pairs, in the order of tiles; a lane a number.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+    slots : array
+        Output of `sum_pixels`.
+    first : (m + 1,) array
+        First pair of each surfel.
+    out : tuple of array
+        Gradients of each surfel, (m, BEFORE + channels) float32; written.
+    """
     (total,) = out
     columns = total.shape[1]
     for number in range(lane, total.shape[0] * columns, lanes):
@@ -239,7 +295,14 @@ def sum_tiles(lane, lanes, room, slots, first, out):  # type: ignore[no-untyped-
 
 
 def project_rows_backward(lane, lanes, room, surfels, p, index, gradient, out):  # type: ignore[no-untyped-def]
-    """`projection.project_backward`."""
+    """`projection.project_backward`.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+    surfels, p, index, gradient, out : tuple or array
+        As of `projection.project_surfel_backward`.
+    """
     for k in range(lane, len(index), lanes):
         project_surfel_backward(k, surfels, p, index, gradient, out)
 

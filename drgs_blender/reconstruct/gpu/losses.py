@@ -20,7 +20,19 @@ from .launch import TensorLauncher
 
 
 def blur_rows(lane, lanes, room, window, pictures, out):  # type: ignore[no-untyped-def]
-    """Weighted means of eleven rows, as `photometric._blur_row` has them; black beyond the edges."""
+    """Weighted means of eleven rows, as `photometric._blur_row` has them; black beyond the edges.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+        See `compute.warp.kernels`.
+    window : (11,) float32 array
+        Weights, symmetric, of sum 1.
+    pictures : (m, h, w) float32 array
+        Channels side by side along the last axis.
+    out : tuple of array
+        The same shape; written.
+    """
     (blurred,) = out
     m, h, w = pictures.shape
     for number in range(lane, m * h * w, lanes):
@@ -34,7 +46,15 @@ def blur_rows(lane, lanes, room, window, pictures, out):  # type: ignore[no-unty
 
 
 def blur_columns(lane, lanes, room, window, channels, pictures, out):  # type: ignore[no-untyped-def]
-    """The same of eleven columns; a pixel has `channels` of them."""
+    """The same of eleven columns; a pixel has `channels` of them.
+
+    Parameters
+    ----------
+    lane, lanes, room, window, pictures, out : int64, tuple or array
+        As of `blur_rows`.
+    channels : int
+        Columns of a pixel.
+    """
     (blurred,) = out
     m, h, w = pictures.shape
     for number in range(lane, m * h * w, lanes):

@@ -23,7 +23,17 @@ from .raster import rasterise
 
 
 def descend_rows(lane, lanes, room, gradient, rate, out):  # type: ignore[no-untyped-def]
-    """`adam.descend`."""
+    """`adam.descend`.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+        See `compute.warp.kernels`.
+    gradient, rate : array
+        As of `adam.step_rows`.
+    out : tuple of array
+        Value, first and second moment, (n, width) float32; changed.
+    """
     value, first, second = out
     for i in range(lane, len(value), lanes):
         step_rows(i, i + 1, value, gradient, first, second, rate)

@@ -248,7 +248,24 @@ def _texels(radiance, t, p, k):  # type: ignore[no-untyped-def]
 
 @njit
 def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples):  # type: ignore[no-untyped-def]
-    """All samples of one pixel, into `Sums` and `Samples`."""
+    """Estimate the integrals of one pixel: all its samples, with MIS weights, into `Sums` and `Samples`.
+
+    Parameters
+    ----------
+    i : int64
+        Pixel.
+    points : Points
+    lobes : Lobes
+    plan : Plan
+    occluder : Occluder
+    sky : Sky
+    envmap : EnvMap
+        From which light samples are drawn.
+    sums : Sums
+        Row `i` is written.
+    samples : Samples
+        Row `i` is written.
+    """
     origin, flat, towards, key = points
     normals, a2s = lobes
     counts, sequence = plan

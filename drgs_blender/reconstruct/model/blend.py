@@ -69,9 +69,26 @@ class Tiles(NamedTuple):
 
 @inlined
 def strength(ex, ey, splat, near, far):  # type: ignore[no-untyped-def]
-    """Squared radius and depth where a pixel at (ex, ey) from the centre meets a splat.
+    """Kernel of a splat at a pixel: of the exact intersection, or of the screen-space filter where that is stronger.
 
-    Then whether the exact intersection decides (else the screen-space filter); u, v over z are the last two.
+    Parameters
+    ----------
+    ex, ey : float32
+        Pixel from the projected centre, pixels.
+    splat : Splat
+    near, far : float32
+        Metres along the view between which the intersection counts.
+
+    Returns
+    -------
+    q : float32
+        Square radius in standard deviations, that of the filter with its dimming: alpha is opacity exp(-q / 2).
+    z : float32
+        Depth, m along the view; of the centre where the filter decides.
+    exact : bool
+        Whether the intersection decides.
+    su, sv : float32
+        u and v over z, 1/m.
     """
     big, one = np.float32(1e30), np.float32(1.0)
     z = one / (splat.i0 + splat.ix * ex + splat.iy * ey)
@@ -119,7 +136,22 @@ def _blend(splats, i, x, y, state, base):  # type: ignore[no-untyped-def]
 
 @inlined
 def blocks_of(box, i, left, top):  # type: ignore[no-untyped-def]
-    """Blocks (x0, y0, x1, y1), half-open, of the tile at (left, top) that splat i touches."""
+    """Blocks of a tile that a splat touches.
+
+    Parameters
+    ----------
+    box : (m, 4) int32 array
+        Pixels, see `Splats`.
+    i : int64
+        Splat.
+    left, top : int64
+        First pixel of the tile.
+
+    Returns
+    -------
+    x0, y0, x1, y1 : int64
+        Columns and rows of blocks in the tile, half-open.
+    """
     x0, y0 = max(box[i, 0] - left, 0) // SIDE, max(box[i, 1] - top, 0) // SIDE
     x1, y1 = (min(box[i, 2] - left, TILE) - 1) // SIDE + 1, (min(box[i, 3] - top, TILE) - 1) // SIDE + 1
     return x0, y0, x1, y1
@@ -127,7 +159,22 @@ def blocks_of(box, i, left, top):  # type: ignore[no-untyped-def]
 
 @inlined
 def open_blocks(is_open, left, top, width, height):  # type: ignore[no-untyped-def]
-    """Open the blocks of the tile at (left, top) that are in the picture; how many these are."""
+    """Open the blocks of a tile that are in the picture, as not yet opaque.
+
+    Parameters
+    ----------
+    is_open : (BLOCKS * BLOCKS,) bool array
+        Written.
+    left, top : int64
+        First pixel of the tile.
+    width, height : int64
+        Of the picture, pixels.
+
+    Returns
+    -------
+    int64
+        How many are open.
+    """
     count = 0
     for block in range(BLOCKS * BLOCKS):
         inside = (left + block % BLOCKS * SIDE < width) & (top + block // BLOCKS * SIDE < height)

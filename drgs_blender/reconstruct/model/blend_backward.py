@@ -38,7 +38,28 @@ TRAVEL, BEFORE = PARAMETERS, PARAMETERS + 1
 
 @inlined
 def slopes(g_alpha, g_depth, alpha, ex, ey, z, exact, su, sv, splat):  # type: ignore[no-untyped-def]
-    """Gradients of a pixel's place (ex, ey), of u and v over z, of 1 / z, and the last where the place changes it."""
+    """Gradients of one pixel by what `strength` computes from, given those by alpha and depth.
+
+    Parameters
+    ----------
+    g_alpha, g_depth : float32
+        Gradients of the loss by the alpha of the splat at the pixel and by its depth.
+    alpha : float32
+    ex, ey, z, exact, su, sv : float32 or bool
+        As of `strength`.
+    splat : Splat
+
+    Returns
+    -------
+    by_ex, by_ey : float32
+        By the pixel's place from the projected centre.
+    by_su, by_sv : float32
+        By u and v over z.
+    by_i : float32
+        By 1 / z.
+    by_slope : float32
+        The same where the place changes it: 0 unless the intersection decides.
+    """
     zero = np.float32(0.0)
     g_q = np.float32(-0.5) * alpha * g_alpha
     # Where the intersection decides, q = (su^2 + sv^2) z^2; else it is the squared distance on the screen.

@@ -91,7 +91,18 @@ class Splat(NamedTuple):
 
 @inlined
 def splat_of(record, i):  # type: ignore[no-untyped-def]
-    """The record of surfel i."""
+    """The record of surfel i.
+
+    Parameters
+    ----------
+    record : (n, RECORD) float32 array
+        `Projected.record`.
+    i : int64
+
+    Returns
+    -------
+    Splat
+    """
     return Splat(
         record[i, RX], record[i, RY], record[i, UX], record[i, UY], record[i, VX], record[i, VY], record[i, I0],
         record[i, IX], record[i, IY], record[i, OPACITY], record[i, CUT], record[i, DIM],
@@ -120,7 +131,21 @@ def _in_camera(p, surfels, i):  # type: ignore[no-untyped-def]
 
 @njit
 def project_surfel(i, surfels, p, picture, out):  # type: ignore[no-untyped-def]
-    """Fill row i of `out`, see `project`; devices have tuples in the order of the records."""
+    """Project a surfel, see `project`.
+
+    Parameters
+    ----------
+    i : int64
+        Row of the surfel.
+    surfels : WorldSurfels
+        Or a tuple in its order, as devices have it; so `out`.
+    p : (PARAMETERS,) float64 array
+        `render.camera.camera_parameters`.
+    picture : tuple of int
+        Width and height, pixels.
+    out : Projected
+        Row `i` is written.
+    """
     _, _, _, opacity = surfels
     width, height = picture
     record, depth, box = out
@@ -187,7 +212,22 @@ def _project(first, last, surfels, p, picture, out):  # type: ignore[no-untyped-
 
 @njit
 def project_surfel_backward(k, surfels, p, index, gradient, out):  # type: ignore[no-untyped-def]
-    """Gradients of the surfel of row k, see `project_backward`."""
+    """Gradients of a surfel's centre and tangents from those of its record, see `project_backward`.
+
+    Parameters
+    ----------
+    k : int64
+        Row of `index` and `gradient`.
+    surfels : WorldSurfels
+        Or a tuple in its order, as devices have it; so `out`.
+    p : (PARAMETERS,) float64 array
+        `render.camera.camera_parameters`.
+    index : (m,) array
+        Surfel of each row of `gradient`.
+    gradient : (m, at least PARAMETERS) float32 array
+    out : WorldSurfels
+        Row ``index[k]`` of centre and tangents is written.
+    """
     g_centre, g_u, g_v, _ = out
     fx, fy = p[FX], p[FY]
     i = np.int64(index[k])

@@ -78,7 +78,21 @@ class Adam:
 
 @njit
 def step_rows(begin, end, value, gradient, first, second, rate):  # type: ignore[no-untyped-def]
-    """The rows from `begin` to `end`. No branch: vector code."""
+    """Step of Adam (Kingma and Ba 2015) for some rows, in place. No branch: vector code.
+
+    Parameters
+    ----------
+    begin, end : int64
+        Rows, half-open.
+    value : (n, width) float32 array
+        Changed.
+    gradient : (n, width) float32 array
+        A value whose gradient is not finite stays as it is.
+    first, second : (n, width) float32 array
+        Moments; changed.
+    rate : (width,) float32 array
+        Learning rates, the correction of the moments' bias included.
+    """
     b1, b2, epsilon = np.float32(_BETA1), np.float32(_BETA2), np.float32(_EPSILON)
     one = np.float32(1.0)
     for i in range(begin, end):

@@ -24,8 +24,8 @@ DIELECTRIC_F0 = 0.04
 LEVELS = 5
 #: Pixels a kernel works on at once; empty columns left and right of a picture (twice the last level's step).
 TILE, PAD = 128, 2 << (LEVELS - 1)
-#: Planes of a guide. ``SURFACE`` is the object's index, NaN where nothing is covered; ``SOURCE`` the same, NaN also
-#: where the light is no number. ``WIDTH`` is the inverse width of a pixel.
+#: Planes of a guide. ``SURFACE`` is the object's pass index, NaN where nothing is covered; ``SOURCE`` the same, and NaN
+#: where the light is no number, too. ``WIDTH`` is the inverse width of a pixel, 1/m.
 POSITION, NORMAL, ROUGHNESS, SOURCE, SURFACE, WIDTH, GUIDES = 0, 3, 6, 7, 8, 9, 10
 #: Planes of a signal, two lobes each: luminance, its variance, the inverse of the difference that counts; the light.
 LUMINANCE, VARIANCE, CERTAINTY, LIGHT = 0, 2, 4, 6
@@ -97,7 +97,21 @@ def _channel(k, red, green, blue):  # type: ignore[no-untyped-def]
 
 @inlined
 def demodulate_pixel(y, x, components, variance, surface, guide, light):  # type: ignore[no-untyped-def]
-    """Fill the planes of a covered pixel, which are 0, and NaN in `SOURCE` and `SURFACE`; `surface` as of `Guides`."""
+    """Fill the planes of a covered pixel, which are 0, and NaN in `SOURCE` and `SURFACE`.
+
+    Parameters
+    ----------
+    y, x : int64
+        Pixel.
+    components : (h, w, 4, 3) float32 array
+        Premultiplied light, linear Rec.709, see ``Radiance.components``.
+    variance : (h, w, 2) float32 array
+        Of the luminance of the diffuse and the glossy sum.
+    surface : Guides
+        Or a tuple in its order.
+    guide, light : (h, planes, w + 2 PAD) float32 array
+        See `Signal`; written.
+    """
     coverage, position, normal, albedo, roughness, metallic, index, footprint = surface
     parts = (light.shape[1] - LIGHT) // 6
     usable = F(1e30)
@@ -158,7 +172,16 @@ def _demodulate(first, last, components, variance, surface, guide, light, spans)
 
 @inlined
 def find_span(y, coverage, spans):  # type: ignore[no-untyped-def]
-    """Span of the covered columns of a row."""
+    """Span of the covered columns of a row.
+
+    Parameters
+    ----------
+    y : int64
+        Row.
+    coverage : (h, w) float32 array
+    spans : (h, 2) int32 array
+        Row `y` is written: first and last + 1 column.
+    """
     first, last = coverage.shape[1], 0
     for x in range(coverage.shape[1]):
         if coverage[y, x] > ZERO:
@@ -168,7 +191,19 @@ def find_span(y, coverage, spans):  # type: ignore[no-untyped-def]
 
 @inlined
 def modulate_pixel(y, x, light, surface, out):  # type: ignore[no-untyped-def]
-    """Multiply a covered pixel's light by surface colour and coverage again."""
+    """Modulation: multiply a covered pixel's light by surface colour and coverage again.
+
+    Parameters
+    ----------
+    y, x : int64
+        Pixel.
+    light : (h, planes, w + 2 PAD) float32 array
+        See `Signal`.
+    surface : Guides
+        Or a tuple in its order.
+    out : (h, w, 4, 3) float32 array
+        Premultiplied light, linear Rec.709; the pixel is written.
+    """
     coverage, _, _, albedo, _, metallic, _, _ = surface
     parts = (light.shape[1] - LIGHT) // 6
     for lobe in range(2):

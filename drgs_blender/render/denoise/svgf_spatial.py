@@ -167,7 +167,18 @@ def _clamp_fireflies(y0, y1, guide, spans, light, out):  # type: ignore[no-untyp
 
 @inlined
 def stop(x):  # type: ignore[no-untyped-def]
-    """(1 - x / 8)^8 for x in [0, 8], beyond it 0."""
+    """Edge-stopping function: (1 - x / 8)^8 for x in [0, 8], beyond it 0.
+
+    Parameters
+    ----------
+    x : float32
+        Sum of the differences, each in units of those that count.
+
+    Returns
+    -------
+    float32
+        In [0, 1].
+    """
     u = max(np.float32(1.0) - np.float32(0.125) * x, np.float32(0.0))
     u *= u
     u *= u
@@ -298,5 +309,15 @@ def _a_trous(y0, y1, step, guide, spans, light, out):  # type: ignore[no-untyped
 
 @inlined
 def share_of(k):  # type: ignore[no-untyped-def]
-    """Share of colour channel `k` in luminance."""
+    """Share of a colour channel in luminance, linear Rec.709.
+
+    Parameters
+    ----------
+    k : int64
+        Channel, 0 to 2.
+
+    Returns
+    -------
+    float32
+    """
     return np.float32(REC709[0]) if k == 0 else np.float32(REC709[1]) if k == 1 else np.float32(REC709[2])

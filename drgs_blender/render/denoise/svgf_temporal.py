@@ -146,8 +146,10 @@ def warp(other: Signal, signal: Signal, vector: Array, expected: Array) -> tuple
     Parameters
     ----------
     other, signal : Signal
-    vector, expected : array
-        See `_neighbours`.
+    vector : (h, w, 2) float32 array
+        Pixels: where the surfaces of `signal` are in the other picture, see `Motion.vector`.
+    expected : (h, w, 3) float32 array
+        World, m: the place of these surfaces then, see `Motion.previous`.
     """
     light = np.zeros_like(signal.light)
     source = np.full((len(light), light.shape[2]), np.nan, np.float32)
@@ -183,7 +185,25 @@ def _look_up(y0, y1, guide, spans, vector, expected, other, other_light, out, so
 
 @njit
 def look_up_pixel(y, x, guide, vector, expected, other, other_light, out, source):  # type: ignore[no-untyped-def]
-    """Bilinear interpolation over those of four pixels that show the same surface."""
+    """Reprojection of a pixel: the other picture's light, bilinear over those of four pixels that show its surface.
+
+    Parameters
+    ----------
+    y, x : int64
+        Pixel.
+    guide : (h, GUIDES, w + 2 PAD) float32 array
+        Of this picture, see `Signal`.
+    vector : (h, w, 2) float32 array
+        `Motion.vector`, pixels.
+    expected : (h, w, 3) float32 array
+        `Motion.previous`: place of the surface in the other picture, world, m.
+    other, other_light : (h, planes, w + 2 PAD) float32 array
+        Guide and light of the other picture, see `Signal`.
+    out : (h, planes, w + 2 PAD) float32 array
+        The pixel, which is 0, is written.
+    source : (h, w + 2 PAD) float32 array
+        The pixel is written where it has a past: the surface, see `SURFACE`.
+    """
     h, planes = out.shape[0], out.shape[1]
     w = out.shape[2] - 2 * PAD
     c = x + PAD
@@ -276,7 +296,25 @@ def _mix(y0, y1, least, spans, light, past, source, change, guide, out):  # type
 
 @njit
 def mix_pixel(y, c, least, light, past, source, change, guide, out):  # type: ignore[no-untyped-def]
-    """Kalman's update; a pixel that holds no number takes over the past."""
+    """Kalman's update of a pixel: its light mixed with the reprojected past; one that holds no number takes the past.
+
+    Parameters
+    ----------
+    y, c : int64
+        Row, and column, `PAD` counted.
+    least : (2,) float32 array
+        `least_gain`.
+    light, past : (h, planes, w + 2 PAD) float32 array
+        Light of this frame and of the past, see `Signal` and `warp`.
+    source : (h, w + 2 PAD) float32 array
+        As of `warp`.
+    change : (h, CHANGES, w + 2 PAD) float32 array
+        `find_change`.
+    guide : (h, GUIDES, w + 2 PAD) float32 array
+        `SOURCE` is written where the past replaces what is no number.
+    out : (h, planes, w + 2 PAD) float32 array
+        The pixel is written.
+    """
     width = (light.shape[1] - LIGHT) // 2
     known, usable = source[y, c] == source[y, c], guide[y, SOURCE, c] == guide[y, SOURCE, c]
     if known and not usable:

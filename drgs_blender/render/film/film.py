@@ -46,15 +46,24 @@ class Pixels(NamedTuple):
 
     Attributes
     ----------
-    coverage : (h, w) array
-    position, normal, albedo : (h, w, 3) array
-    roughness, metallic, pass_index, depth : (h, w) array
+    coverage, roughness, metallic : (h, w) array
+        In [0, 1].
+    pass_index : (h, w) array
+        Of the nearest sample's object, Blender's IndexOB.
+    depth : (h, w) array
+        Metres along the view axis; `EMPTY_DEPTH` where the pixel is empty.
+    position : (h, w, 3) array
+        World, m; 0 where the pixel is empty.
+    normal : (h, w, 3) array
+        Shading normal, unit, world; 0 where the pixel is empty.
+    albedo : (h, w, 3) array
+        Linear Rec.709, not premultiplied.
     components : (h, w, 4, 3) array
-        In the order of `points.Radiance.components`, premultiplied.
+        In the order of `points.Radiance.components`, premultiplied, linear Rec.709.
     variance : (h, w, 2) array
         Of the luminance of the premultiplied diffuse and glossy sums.
     emission : (h, w, 3) array
-        Light that seen surfaces emit.
+        Light that seen surfaces emit, premultiplied, linear Rec.709.
     catcher : (h, w, 3) array
         Sums by weight over the points of catchers: one, luminance, unshadowed luminance.
     """
@@ -117,7 +126,6 @@ class Film:
         pass_index : (objects,) int32 array
         environment : EnvironmentLight
             Background, unless the film is transparent.
-        environment : EnvironmentLight
         """
         x0, top = self.origin
         y0, y1 = buffer.rows

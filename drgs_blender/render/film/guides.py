@@ -16,9 +16,16 @@ class Guides(NamedTuple):
 
     Attributes
     ----------
-    coverage, roughness, metallic, pass_index : (h, w) array
-        See `film.Pixels`, also for the next.
-    position, normal, albedo : (h, w, 3) array
+    coverage, roughness, metallic : (h, w) array
+        In [0, 1].
+    pass_index : (h, w) array
+        Of the object, Blender's IndexOB.
+    position : (h, w, 3) array
+        World, m; 0 where the pixel is empty.
+    normal : (h, w, 3) array
+        Shading normal, unit, world; 0 where the pixel is empty.
+    albedo : (h, w, 3) array
+        Linear Rec.709.
     footprint : (h, w) array
         Width of a pixel at the surface, metres.
     """

@@ -145,7 +145,22 @@ def vector_pass(before: Motion | None, after: Motion | None, shape: tuple[int, i
 
 @inlined
 def project(p, x, y, z):  # type: ignore[no-untyped-def]
-    """Pixel position and depth of a world-space point through the camera of parameters `p`; inverse of `camera_ray`."""
+    """Project a world-space point: the inverse of `camera_ray`.
+
+    Parameters
+    ----------
+    p : (PARAMETERS,) float64 array
+        `camera.camera_parameters`.
+    x, y, z : float64
+        World, m.
+
+    Returns
+    -------
+    px, py : float64
+        Pixels, from the upper left corner of the full picture.
+    depth : float64
+        Metres along the view axis.
+    """
     x, y, z = x - p[POSITION], y - p[POSITION + 1], z - p[POSITION + 2]
     depth = -(p[2] * x + p[5] * y + p[8] * z)
     right = p[0] * x + p[3] * y + p[6] * z

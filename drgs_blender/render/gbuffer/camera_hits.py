@@ -110,10 +110,14 @@ def trace_samples(lane, lanes, room, tracer, view_of, mask, owners, out):  # typ
 
     Parameters
     ----------
+    lane, lanes : int64
     room : tuple
         Not used.
+    tracer : Tracer
     view_of : tuple
         `camera.camera_parameters`, column and row of the first sample.
+    mask : int32
+        Of the camera's rays, see `ray_masks`.
     owners : tuple of array
         Object of each face and of each place.
     out : tuple
@@ -148,6 +152,7 @@ def shade_hits(lane, lanes, room, geometry, moving, view_of, layer, hits, keys, 
 
     Parameters
     ----------
+    lane, lanes : int64
     room : tuple
         Not used.
     geometry, moving : tuple

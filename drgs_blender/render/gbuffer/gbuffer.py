@@ -172,6 +172,20 @@ def face_viewer(nx, ny, nz, gx, gy, gz, vx, vy, vz):  # type: ignore[no-untyped-
     """Shading normal on the side of the geometric normal g, which faces the viewer at v, and visible from there.
 
     A smooth normal that looks away from the viewer near a silhouette is bent until it is just visible.
+
+    Parameters
+    ----------
+    nx, ny, nz : float
+        Shading normal, unit, world.
+    gx, gy, gz : float
+        Geometric normal, unit, world.
+    vx, vy, vz : float
+        Direction towards the viewer, unit, world.
+
+    Returns
+    -------
+    nx, ny, nz : float
+        Unit, world.
     """
     if nx * gx + ny * gy + nz * gz < 0.0:
         nx, ny, nz = -nx, -ny, -nz

@@ -200,8 +200,10 @@ def attach_points(lane, lanes, room, tracer, rules, view_of, samples, keys, out)
 
     Parameters
     ----------
+    lane, lanes : int64
     room : tuple
         Not used.
+    tracer : Tracer
     rules, view_of, samples, keys, out : tuple
         As of `tie_to_mesh`; the last is its three groups of arrays to be filled.
     """

@@ -66,10 +66,12 @@ class Sampling:
 
     Parameters
     ----------
-    count, samples, parts : int
-        Points, and as of `sample_adaptively`.
+    count : int
+        Points.
+    samples, parts : int
+        As of `sample_adaptively`.
     threshold : float
-        Points, and as of `sample_adaptively`.
+        As of `sample_adaptively`.
 
     Attributes
     ----------

@@ -31,14 +31,35 @@ _NODES = 16
 
 @inlined
 def alpha_squared(roughness):  # type: ignore[no-untyped-def]
-    """Square of GGX's alpha = max(roughness^2, 1e-3)."""
+    """Square of GGX's alpha = max(roughness^2, 1e-3).
+
+    Parameters
+    ----------
+    roughness : float32
+        In [0, 1].
+
+    Returns
+    -------
+    float32
+    """
     alpha = max(roughness * roughness, F(1e-3))
     return alpha * alpha
 
 
 @inlined
 def fresnel_dielectric(c):  # type: ignore[no-untyped-def]
-    """Unpolarised Fresnel reflectance of IOR 1.5 at cosine c from outside."""
+    """Unpolarised Fresnel reflectance of a dielectric of IOR 1.5 from outside (PBRT 9.3.5).
+
+    Parameters
+    ----------
+    c : float32
+        Cosine between direction and (half vector's) normal, in [0, 1].
+
+    Returns
+    -------
+    float32
+        In [0, 1].
+    """
     eta2 = F(_IOR * _IOR)
     g = math.sqrt(eta2 - ONE + c * c)
     a = (g - c) / (g + c)
@@ -48,7 +69,22 @@ def fresnel_dielectric(c):  # type: ignore[no-untyped-def]
 
 @njit
 def layer_albedo(roughness, nv, table):  # type: ignore[no-untyped-def]
-    """Cycles' estimate of the dielectric lobe's directional albedo: bilinear in (n . v, roughness)."""
+    """Cycles' estimate of the dielectric lobe's directional albedo: bilinear in (n . v, roughness).
+
+    Parameters
+    ----------
+    roughness : float32
+        In [0, 1]; clamped.
+    nv : float32
+        Cosine between normal and viewer; clamped to [0, 1].
+    table : (16, 16) float32 array
+        `layer_table`.
+
+    Returns
+    -------
+    float32
+        Directional albedo in [0, 1].
+    """
     last = F(_NODES - 1)
     x, y = min(max(roughness, ZERO), ONE) * last, min(max(nv, ZERO), ONE) * last
     i, j = min(np.int32(x), np.int32(_NODES - 2)), min(np.int32(y), np.int32(_NODES - 2))
@@ -60,7 +96,24 @@ def layer_albedo(roughness, nv, table):  # type: ignore[no-untyped-def]
 
 @njit
 def diffuse_weight(roughness, metallic, nv, shading_model, table):  # type: ignore[no-untyped-def]
-    """Factor of albedo / pi in the diffuse lobe."""
+    """Weight of the diffuse lobe: the factor of albedo / pi in it.
+
+    Parameters
+    ----------
+    roughness, metallic : float32
+        In [0, 1].
+    nv : float32
+        Cosine between normal of the specular lobe and viewer.
+    shading_model : int64
+        PAPER or PRINCIPLED.
+    table : (16, 16) float32 array
+        `layer_table`.
+
+    Returns
+    -------
+    float32
+        In [0, 1].
+    """
     # Metals interpolated over a triangle are 1 to rounding, above or below: none has a diffuse lobe.
     rest = ONE - metallic if metallic < _METAL else ZERO
     if shading_model == PAPER:
@@ -70,7 +123,24 @@ def diffuse_weight(roughness, metallic, nv, shading_model, table):  # type: igno
 
 @inlined
 def fresnel(vh, r, g, b, metallic, shading_model):  # type: ignore[no-untyped-def]
-    """Reflectance (RGB) of the specular lobes at half-vector cosine vh; metals end at white, as in Cycles."""
+    """Fresnel reflectance of the specular lobes, dielectric and metallic together; metals end at white, as in Cycles.
+
+    Parameters
+    ----------
+    vh : float32
+        Cosine between viewer and half vector.
+    r, g, b : float32
+        Albedo, linear Rec.709; cut at 1.
+    metallic : float32
+        In [0, 1].
+    shading_model : int64
+        PAPER or PRINCIPLED.
+
+    Returns
+    -------
+    fr, fg, fb : float32
+        In [0, 1], linear Rec.709.
+    """
     r, g, b = min(r, ONE), min(g, ONE), min(b, ONE)
     x = max(ZERO, ONE - vh)
     s = x * x
@@ -93,6 +163,20 @@ def glossy_normal(nx, ny, nz, gx, gy, gz, vx, vy, vz):  # type: ignore[no-untype
 
     A smooth normal far from the geometric normal g would mirror the viewer v into the surface; Cycles turns it as far
     as needed (``ensure_valid_specular_reflection``), in the plane of both normals. All of unit length, g.v >= 0.
+
+    Parameters
+    ----------
+    nx, ny, nz : float32
+        Shading normal, unit, world.
+    gx, gy, gz : float32
+        Geometric normal, unit, world.
+    vx, vy, vz : float32
+        Direction towards the viewer, unit, world.
+
+    Returns
+    -------
+    mx, my, mz : float32
+        Unit, world.
     """
     nv = nx * vx + ny * vy + nz * vz
     gv = gx * vx + gy * vy + gz * vz
@@ -113,9 +197,25 @@ def glossy_normal(nx, ny, nz, gx, gy, gz, vx, vy, vz):  # type: ignore[no-untype
 
 @inlined
 def ggx(nl, nv, nh2, sin2, a2):  # type: ignore[no-untyped-def]
-    """D G / (4 nl nv) of GGX with height-correlated Smith, and D; nh2 = cos^2, sin2 = sin^2 of the half vector.
+    """GGX's microfacet distribution D with height-correlated Smith masking-shadowing G (Heitz 2014; PBRT 9.6).
 
     The sine comes apart, because 1 - cos^2 loses the whole lobe to rounding when alpha is small.
+
+    Parameters
+    ----------
+    nl, nv : float32
+        Cosines of normal and light, of normal and viewer.
+    nh2, sin2 : float32
+        Squares of cosine and sine between normal and half vector.
+    a2 : float32
+        `alpha_squared`.
+
+    Returns
+    -------
+    value : float32
+        D G / (4 nl nv), sr^-1: the specular BRDF without Fresnel.
+    d : float32
+        D, sr^-1.
     """
     k = a2 * nh2 + sin2
     d = a2 / (PI * k * k)
@@ -125,7 +225,22 @@ def ggx(nl, nv, nh2, sin2, a2):  # type: ignore[no-untyped-def]
 
 @inlined
 def vndf_terms(nv, a2):  # type: ignore[no-untyped-def]
-    """(bound, norm): the cap's lower bound factor k, and what turns D into the pdf of reflected directions."""
+    """Terms of the bounded sampling of GGX's visible normals and of its pdf (Eto and Tokuyoshi 2023).
+
+    Parameters
+    ----------
+    nv : float32
+        Cosine between normal and viewer, >= 0.
+    a2 : float32
+        `alpha_squared`.
+
+    Returns
+    -------
+    bound : float32
+        k, the factor of the spherical cap's lower bound.
+    norm : float32
+        Factor that turns D into the pdf per solid angle of the reflected directions.
+    """
     s = ONE + math.sqrt(max(ZERO, ONE - nv * nv))
     s2 = s * s
     bound = (ONE - a2) * s2 / (s2 + a2 * nv * nv)
@@ -134,7 +249,24 @@ def vndf_terms(nv, a2):  # type: ignore[no-untyped-def]
 
 @inlined
 def sample_vndf(u, v, ix, iy, iz, alpha, bound):  # type: ignore[no-untyped-def]
-    """GGX importance sampling: the reflected direction for view (ix, iy, iz), iz > 0, in the frame of the normal."""
+    """GGX importance sampling: the direction mirrored by a visible normal (VNDF; Eto and Tokuyoshi 2023).
+
+    Parameters
+    ----------
+    u, v : float32
+        Random numbers in [0, 1): azimuth (in turns), height.
+    ix, iy, iz : float32
+        Direction towards the viewer, unit, in the tangent frame (z is the normal); iz > 0.
+    alpha : float32
+        GGX's alpha, root of `alpha_squared`.
+    bound : float32
+        Of `vndf_terms`.
+
+    Returns
+    -------
+    ox, oy, oz : float32
+        Direction towards the light, unit, in the tangent frame; may point below the surface.
+    """
     x, y = ix * alpha, iy * alpha
     scale = ONE / math.sqrt(x * x + y * y + iz * iz)
     x, y, z = x * scale, y * scale, iz * scale
@@ -161,14 +293,24 @@ def evaluate(angles, albedo, kd, metallic, a2, norm, shading_model):  # type: ig
         (nl, nv, vl, nh2, sin2): cosines of normal n, light l and view v, and squares of cosine and sine between the
         half vector and n. nl > 0; where nv <= 0 the specular lobe is black, as in Cycles.
     albedo : tuple of float
-    kd : float
+        (r, g, b), linear Rec.709.
+    kd : float32
         `diffuse_weight`.
-    metallic : float
-    a2 : float
+    metallic : float32
+        In [0, 1].
+    a2 : float32
         `alpha_squared`.
-    norm : float
+    norm : float32
         Of `vndf_terms`.
-    shading_model : int
+    shading_model : int64
+        PAPER or PRINCIPLED.
+
+    Returns
+    -------
+    qr, qg, qb, sr, sg, sb : float32
+        Diffuse and specular BRDF, sr^-1, linear Rec.709.
+    pdf : float32
+        Of ``sample_vndf``, sr^-1.
     """
     nl, nv, vl, nh2, sin2 = angles
     r, g, b = albedo

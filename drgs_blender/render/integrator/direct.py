@@ -61,7 +61,20 @@ def _reflect(sums, rays, slot, kind, diffuse, glossy):  # type: ignore[no-untype
 
 @njit
 def deliver(count, found, limit, sums):  # type: ignore[no-untyped-def]
-    """Add the light of finished paths to their points; `limit` is `clamp_indirect`, scaled to one sample."""
+    """Add the light of finished paths, times BRDF and cosine at their shading points, to these points' sums.
+
+    Parameters
+    ----------
+    count : int64
+        Paths.
+    found : (capacity, FOUND) float32 array
+        From CARRIED on: BRDF times cosine over pdf at the shading point, diffuse and glossy, and the point's row of
+        `sums`. INDIRECT: radiance from `indirect.trace_paths`, linear Rec.709.
+    limit : float32
+        `clamp_indirect`, scaled to one sample: highest mean of its three channels; 0 for none.
+    sums : (points, KINDS * KIND) float32 array
+        Added to, as light of kind 1 (indirect).
+    """
     for path in range(count):
         h = np.int64(found[path, CARRIED + 6])
         fr, fg, fb = found[path, CARRIED], found[path, CARRIED + 1], found[path, CARRIED + 2]
@@ -234,7 +247,23 @@ def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: igno
 
 @njit
 def finish(sums, h, total, components, moments, i):  # type: ignore[no-untyped-def]
-    """Write out point i: its light, and of either lobe sum and sum of squares of `total` samples' luminance."""
+    """Write out the light of a point, and for either lobe sum and sum of squares of its samples' luminance.
+
+    Parameters
+    ----------
+    sums : (points, KINDS * KIND) float32 array
+        Of the block.
+    h : int64
+        The point's row of it.
+    total : int64
+        Its samples.
+    components : (n, 4, 3) float32 array
+        Row `i` is written, linear Rec.709, see ``Radiance.components``.
+    moments : (n, 5) float32 array
+        Row `i` is written, see ``Radiance.moments``.
+    i : int64
+        The point among all.
+    """
     for lobe in range(2):
         for k in range(3):
             c = 3 * lobe + k

@@ -1,8 +1,10 @@
 """Indirect light: paths continued in batches from the hits of direct samples.
 
 Every path vertex takes next event estimation of environment and lights, one sample each, and one BRDF sample, combined
-by multiple importance sampling (balance heuristic). The throughput is the path's weight so far; from the fourth vertex
-on, Russian roulette ends paths by it.
+by multiple importance sampling (balance heuristic). The throughput is the path's weight so far. It starts at 1 at the
+first hit: the BRDF of the visible surface is not in it, but in the columns from CARRIED on, and `direct.deliver`
+multiplies by it. Russian roulette ends paths before their fourth vertex and all later ones; `_onwards` computes the
+probability of survival, the largest channel of the throughput, 1 at most.
 """
 
 from __future__ import annotations
@@ -33,7 +35,22 @@ FOUND = 10
 
 @njit
 def lifted(px, py, pz, gx, gy, gz, extent):  # type: ignore[no-untyped-def]
-    """Lift a ray's start off the surface by more than rounding can push it below."""
+    """Lift a ray's origin off the surface by more than rounding can push it below.
+
+    Parameters
+    ----------
+    px, py, pz : float32
+        Point on the surface, world, m.
+    gx, gy, gz : float32
+        Unit geometric normal, on the side where the ray starts.
+    extent : float32
+        `Traits.extent`, m.
+
+    Returns
+    -------
+    x, y, z : float32
+        World, m.
+    """
     lift = _OFFSET_POINT * max(abs(px), max(abs(py), abs(pz))) + _OFFSET_SCENE * extent
     return px + lift * gx, py + lift * gy, pz + lift * gz
 
@@ -143,6 +160,7 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
             fr, fg, fb = fr * weight, fg * weight, fb * weight
             key = ints[c + w.KEY]
             if bounce + 1 >= _SURE_BOUNCES:
+                # Russian roulette (PBRT 2.2.4): the probability of survival.
                 survive = min(ONE, max(fr, max(fg, fb)))
                 if not unit(mix(U(key + U(0x165667B1)))) < survive:
                     continue

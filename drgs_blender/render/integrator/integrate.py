@@ -210,13 +210,14 @@ def shade_points(lane, lanes, scratch, points, scene, settings, sampler, out):  
 
     Parameters
     ----------
+    lane, lanes : int64
     scratch : Scratch
     points : PointArrays
     scene : Scene
     settings : Settings
     sampler : Sampler
     out : tuple of array
-        Components and moments of the points' `Radiance`.
+        Components (n, 4, 3) and moments (n, 5) of the points' `Radiance`.
     """
     components, moments = out
     n = len(points.pixel)

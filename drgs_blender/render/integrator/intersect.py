@@ -2,9 +2,8 @@
 
 With surfels a shadow ray brings what these let through, and a ray that looks for a surface meets the surfels in front
 of the nearest mesh as one blended surface, see `surfels.surfel_tracer`. What they let through reaches the
-environment; where a
-mesh lies behind them, chance decides which of the two the ray meets. Functions that end in ``_meshes`` are for meshes
-alone; a device has no others.
+environment; where a mesh lies behind them, chance decides which of the two the ray meets. Functions that end in
+``_meshes`` are for meshes alone; a device has no others.
 """
 
 from __future__ import annotations
@@ -55,8 +54,10 @@ class MixedHit(NamedTuple):
         As of `Hit`.
     nx, ny, nz : np.float32
         Unit shading normal.
-    r, g, b, roughness, metallic : np.float32
-        Linear Rec.709.
+    r, g, b : np.float32
+        Albedo, linear Rec.709.
+    roughness, metallic : np.float32
+        In [0, 1].
     size : np.float32
         Metres: mean larger standard deviation of the surfels.
     owner : np.int32
@@ -90,7 +91,22 @@ def meshes_alone(meshes: Tracer) -> MixedTracer:
 
 @njit
 def ray_of(rays, slot, far, mask):  # type: ignore[no-untyped-def]
-    """The `Ray` of a slot, which ends at `far`."""
+    """The `Ray` of a slot: from its position along its direction up to a distance.
+
+    Parameters
+    ----------
+    rays : Batch
+        OX to OZ (m) and LX to LZ (unit) are read, world.
+    slot : int64
+    far : float32
+        Metres; its `tfar`. The ray's `tnear` is 0.
+    mask : int32
+        See `ray_masks`.
+
+    Returns
+    -------
+    Ray
+    """
     s, _ = rays
     i, _ = w.at(slot)
     origin, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
@@ -107,13 +123,39 @@ def _start_of(rays, slot):  # type: ignore[no-untyped-def]
 
 @njit
 def passed_meshes(tracer, rays, slot, far, mask):  # type: ignore[no-untyped-def]
+    """`passed` where there are meshes alone.
+
+    Parameters
+    ----------
+    tracer : MixedTracer
+        Or a device's.
+    rays, slot, far, mask : Batch, int64, float32 or int32
+        As of `ray_of`.
+
+    Returns
+    -------
+    float32
+        Visibility, 0 or 1.
+    """
     hidden = shadowed(tracer, ray_of(rays, slot, far, mask))
     return ZERO if hidden else ONE
 
 
 @njit
 def passed(tracer, rays, slot, far, mask):  # type: ignore[no-untyped-def]
-    """Share of light that reaches a slot's position from its direction, from no farther than `far`."""
+    """Shadow ray: the share of light that reaches a slot's position from its direction, from no farther than `far`.
+
+    Parameters
+    ----------
+    tracer : MixedTracer
+    rays, slot, far, mask : Batch, int64, float32 or int32
+        As of `ray_of`.
+
+    Returns
+    -------
+    float32
+        0 behind a mesh, else the transmittance of the surfels, see `surfel_tracer.transmittance`.
+    """
     ray = ray_of(rays, slot, far, mask)
     if shadowed(tracer, ray):
         return ZERO
@@ -124,16 +166,45 @@ def passed(tracer, rays, slot, far, mask):  # type: ignore[no-untyped-def]
 
 @njit
 def meet_meshes(tracer, rays, slot, mask):  # type: ignore[no-untyped-def]
+    """`meet` where there are meshes alone.
+
+    Parameters
+    ----------
+    tracer : MixedTracer
+        Or a device's.
+    rays, slot, mask : Batch, int64 or int32
+        As of `ray_of`.
+
+    Returns
+    -------
+    through : float32
+        1 where nothing is met, else 0.
+    reach : float32
+        Distance of the hit, m.
+    hit : Hit
+    """
     hit = nearest(tracer, ray_of(rays, slot, FAR, mask))
     return (ONE if hit.face < 0 else ZERO), hit.t, hit
 
 
 @njit
 def meet(tracer, rays, slot, mask):  # type: ignore[no-untyped-def]
-    """Follow a slot's ray: ``(through, reach, hit)``.
+    """Closest hit of a slot's ray, of meshes and surfels together.
 
-    ``through`` is the share of light that comes from beyond everything: 1 where nothing is met, 0 behind a mesh. Lights
-    nearer than ``reach`` are seen. ``hit`` is for `put_hit`, and not to be used where ``through`` is 1.
+    Parameters
+    ----------
+    tracer : MixedTracer
+    rays, slot, mask : Batch, int64 or int32
+        As of `ray_of`; KEY is read, too.
+
+    Returns
+    -------
+    through : float32
+        Share of light that comes from beyond everything: 1 where nothing is met, 0 behind a mesh.
+    reach : float32
+        Metres: lights nearer than this are seen.
+    hit : MixedHit
+        For `put_hit`; not to be used where `through` is 1.
     """
     ray = ray_of(rays, slot, FAR, mask)
     t, face, instance, u, v, gx, gy, gz = nearest(tracer, ray)
@@ -172,12 +243,37 @@ def _put_face(rays, slot, start, hit, key, owner):  # type: ignore[no-untyped-de
 
 @njit
 def put_hit_meshes(tracer, rays, slot, start, hit, key, owner):  # type: ignore[no-untyped-def]
+    """`put_hit` where there are meshes alone.
+
+    Parameters
+    ----------
+    tracer : MixedTracer
+        Not used.
+    rays, slot, start, hit, key, owner : Batch, int64, tuple, Hit or uint32
+        As of `put_hit`.
+    """
     _put_face(rays, slot, start, hit, key, owner)
 
 
 @njit
 def put_hit(tracer, rays, slot, start, hit, key, owner):  # type: ignore[no-untyped-def]
-    """Put what a ray met into a slot, as `surface_of` reads it; `start` is its origin and direction."""
+    """Put what a ray met into a slot, as `surface_of` reads it.
+
+    Parameters
+    ----------
+    tracer : MixedTracer
+    rays : Batch
+        Written: position and viewer of the hit, its normals and materials or its face, KEY, OWNER and OWN.
+    slot : int64
+    start : tuple of tuple
+        Origin (m) and unit direction of the ray, (x, y, z) float32 each, world.
+    hit : MixedHit
+        As `meet` returns it.
+    key : uint32
+        Key of the path's random numbers.
+    owner : int64
+        The path: its row of `found`, see `indirect.trace_paths`.
+    """
     _put_face(rays, slot, start, hit, key, owner)
     if tracer.surfel_scene == 0:
         return
@@ -200,12 +296,46 @@ def _face_of(rays, slot, geometry):  # type: ignore[no-untyped-def]
 
 @njit
 def surface_of_meshes(tracer, rays, slot, geometry):  # type: ignore[no-untyped-def]
+    """`surface_of` where there are meshes alone.
+
+    Parameters
+    ----------
+    tracer : MixedTracer
+        Not used.
+    rays, slot, geometry : Batch, int64 or Geometry
+        As of `surface_of`.
+
+    Returns
+    -------
+    nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb : float32
+        As of `surface_of`.
+    """
     return _face_of(rays, slot, geometry)
 
 
 @njit
 def surface_of(tracer, rays, slot, geometry):  # type: ignore[no-untyped-def]
-    """Surface (`surface_at`) of the hit in a slot, save for its object."""
+    """Surface (`surface_at`) of the hit that `put_hit` put into a slot.
+
+    Parameters
+    ----------
+    tracer : MixedTracer
+        Not used.
+    rays : Batch
+    slot : int64
+    geometry : Geometry
+
+    Returns
+    -------
+    nx, ny, nz, gx, gy, gz : float32
+        Unit shading and geometric normal, world.
+    r, g, b : float32
+        Albedo, linear Rec.709.
+    roughness, metallic : float32
+        In [0, 1].
+    er, eg, eb : float32
+        Emitted radiance, linear Rec.709; 0 of surfels.
+    """
     s, ints = rays
     i, c = w.at(slot)
     if ints[c + w.N0] != _SURFELS:
@@ -218,12 +348,30 @@ def surface_of(tracer, rays, slot, geometry):  # type: ignore[no-untyped-def]
 
 @njit
 def put_start_meshes(tracer, rays, slot, points, point):  # type: ignore[no-untyped-def]
-    pass
+    """`put_start` where there are meshes alone: nothing to do.
+
+    Parameters
+    ----------
+    tracer, rays, slot, points, point : MixedTracer, Batch, int64 or PointArrays
+        As of `put_start`; not used.
+    """
 
 
 @njit
 def put_start(tracer, rays, slot, points, point):  # type: ignore[no-untyped-def]
-    """Put into a slot which surfels are the `point`-th shading point's own; see ``ShadingPoints``."""
+    """Put into a slot which surfels are a shading point's own, so that they do not stop its rays.
+
+    Parameters
+    ----------
+    tracer : MixedTracer
+    rays : Batch
+        SIZE (m) and OWN (object) are written; nothing without surfels.
+    slot : int64
+    points : PointArrays
+        `own` and `size` are read, see ``ShadingPoints``.
+    point : int64
+        Row of the points.
+    """
     if tracer.surfel_scene == 0:
         return
     s, ints = rays
@@ -234,10 +382,26 @@ def put_start(tracer, rays, slot, points, point):  # type: ignore[no-untyped-def
 
 @njit
 def light_radiance(rays, slot, others, glossy_others, share, lights, tracer, mask):  # type: ignore[no-untyped-def]
-    """Radiance over density of a light sample, for the diffuse and the glossy lobe; 0 when in shadow.
+    """Radiance of a light sample times visibility and MIS weight over pdf, for the diffuse and the glossy lobe.
 
-    `others` and `share` are the balance heuristic's densities of other strategies, for the diffuse and for the glossy
-    lobe, and number of light samples.
+    Parameters
+    ----------
+    rays : Batch
+        As `wavefront.light_directions` and `evaluate` left it.
+    slot : int64
+    others, glossy_others : float32
+        Sum over the other strategies of count times pdf (sr^-1), for the diffuse and the glossy lobe.
+    share : float32
+        Number of light samples.
+    lights : LightTables
+    tracer : MixedTracer
+    mask : int32
+        Of the shadow ray, see `ray_masks`.
+
+    Returns
+    -------
+    dr, dg, db, gr, gg, gb : float32
+        For the diffuse and the glossy lobe, linear Rec.709, not yet times BRDF and cosine; 0 in shadow.
     """
     s, ints = rays
     i, c = w.at(slot)

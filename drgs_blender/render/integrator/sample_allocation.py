@@ -109,7 +109,24 @@ def write_point_states(first, last, points, scene, settings, sampler, scratch): 
 
 @njit
 def put_sample(tracer, rays, slot, points, i, state, h, rate):  # type: ignore[no-untyped-def]
-    """Copy point i, the h-th of its block, into a slot; `rate` is its part of a pixel's samples."""
+    """Copy a shading point into a slot: surface, viewer, BRDF parameters and number of samples of each strategy.
+
+    Parameters
+    ----------
+    tracer : MixedTracer
+    rays : Batch
+        Written: fields from OX to KD, WC to WL, OWNER, and those of `put_start`.
+    slot : int64
+    points : PointArrays
+    i : int64
+        The point's row.
+    state : (block, POINT_STATE) float32 array
+        As `write_point_states` left it.
+    h : int64
+        The point's row of `state`.
+    rate : float32
+        The point's part of its pixel's samples.
+    """
     s, ints = rays
     normal, flat, view = points.normal, points.geometric_normal, points.viewer
     albedo, metallic = points.albedo, points.metallic

@@ -73,27 +73,65 @@ class Batch(NamedTuple):
 
 @njit
 def batch(capacity):  # type: ignore[no-untyped-def]
-    """A `Batch` with room for `capacity` slots."""
+    """A `Batch` with room for `capacity` slots.
+
+    Parameters
+    ----------
+    capacity : int64
+        Slots; rounded up to whole packets.
+
+    Returns
+    -------
+    Batch
+        All fields 0.
+    """
     packets = (capacity + LANES - 1) // LANES
     return Batch(np.zeros(packets * _FLOATS, np.float32), np.zeros(packets * _INTS, np.uint32))
 
 
 @inlined
 def at(slot):  # type: ignore[no-untyped-def]
-    """Places of a slot's field 0 in the two arrays."""
+    """Places of a slot's field 0 in the two arrays.
+
+    Parameters
+    ----------
+    slot : int64
+
+    Returns
+    -------
+    i, c : int64
+        Index in `Batch.floats` and in `Batch.ints`; a field's constant is added to it.
+    """
     packet, lane = slot // LANES, slot % LANES
     return packet * _FLOATS + lane, packet * _INTS + lane
 
 
 @inlined
 def packets(count):  # type: ignore[no-untyped-def]
-    """Packets that hold `count` slots."""
+    """Packets that hold `count` slots.
+
+    Parameters
+    ----------
+    count : int64
+
+    Returns
+    -------
+    int64
+    """
     return (count + LANES - 1) // LANES
 
 
 @njit
 def scramble(rays, count):  # type: ignore[no-untyped-def]
-    """Turn N0 to N2, a Sobol' point with reversed bits, into random numbers; CELL is the key of the point set."""
+    """Owen scrambling: turn N0 to N2, a Sobol' point with reversed bits, into random numbers; see `sampling.scrambled`.
+
+    Parameters
+    ----------
+    rays : Batch
+        N0, N1 and N2 are read and written; CELL is read, the key of the point set.
+    count : int64
+        Slots 0, 1, ...; whole packets are worked on.
+    """
     ints = rays.ints
     for p in range(packets(count)):
         c = p * _INTS
@@ -128,7 +166,15 @@ def _ggx_direction(s, i, u, v):  # type: ignore[no-untyped-def]
 
 @njit
 def cosine_directions(rays, count):  # type: ignore[no-untyped-def]
-    """Directions in proportion to the cosine."""
+    """Cosine sampling: directions about the shading normal with pdf cos / pi (PBRT A.5.3).
+
+    Parameters
+    ----------
+    rays : Batch
+        N0, N1 (random numbers) and NX, NY, NZ are read; LX, LY, LZ are written: unit, world.
+    count : int64
+        Slots.
+    """
     s, ints = rays
     for p in range(packets(count)):
         b, c = p * _FLOATS, p * _INTS
@@ -140,7 +186,15 @@ def cosine_directions(rays, count):  # type: ignore[no-untyped-def]
 
 @njit
 def ggx_directions(rays, count):  # type: ignore[no-untyped-def]
-    """Directions by visible normals."""
+    """GGX sampling by visible normals (VNDF) about the normal of the specular lobe; see `brdf.sample_vndf`.
+
+    Parameters
+    ----------
+    rays : Batch
+        N0, N1 (random numbers), MX to MZ, VX to VZ and A2 are read; LX, LY, LZ are written: unit, world.
+    count : int64
+        Slots.
+    """
     s, ints = rays
     for p in range(packets(count)):
         b, c = p * _FLOATS, p * _INTS
@@ -152,7 +206,16 @@ def ggx_directions(rays, count):  # type: ignore[no-untyped-def]
 
 @njit
 def brdf_directions(rays, count):  # type: ignore[no-untyped-def]
-    """Directions from the mixture of both lobes; CELL says which (1 diffuse, 0 specular)."""
+    """BRDF sampling: directions from the mixture of both lobes, cosine or GGX, picked by SHARE.
+
+    Parameters
+    ----------
+    rays : Batch
+        N0 to N2 (random numbers), SHARE and the surface are read; LX, LY, LZ (unit, world) are written, and CELL: the
+        lobe, 1 diffuse, 0 specular.
+    count : int64
+        Slots.
+    """
     s, ints = rays
     for p in range(packets(count)):
         b, c = p * _FLOATS, p * _INTS
@@ -170,7 +233,17 @@ def brdf_directions(rays, count):  # type: ignore[no-untyped-def]
 
 @njit
 def environment_directions(rays, count, envmap):  # type: ignore[no-untyped-def]
-    """Directions towards the environment in proportion to its light on the surface, with MU, MV and PE."""
+    """Environment sampling: directions in proportion to luminance times cosine (`product_sampling`), with their pdf.
+
+    Parameters
+    ----------
+    rays : Batch
+        N0 to N2 (random numbers) and ROW are read. Written: LX, LY, LZ (unit, world), MU, MV (lat-long coordinates in
+        [0, 1]), PE (pdf, sr^-1); N2, CELL and ER are overwritten.
+    count : int64
+        Slots.
+    envmap : EnvMap
+    """
     s, ints = rays
     for slot in range(count):
         _, c = at(slot)
@@ -207,7 +280,18 @@ def environment_directions(rays, count, envmap):  # type: ignore[no-untyped-def]
 
 @njit
 def light_directions(rays, count, lights):  # type: ignore[no-untyped-def]
-    """Directions towards lights, with ER, EG, EB, distance, density (see ``sample_light``) and the light in CELL."""
+    """Light sampling: directions towards lights and emitting triangles, see ``sample_light``.
+
+    Parameters
+    ----------
+    rays : Batch
+        N0 to N2 (random numbers) and OX, OY, OZ are read. Written: LX, LY, LZ (unit, world), ER, EG, EB (radiance,
+        linear Rec.709), MU (distance, m), MV (pdf, sr^-1, pick included; negative where no other strategy finds the
+        light), CELL (the light, for `light_flags`).
+    count : int64
+        Slots.
+    lights : LightTables
+    """
     s, ints = rays
     for slot in range(count):
         i, c = at(slot)
@@ -221,7 +305,17 @@ def light_directions(rays, count, lights):  # type: ignore[no-untyped-def]
 
 @njit
 def look_up(rays, count, envmap):  # type: ignore[no-untyped-def]
-    """MU, MV and PE of directions that were not drawn from the environment."""
+    """Place in the environment map, and pdf of environment sampling, of directions that another strategy drew.
+
+    Parameters
+    ----------
+    rays : Batch
+        LX, LY, LZ, LIVE and ROW are read. Written: MU, MV (lat-long coordinates in [0, 1]), and where LIVE is not 0 PE
+        (pdf, sr^-1).
+    count : int64
+        Slots.
+    envmap : EnvMap
+    """
     s, ints = rays
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
@@ -234,7 +328,16 @@ def look_up(rays, count, envmap):  # type: ignore[no-untyped-def]
 
 @njit
 def warm(rays, count, envmap):  # type: ignore[no-untyped-def]
-    """Fetch what `envmap_radiance` will read, all at once, long before it waits for it."""
+    """Prefetch: fetch what `envmap_radiance` will read, all at once, long before it waits for it.
+
+    Parameters
+    ----------
+    rays : Batch
+        MU, MV and LIVE are read; ER is overwritten, so that the reads are not optimised away.
+    count : int64
+        Slots.
+    envmap : EnvMap
+    """
     s = rays.floats
     for slot in range(count):
         i, _ = at(slot)
@@ -248,6 +351,16 @@ def evaluate(rays, count, shading_model):  # type: ignore[no-untyped-def]
 
     Light passes only above both the geometric and the shading normal: the shadow terminator of coarse meshes shows
     their faces, and is not softened.
+
+    Parameters
+    ----------
+    rays : Batch
+        The surface and LX, LY, LZ are read. Written: QR, QG, QB and SR, SG, SB (diffuse and specular BRDF times cosine,
+        sr^-1, linear Rec.709), PC, PG (pdf of cosine and of GGX sampling, sr^-1), LIVE (1 or 0).
+    count : int64
+        Slots.
+    shading_model : int64
+        One of `brdf.SHADING_MODELS`.
     """
     s = rays.floats
     for p in range(packets(count)):
@@ -295,13 +408,35 @@ def _scale(s, i, k):  # type: ignore[no-untyped-def]
 
 @inlined
 def weigh_one(s, i, cosine, ggx):  # type: ignore[no-untyped-def]
-    """`weigh` for the slot at i."""
+    """`weigh` for one slot.
+
+    Parameters
+    ----------
+    s : (packets * 48 * LANES,) float32 array
+        `Batch.floats`.
+    i : int64
+        Index of the slot in it, see `at`.
+    cosine, ggx : float32
+        As of `weigh`.
+    """
     _scale(s, i, _factor(s, i, cosine, ggx))
 
 
 @njit
 def weigh(rays, count, cosine, ggx):  # type: ignore[no-untyped-def]
-    """Divide by the density of all strategies together; the arguments (1 or 0) say whether these two take part."""
+    """MIS weight over pdf (balance heuristic, PBRT 2.2.3): divide both lobes by the sum of count times pdf.
+
+    The strategies are environment, cosine and GGX; lights have a density of their own, see `light_radiance`.
+
+    Parameters
+    ----------
+    rays : Batch
+        WC, WG, WE (counts) and PC, PG, PE (pdfs) are read; QR, QG, QB, SR, SG, SB are divided; ER is overwritten.
+    count : int64
+        Slots.
+    cosine, ggx : float32
+        1 or 0: whether cosine and GGX sampling take part.
+    """
     s = rays.floats
     for p in range(packets(count)):
         # Two loops, for LLVM vectorises none that reads and writes this many arrays.
@@ -313,7 +448,15 @@ def weigh(rays, count, cosine, ggx):  # type: ignore[no-untyped-def]
 
 @njit
 def weigh_apart(rays, count):  # type: ignore[no-untyped-def]
-    """`weigh` where cosine sampling is of the diffuse lobe alone, GGX sampling of the specular one alone."""
+    """`weigh` where cosine sampling is of the diffuse lobe alone, GGX sampling of the specular one alone.
+
+    Parameters
+    ----------
+    rays : Batch
+        As of `weigh`; ER stays as it is.
+    count : int64
+        Slots.
+    """
     s = rays.floats
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
@@ -326,7 +469,17 @@ def weigh_apart(rays, count):  # type: ignore[no-untyped-def]
 
 @njit
 def drop(rays, count, lobe):  # type: ignore[no-untyped-def]
-    """Take the lobe whose fields begin at `lobe` (QR or SR) out of the BRDF."""
+    """Take a lobe out of the BRDF.
+
+    Parameters
+    ----------
+    rays : Batch
+        The three fields of the lobe are set to 0.
+    count : int64
+        Slots.
+    lobe : int64
+        First field of the lobe: QR (diffuse) or SR (specular).
+    """
     s = rays.floats
     for p in range(packets(count)):
         for i in range(p * _FLOATS + lobe, p * _FLOATS + lobe + 3 * LANES):
@@ -335,7 +488,26 @@ def drop(rays, count, lobe):  # type: ignore[no-untyped-def]
 
 @inlined
 def diffuse_share(mv, r, g, b, kd, metallic, shading_model):  # type: ignore[no-untyped-def]
-    """Probability of sampling the diffuse lobe, from what both reflect towards the viewer."""
+    """Probability of sampling the diffuse lobe, from the luminance that both lobes reflect towards the viewer.
+
+    Parameters
+    ----------
+    mv : float32
+        Cosine between viewer and normal of the specular lobe.
+    r, g, b : float32
+        Albedo, linear Rec.709.
+    kd : float32
+        `brdf.diffuse_weight`.
+    metallic : float32
+        In [0, 1].
+    shading_model : int64
+        One of `brdf.SHADING_MODELS`.
+
+    Returns
+    -------
+    float32
+        From 0.1 to 0.8; 1 where the viewer is below the normal, 0 without a diffuse lobe.
+    """
     fr, fg, fb = brdf.fresnel(max(mv, ZERO), r, g, b, metallic, shading_model)
     diffuse = kd * luminance(r, g, b)
     share = min(max(diffuse / max(diffuse + luminance(fr, fg, fb), _TINY), F(0.1)), F(0.8))
@@ -345,7 +517,17 @@ def diffuse_share(mv, r, g, b, kd, metallic, shading_model):  # type: ignore[no-
 
 @njit
 def lobe_shares(rays, count, shading_model):  # type: ignore[no-untyped-def]
-    """SHARE: how often the diffuse lobe is sampled."""
+    """SHARE: the probability of sampling the diffuse lobe, see `diffuse_share`.
+
+    Parameters
+    ----------
+    rays : Batch
+        The surface is read, SHARE is written.
+    count : int64
+        Slots.
+    shading_model : int64
+        One of `brdf.SHADING_MODELS`.
+    """
     s = rays.floats
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
@@ -355,9 +537,18 @@ def lobe_shares(rays, count, shading_model):  # type: ignore[no-untyped-def]
 
 @njit
 def carry(rays, count, light):  # type: ignore[no-untyped-def]
-    """Put throughput times both lobes into QR, QG, QB, and what a path's samples are divided by into PG and PE.
+    """Throughput of a path times both lobes, and the pdfs that its samples are divided by.
 
-    PG becomes the density of the mixture of lobes, PE the same plus `light` times the density of light sampling.
+    Parameters
+    ----------
+    rays : Batch
+        TR, TG, TB (throughput), both lobes, PC, PG, PE and SHARE are read. Written: QR, QG, QB (throughput times BRDF
+        times cosine, linear Rec.709), PG (pdf of the mixture of lobes, sr^-1), PE (that plus `light` times the pdf of
+        environment sampling).
+    count : int64
+        Slots.
+    light : float32
+        1 or 0: whether an environment sample is part of the MIS weight in PE.
     """
     s = rays.floats
     for p in range(packets(count)):
@@ -372,7 +563,17 @@ def carry(rays, count, light):  # type: ignore[no-untyped-def]
 
 @njit
 def fresh_numbers(rays, count, step):  # type: ignore[no-untyped-def]
-    """Move on to the next key and hash three random numbers from it."""
+    """Move on to the next key and hash three random numbers from it.
+
+    Parameters
+    ----------
+    rays : Batch
+        KEY is read and written; N0, N1, N2 are written.
+    count : int64
+        Slots.
+    step : uint32
+        Added to the keys.
+    """
     ints = rays.ints
     for p in range(packets(count)):
         c = p * _INTS

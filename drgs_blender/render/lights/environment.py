@@ -204,7 +204,19 @@ class EnvironmentLight:
 
 @njit
 def map_at(dx, dy, dz, envmap):  # type: ignore[no-untyped-def]
-    """Lat-long coordinates (u, v) in [0, 1] of a world direction; row 0 at +Z, +X at u = 1/2."""
+    """Lat-long coordinates in the environment map of a world direction; row 0 at +Z, +X at u = 1/2.
+
+    Parameters
+    ----------
+    dx, dy, dz : float32
+        Unit, world.
+    envmap : EnvMap
+
+    Returns
+    -------
+    u, v : float32
+        In [0, 1].
+    """
     x = envmap.xx * dx + envmap.xy * dy + envmap.xz * dz
     y = envmap.yx * dx + envmap.yy * dy + envmap.yz * dz
     z = envmap.zx * dx + envmap.zy * dy + envmap.zz * dz
@@ -213,7 +225,21 @@ def map_at(dx, dy, dz, envmap):  # type: ignore[no-untyped-def]
 
 @njit
 def envmap_pdf(u, v, product, envmap):  # type: ignore[no-untyped-def]
-    """The pdf per solid angle at (u, v) of sampling the environment at a surface whose `product_row` is `product`."""
+    """The pdf per solid angle of environment sampling (PBRT 12.5), at a surface.
+
+    Parameters
+    ----------
+    u, v : float32
+        Lat-long coordinates of the direction, in [0, 1].
+    product : int32
+        `product_row` of the surface's normal.
+    envmap : EnvMap
+
+    Returns
+    -------
+    float32
+        sr^-1.
+    """
     row = min(np.int64(envmap.height - 1), np.int64(v * np.float32(envmap.height)))
     column = min(np.int64(envmap.width - 1), np.int64(u * np.float32(envmap.width)))
     density = load_float(envmap.texels, 4 * (row * envmap.width + column) + 3)
@@ -224,7 +250,19 @@ def envmap_pdf(u, v, product, envmap):  # type: ignore[no-untyped-def]
 
 @njit
 def envmap_radiance(u, v, envmap):  # type: ignore[no-untyped-def]
-    """Bilinear lookup, wrapped in u and clamped in v."""
+    """Radiance of the environment: bilinear lookup, wrapped in u and clamped in v.
+
+    Parameters
+    ----------
+    u, v : float32
+        Lat-long coordinates of the direction, in [0, 1].
+    envmap : EnvMap
+
+    Returns
+    -------
+    r, g, b : float32
+        Linear Rec.709.
+    """
     h, w = envmap.height, envmap.width
     x, y = u * np.float32(w) - np.float32(0.5), v * np.float32(h) - np.float32(0.5)
     y = min(max(y, np.float32(0.0)), np.float32(h - 1))
@@ -247,7 +285,19 @@ def envmap_radiance(u, v, envmap):  # type: ignore[no-untyped-def]
 
 @njit
 def envmap_touch(u, v, envmap):  # type: ignore[no-untyped-def]
-    """Prefetch: a value from both rows of texels that `envmap_radiance` will read, to bring them into the cache."""
+    """Prefetch: a value from both rows of texels that `envmap_radiance` will read, to bring them into the cache.
+
+    Parameters
+    ----------
+    u, v : float32
+        Lat-long coordinates of the direction, in [0, 1].
+    envmap : EnvMap
+
+    Returns
+    -------
+    float32
+        Of no meaning; to be stored, so that the reads take place.
+    """
     h, w = envmap.height, envmap.width
     y = min(max(v * np.float32(h) - np.float32(0.5), np.float32(0.0)), np.float32(h - 1))
     column, row = min(np.int64(u * np.float32(w)), w - 1), np.int64(y)
@@ -257,19 +307,58 @@ def envmap_touch(u, v, envmap):  # type: ignore[no-untyped-def]
 
 @njit
 def first_cell(n, envmap):  # type: ignore[no-untyped-def]
-    """Place in the sampling cells where the search for the random number n (uint32) starts."""
+    """Sampling cell where the search for a random number in the CDF starts.
+
+    Parameters
+    ----------
+    n : uint32
+        Random number, from `in_cells_order`.
+    envmap : EnvMap
+
+    Returns
+    -------
+    int32
+        Place of the cell in their Morton order.
+    """
     return load_int32(envmap.guide, np.int64((np.uint64(n) * np.uint64(envmap.guide_size)) >> np.uint64(32)))
 
 
 @njit
 def cell_end(cell_index, envmap):  # type: ignore[no-untyped-def]
-    """Last random number (uint32) that falls on the cell of this index."""
+    """CDF of the sampling cells: the last random number that falls on a cell.
+
+    Parameters
+    ----------
+    cell_index : int
+        Place of the cell in their Morton order.
+    envmap : EnvMap
+
+    Returns
+    -------
+    uint32
+    """
     return load_uint32(envmap.cells, 2 * np.int64(cell_index))
 
 
 @njit
 def cell_at(cell_index, envmap):  # type: ignore[no-untyped-def]
-    """(row, column) of the cell of this index, upper and lower z of its row, density per solid angle."""
+    """A sampling cell and its pdf without regard to a normal.
+
+    Parameters
+    ----------
+    cell_index : int
+        Place of the cell in their Morton order.
+    envmap : EnvMap
+
+    Returns
+    -------
+    row, column : int64
+        Of the cell among cells.
+    upper, lower : float32
+        z of the upper and lower edge of its row, in the environment's frame.
+    density : float32
+        Pdf per solid angle, sr^-1.
+    """
     cell = np.int64(load_uint32(envmap.cells, 2 * np.int64(cell_index) + 1))
     row, column = cell // envmap.columns, cell % envmap.columns
     density = load_float(envmap.texels, 4 * (row * envmap.step * envmap.width + column * envmap.step) + 3)
@@ -278,7 +367,25 @@ def cell_at(cell_index, envmap):  # type: ignore[no-untyped-def]
 
 @njit
 def direction_in_cell(column, upper, lower, n0, n1, envmap):  # type: ignore[no-untyped-def]
-    """World direction within a cell, from two uint32, and its lat-long coordinates (u, v)."""
+    """Direction uniform in the solid angle of a cell.
+
+    Parameters
+    ----------
+    column : int
+        Of the cell.
+    upper, lower : float32
+        z of its edges, see `cell_at`.
+    n0, n1 : uint32
+        Random numbers: azimuth, z.
+    envmap : EnvMap
+
+    Returns
+    -------
+    dx, dy, dz : float32
+        Unit, world.
+    u, v : float32
+        Lat-long coordinates, in [0, 1].
+    """
     u = (np.float32(column) + unit(n0)) / np.float32(envmap.columns)
     z = upper + unit(n1) * (lower - upper)
     s, c = sincos_turns(np.float32(0.5) - u)

@@ -206,16 +206,30 @@ def _emitters_share(px, py, pz, lights):  # type: ignore[no-untyped-def]
 
 @njit
 def sample_light(n0, n1, n2, px, py, pz, lights):  # type: ignore[no-untyped-def]
-    """A direction from a point towards one of the lights or surfaces, from three uint32.
+    """Light sampling: a direction from a point towards one of the lights or emitting triangles (PBRT 12.6).
+
+    Parameters
+    ----------
+    n0, n1, n2 : uint32
+        Random numbers: the pick, the place on the light.
+    px, py, pz : float32
+        Point, world, m.
+    lights : LightTables
 
     Returns
     -------
-    lx, ly, lz, distance, r, g, b, pdf, index : float
-        World direction of unit length, distance to the light (infinite for suns), radiance, density per solid angle
-        times the probability of the pick, row of the table or, behind those, of the emitters. A negative density
-        marks a light that no other strategy finds (without size, or one that nothing shadows): what it adds is
-        f cos rgb / |pdf| without a further weight.
-        (..., 0, 0, 0, 0, -1 or the light) when the light sends nothing here.
+    lx, ly, lz : float32
+        Unit, world.
+    distance : float32
+        To the light, m; infinite for suns.
+    r, g, b : float32
+        Radiance, linear Rec.709; 0 when the light sends nothing here.
+    pdf : float32
+        Per solid angle times the probability of the pick, sr^-1; 0 when the light sends nothing here. Negative for a
+        light that no other strategy finds (without size, or one that nothing shadows): it adds f cos rgb / |pdf|
+        without a MIS weight.
+    index : int64
+        Row of the table or, behind those, of the emitters; -1 for none.
     """
     table, pick, emitters = lights
     share = _emitters_share(px, py, pz, lights)
@@ -250,7 +264,18 @@ def sample_light(n0, n1, n2, px, py, pz, lights):  # type: ignore[no-untyped-def
 
 @njit
 def light_flags(index, lights):  # type: ignore[no-untyped-def]
-    """Bits CAMERA, DIFFUSE, GLOSSY (rays that see it), SHADOW (things block it) and ABSENT of what was sampled."""
+    """Bits CAMERA, DIFFUSE, GLOSSY (rays that see it), SHADOW (things block it) and ABSENT of what was sampled.
+
+    Parameters
+    ----------
+    index : int64
+        As `sample_light` returns it.
+    lights : LightTables
+
+    Returns
+    -------
+    int64
+    """
     table, _, emitters = lights
     if index >= len(table):
         return emitter_bits(index - len(table), emitters)
@@ -263,6 +288,21 @@ def pdf_light(index, px, py, pz, lx, ly, lz, lights):  # type: ignore[no-untyped
 
     0 where the light sends nothing from there: the density of samples whose radiance is not 0. 0 for lights without
     size.
+
+    Parameters
+    ----------
+    index : int64
+        Row of the table.
+    px, py, pz : float32
+        Point, world, m.
+    lx, ly, lz : float32
+        Direction from it, unit, world.
+    lights : LightTables
+
+    Returns
+    -------
+    float32
+        sr^-1.
     """
     table = lights.table
     t = light_hit(index, px, py, pz, lx, ly, lz, table)
@@ -288,17 +328,20 @@ def emission_along(origin, direction, hit, geometry, lights):  # type: ignore[no
     Parameters
     ----------
     origin, direction : tuple of float
-        World space; the direction is of unit length.
+        World, m; the direction is of unit length.
     hit : Hit
         Result of ``scene.interaction.nearest``.
     geometry : Geometry
         The scene's.
+    lights : LightTables
 
     Returns
     -------
-    r, g, b, diffuse, glossy : float
-        Radiance, 0 without a hit; density per solid angle, pick included, with which ``sample_light`` draws this
-        direction by this surface, for either lobe.
+    r, g, b : float32
+        Radiance, linear Rec.709; 0 without a hit.
+    diffuse, glossy : float32
+        Pdf per solid angle, pick included, sr^-1, with which ``sample_light`` draws this direction by this surface, for
+        either lobe.
     """
     if hit.face < 0:
         return ZERO, ZERO, ZERO, ZERO, ZERO
@@ -341,24 +384,26 @@ def _add_light(i, origin, direction, tmax, others, share, seen_by, lights):  # t
 
 @njit
 def lights_along(origin, direction, tmax, others, share, seen_by, lights):  # type: ignore[no-untyped-def]
-    """Sum over the lights with size that a ray meets of L / (others + share * pick * density).
+    """Lights with size that a ray meets, with MIS weight over pdf: the sum of L / (others + share * pick * density).
 
     Parameters
     ----------
     origin, direction : tuple of float
-        World space; the direction is of unit length.
-    tmax : float
-        Distance of the surface behind, infinite when none.
-    others : float
-        Sum over all other strategies of count times density in this direction; must be positive.
-    share : int
+        World, m; the direction is of unit length.
+    tmax : float32
+        Distance of the surface behind, m; infinite when none.
+    others : float32
+        Sum over all other strategies of count times pdf in this direction, sr^-1; must be positive.
+    share : float32
         Number of light samples that the balance heuristic reckons with; 0 leaves them out.
-    seen_by : int
+    seen_by : int64
         CAMERA, DIFFUSE or GLOSSY: lights that such rays do not see are left out.
+    lights : LightTables
 
     Returns
     -------
-    r, g, b : float
+    r, g, b : float32
+        Linear Rec.709, not shadowed.
     """
     ox, oy, oz = origin
     dx, dy, dz = direction
@@ -380,7 +425,17 @@ def lights_along(origin, direction, tmax, others, share, seen_by, lights):  # ty
 
 @njit
 def suns_along(origin, direction, tmax, others, share, seen_by, lights):  # type: ignore[no-untyped-def]
-    """`lights_along` of suns alone."""
+    """`lights_along` of suns alone.
+
+    Parameters
+    ----------
+    origin, direction, tmax, others, share, seen_by, lights : tuple, float32, int64 or LightTables
+        As of `lights_along`.
+
+    Returns
+    -------
+    r, g, b : float32
+    """
     pick = lights.pick
     red, green, blue = ZERO, ZERO, ZERO
     for i in range(np.int64(pick[0, SUNS]), np.int64(pick[0, END])):

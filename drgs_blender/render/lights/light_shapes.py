@@ -152,7 +152,22 @@ def _area(row: Array, light: Light, columns: Array, lengths: Array) -> float | N
 
 @njit
 def light_emission(i, lx, ly, lz, table):  # type: ignore[no-untyped-def]
-    """Share of its radiance that light `i` sends against the unit direction (lx, ly, lz), which points at it."""
+    """Share of its radiance that a light sends along a direction: a spot's cone, an area light's spread; else 1.
+
+    Parameters
+    ----------
+    i : int64
+        Row of the table.
+    lx, ly, lz : float32
+        Direction towards the light, unit, world.
+    table : (k, WIDTH) float32 array
+        `Lights.table`.
+
+    Returns
+    -------
+    float32
+        In [0, 1], with spread also above, as the power stays.
+    """
     if table[i, CONE_COS] > -ONE:
         w = -(lx * table[i, AXIS] + ly * table[i, AXIS + 1] + lz * table[i, AXIS + 2])
         u = lx * table[i, U_AXIS] + ly * table[i, U_AXIS + 1] + lz * table[i, U_AXIS + 2]
@@ -172,7 +187,24 @@ def light_emission(i, lx, ly, lz, table):  # type: ignore[no-untyped-def]
 
 @njit
 def light_hit(i, ox, oy, oz, dx, dy, dz, table):  # type: ignore[no-untyped-def]
-    """Distance at which a ray of unit direction meets light `i`, -1 when it does not. Suns are at infinity."""
+    """Intersection of a ray with a light.
+
+    Parameters
+    ----------
+    i : int64
+        Row of the table.
+    ox, oy, oz : float32
+        Origin, world, m.
+    dx, dy, dz : float32
+        Direction, unit, world.
+    table : (k, WIDTH) float32 array
+        `Lights.table`.
+
+    Returns
+    -------
+    float32
+        Distance, m, infinite for suns; -1 when the ray does not meet the light.
+    """
     kind = np.int32(table[i, KIND])
     if kind <= BARE_SUN:
         return -ONE
@@ -272,7 +304,26 @@ def _spherical_rectangle(a, b, u0, u1, v0, v1, height):  # type: ignore[no-untyp
 
 @njit
 def light_pdf(i, px, py, pz, lx, ly, lz, t, table):  # type: ignore[no-untyped-def]
-    """Density per solid angle with which `light_direction` draws a direction that meets light `i` at distance `t`."""
+    """The pdf, density per solid angle, with which `light_direction` draws a direction that meets the light.
+
+    Parameters
+    ----------
+    i : int64
+        Row of the table.
+    px, py, pz : float32
+        Point, world, m.
+    lx, ly, lz : float32
+        Direction from it, unit, world.
+    t : float32
+        Distance at which it meets the light, see `light_hit`, m.
+    table : (k, WIDTH) float32 array
+        `Lights.table`.
+
+    Returns
+    -------
+    float32
+        sr^-1; 0 of lights without size.
+    """
     kind = np.int32(table[i, KIND])
     if kind <= BARE_SUN:
         return ZERO
@@ -314,7 +365,26 @@ def _about(x, y, z, width, a, b):  # type: ignore[no-untyped-def]
 
 @njit
 def light_direction(i, n1, n2, px, py, pz, table):  # type: ignore[no-untyped-def]
-    """A unit direction towards light `i` and the distance, from two uint32; distance -1 when it sends nothing here."""
+    """Sample a direction towards a light.
+
+    Parameters
+    ----------
+    i : int64
+        Row of the table.
+    n1, n2 : uint32
+        Random numbers.
+    px, py, pz : float32
+        Point, world, m.
+    table : (k, WIDTH) float32 array
+        `Lights.table`.
+
+    Returns
+    -------
+    lx, ly, lz : float32
+        Unit, world.
+    t : float32
+        Distance, m, infinite for suns; -1 when the light sends nothing here.
+    """
     kind = np.int32(table[i, KIND])
     a, b = unit(n1), unit(n2)
     x, y, z = table[i, PLACE], table[i, PLACE + 1], table[i, PLACE + 2]

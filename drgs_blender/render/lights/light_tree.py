@@ -141,7 +141,22 @@ def _node_weight(node, px, py, pz, table, pick):  # type: ignore[no-untyped-def]
 
 @njit
 def lights_weight(px, py, pz, table, pick):  # type: ignore[no-untyped-def]
-    """Estimated luminance that arrives at a point from all lights, unshadowed; 0 only where nothing arrives."""
+    """Estimated luminance that arrives at a point from all lights, unshadowed; 0 only where nothing arrives.
+
+    Parameters
+    ----------
+    px, py, pz : float32
+        Point, world, m.
+    table : (k, WIDTH) float32 array
+        `Lights.table`.
+    pick : (m, 16) float32 array
+        `Lights.pick`.
+
+    Returns
+    -------
+    float32
+        From all directions together, as `Lights.power`.
+    """
     weight = pick[0, _SUN_POWER]
     if pick[0, SUNS] > ZERO:
         weight += _node_weight(np.int64(1), px, py, pz, table, pick)
@@ -150,7 +165,26 @@ def lights_weight(px, py, pz, table, pick):  # type: ignore[no-untyped-def]
 
 @njit
 def pick_light(n0, px, py, pz, table, pick):  # type: ignore[no-untyped-def]
-    """(index, probability) of the light that a uint32 picks for a point; (-1, 0) when it falls on none."""
+    """Pick a light for a point by the light tree (Conty Estevez and Kulla 2018).
+
+    Parameters
+    ----------
+    n0 : uint32
+        Random number.
+    px, py, pz : float32
+        Point, world, m.
+    table : (k, WIDTH) float32 array
+        `Lights.table`.
+    pick : (m, 16) float32 array
+        `Lights.pick`.
+
+    Returns
+    -------
+    index : int64
+        Row of the table; -1 when the number falls on none.
+    probability : float32
+        Of the pick; 0 for none.
+    """
     rest = np.float64(n0) * (1.0 / 4294967296.0)
     probability = 1.0
     first, past = np.int64(pick[0, SUNS]), np.int64(pick[0, END])
@@ -194,7 +228,23 @@ def pick_light(n0, px, py, pz, table, pick):  # type: ignore[no-untyped-def]
 
 @njit
 def pick_probability(i, px, py, pz, table, pick):  # type: ignore[no-untyped-def]
-    """Probability with which `pick_light` picks light `i` for a point."""
+    """Probability with which `pick_light` picks light `i` for a point.
+
+    Parameters
+    ----------
+    i : int64
+        Row of the table.
+    px, py, pz : float32
+        Point, world, m.
+    table : (k, WIDTH) float32 array
+        `Lights.table`.
+    pick : (m, 16) float32 array
+        `Lights.pick`.
+
+    Returns
+    -------
+    float32
+    """
     suns = np.float64(pick[0, _SUN_POWER])
     if F(i) >= pick[0, SUNS]:
         here = 0.0
@@ -233,7 +283,25 @@ def _slab(o, d, low, high, near, far):  # type: ignore[no-untyped-def]
 
 @njit
 def box_hit(node, ox, oy, oz, dx, dy, dz, tmax, pick):  # type: ignore[no-untyped-def]
-    """Whether a ray up to `tmax` meets a node's box."""
+    """Whether a ray meets the box of a node (slab test).
+
+    Parameters
+    ----------
+    node : int64
+        Row of the tree.
+    ox, oy, oz : float32
+        Origin, world, m.
+    dx, dy, dz : float32
+        Direction, unit, world.
+    tmax : float32
+        End of the ray, m.
+    pick : (m, 16) float32 array
+        `Lights.pick`.
+
+    Returns
+    -------
+    bool
+    """
     near, far = _slab(ox, dx, pick[node, _LOW], pick[node, _HIGH], ZERO, tmax)
     near, far = _slab(oy, dy, pick[node, _LOW + 1], pick[node, _HIGH + 1], near, far)
     near, far = _slab(oz, dz, pick[node, _LOW + 2], pick[node, _HIGH + 2], near, far)

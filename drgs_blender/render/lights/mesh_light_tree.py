@@ -163,7 +163,19 @@ def _node_weight(node, px, py, pz, tree):  # type: ignore[no-untyped-def]
 
 @njit
 def emitters_weight(px, py, pz, tree):  # type: ignore[no-untyped-def]
-    """Estimated luminance that arrives at a point from all triangles, unshadowed; float64."""
+    """Estimated luminance that arrives at a point from all triangles, unshadowed; float64.
+
+    Parameters
+    ----------
+    px, py, pz : float32
+        Point, world, m.
+    tree : Tree
+
+    Returns
+    -------
+    float64
+        From all directions together, as `Lights.power`.
+    """
     weight, _ = _node_weight(np.int64(1), px, py, pz, tree)
     return np.float64(load_float(tree.nodes, 0)) * np.float64(weight)
 
@@ -189,7 +201,23 @@ def _power(i, tree):  # type: ignore[no-untyped-def]
 
 @njit
 def pick_emitter(rest, px, py, pz, tree):  # type: ignore[no-untyped-def]
-    """(row, probability) of the triangle that a float64 in [0, 1) picks for a point; (-1, 0) when none."""
+    """Pick an emitting triangle for a point by the light tree.
+
+    Parameters
+    ----------
+    rest : float64
+        Random number in [0, 1).
+    px, py, pz : float32
+        Point, world, m.
+    tree : Tree
+
+    Returns
+    -------
+    row : int64
+        -1 when the number falls on none.
+    probability : float64
+        Of the pick; 0 for none.
+    """
     node, probability = np.int64(1), 1.0
     here, flat = _node_weight(node, px, py, pz, tree)
     while node < tree.leaves and not flat:
@@ -223,7 +251,20 @@ def pick_emitter(rest, px, py, pz, tree):  # type: ignore[no-untyped-def]
 
 @njit
 def emitter_probability(i, px, py, pz, tree):  # type: ignore[no-untyped-def]
-    """Probability with which `pick_emitter` picks row `i` for a point."""
+    """Probability with which `pick_emitter` picks row `i` for a point.
+
+    Parameters
+    ----------
+    i : int64
+        Row of the triangle.
+    px, py, pz : float32
+        Point, world, m.
+    tree : Tree
+
+    Returns
+    -------
+    float64
+    """
     leaf = tree.leaves + ((i + 1) * tree.leaves - 1) // tree.size
     level = 0
     while leaf >> level > 1:

@@ -293,7 +293,32 @@ def _fill(own, vertices, faces, matrices, luminance, bits, turned, rows):  # typ
 
 @njit
 def sample_emitter(rest, n1, n2, px, py, pz, emitters):  # type: ignore[no-untyped-def]
-    """`lights.sample_light` among emitting triangles: `rest` in [0, 1), float64, picks, two uint32 choose the place."""
+    """Light sampling among emitting triangles, see `light_sampler.sample_light`.
+
+    Parameters
+    ----------
+    rest : float64
+        Random number in [0, 1) for the pick.
+    n1, n2 : uint32
+        Random numbers for the place on the triangle.
+    px, py, pz : float32
+        Point, world, m.
+    emitters : int64
+        Address, see `LightTables`; not 0.
+
+    Returns
+    -------
+    lx, ly, lz : float32
+        Unit, world.
+    distance : float32
+        Metres.
+    r, g, b : float32
+        Radiance, linear Rec.709.
+    pdf : float32
+        Per solid angle times the probability of the pick, sr^-1; 0 when nothing is sent here.
+    row : int64
+        Of the triangle; -1 for none.
+    """
     tables = _tables(emitters)
     i, probability = pick_emitter(rest, px, py, pz, tables.tree)
     if i < 0:
@@ -308,7 +333,19 @@ def sample_emitter(rest, n1, n2, px, py, pz, emitters):  # type: ignore[no-untyp
 
 @njit
 def emitter_row(face, instance, emitters):  # type: ignore[no-untyped-def]
-    """Row of the triangle that a ray hit, -1 when it is not sampled."""
+    """Row of the triangle that a ray hit, -1 when it is not sampled.
+
+    Parameters
+    ----------
+    face, instance : int32
+        As of `Hit`.
+    emitters : int64
+        Address, see `LightTables`; 0: there are none.
+
+    Returns
+    -------
+    int64
+    """
     if emitters == 0:
         return np.int64(-1)
     tables = _tables(emitters)
@@ -325,13 +362,44 @@ def emitter_row(face, instance, emitters):  # type: ignore[no-untyped-def]
 
 @njit
 def emitter_bits(i, emitters):  # type: ignore[no-untyped-def]
-    """Bits of a row, see `triangles`."""
+    """Bits of an emitting triangle, see `triangle_light`.
+
+    Parameters
+    ----------
+    i : int64
+        Row.
+    emitters : int64
+        Address, see `LightTables`.
+
+    Returns
+    -------
+    int64
+    """
     return np.int64(load_float(_tables(emitters).tree.rows, WIDTH * i + BITS))
 
 
 @njit
 def emitter_pdf(i, px, py, pz, lx, ly, lz, t, emitters):  # type: ignore[no-untyped-def]
-    """Density per solid angle, pick included, of `sample_emitter` in the direction that meets row `i` at t."""
+    """The pdf per solid angle, pick included, of `sample_emitter` in a direction that meets a triangle.
+
+    Parameters
+    ----------
+    i : int64
+        Row of the triangle.
+    px, py, pz : float32
+        Point, world, m.
+    lx, ly, lz : float32
+        Direction from it, unit, world.
+    t : float32
+        Distance at which it meets the triangle, m.
+    emitters : int64
+        Address, see `LightTables`.
+
+    Returns
+    -------
+    float32
+        sr^-1.
+    """
     tree = _tables(emitters).tree
     density = triangle_density(i, px, py, pz, lx, ly, lz, t, tree.rows)
     return F(density * emitter_probability(i, px, py, pz, tree))
@@ -339,5 +407,18 @@ def emitter_pdf(i, px, py, pz, lx, ly, lz, t, emitters):  # type: ignore[no-unty
 
 @njit
 def emitters_luminance(px, py, pz, emitters):  # type: ignore[no-untyped-def]
-    """Estimated luminance that arrives at a point from all that is sampled, unshadowed; float64."""
+    """Estimated luminance that arrives at a point from all triangles that are sampled, unshadowed.
+
+    Parameters
+    ----------
+    px, py, pz : float32
+        Point, world, m.
+    emitters : int64
+        Address, see `LightTables`.
+
+    Returns
+    -------
+    float64
+        From all directions together, as `Lights.power`.
+    """
     return emitters_weight(px, py, pz, _tables(emitters).tree)

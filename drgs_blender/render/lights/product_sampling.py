@@ -36,7 +36,19 @@ def normals() -> Array:
 
 @njit
 def product_row(nx, ny, nz, envmap):  # type: ignore[no-untyped-def]
-    """Row of the tables for a unit world normal."""
+    """Row of the tables whose normal is nearest in the octahedral map.
+
+    Parameters
+    ----------
+    nx, ny, nz : float32
+        Shading normal, unit, world.
+    envmap : EnvMap
+
+    Returns
+    -------
+    int32
+        0 to SIDE^2 - 1.
+    """
     x = envmap.xx * nx + envmap.xy * ny + envmap.xz * nz
     y = envmap.yx * nx + envmap.yy * ny + envmap.yz * nz
     z = envmap.zx * nx + envmap.zy * ny + envmap.zz * nz
@@ -128,7 +140,20 @@ def _find_slices(first, last, starts, blocks, slices):  # type: ignore[no-untype
 
 @njit
 def block_of(row, n, envmap):  # type: ignore[no-untyped-def]
-    """Block on which the random number n (uint32) falls in a row of the tables."""
+    """Block of cells on which a random number falls: the CDF of one row of the tables, inverted.
+
+    Parameters
+    ----------
+    row : int
+        `product_row`.
+    n : uint32
+        Random number.
+    envmap : EnvMap
+
+    Returns
+    -------
+    int64
+    """
     n = min(np.uint32(n), np.uint32(2**32 - 2))  # the largest number fills the rows up
     base = np.int64(row) * np.int64(envmap.blocks)
     place = np.int64(load_int32(envmap.slices, np.int64(row) * _SLICES + (np.int64(n) >> _SLICE)))
@@ -142,6 +167,23 @@ def in_cells_order(row, block, n, below, envmap):  # type: ignore[no-untyped-def
     """Random number n, which fell on a block, among those of the block's cells; and the row's ratio there.
 
     `below` (uint32) stands behind n's last digit: where a block's run grows, all its cells stay reachable.
+
+    Parameters
+    ----------
+    row : int
+        `product_row`.
+    block : int64
+        `block_of` the two.
+    n, below : uint32
+        Random numbers.
+    envmap : EnvMap
+
+    Returns
+    -------
+    number : uint32
+        For `environment.first_cell`.
+    ratio : float32
+        Factor of the pdf, see `product_ratio`.
     """
     place = np.int64(row) * np.int64(envmap.blocks) + block
     ratio = load_float(envmap.ratio, place)
@@ -154,6 +196,19 @@ def in_cells_order(row, block, n, below, envmap):  # type: ignore[no-untyped-def
 
 @njit
 def product_ratio(row, cell_row, cell_column, envmap):  # type: ignore[no-untyped-def]
-    """Density of light sampling by a row of the tables over that without, in the cell at (row, column)."""
+    """Pdf of product sampling over that without a normal, in a cell.
+
+    Parameters
+    ----------
+    row : int
+        `product_row`.
+    cell_row, cell_column : int64
+        Of the cell among cells.
+    envmap : EnvMap
+
+    Returns
+    -------
+    float32
+    """
     place = (np.int64(cell_row) >> envmap.shift) * envmap.block_columns + (np.int64(cell_column) >> envmap.shift)
     return load_float(envmap.ratio, np.int64(row) * np.int64(envmap.blocks) + np.int64(load_int32(envmap.block, place)))

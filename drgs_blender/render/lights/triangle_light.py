@@ -76,7 +76,22 @@ def _frame(i, px, py, pz, rows):  # type: ignore[no-untyped-def]
 
 @njit
 def triangle_weight(i, px, py, pz, rows):  # type: ignore[no-untyped-def]
-    """Luminance that arrives at a point from a triangle, unshadowed, from all directions together: an estimate > 0."""
+    """Estimated luminance that arrives at a point from a triangle, unshadowed: its weight in the pick; above 0.
+
+    Parameters
+    ----------
+    i : int64
+        Row of the triangle.
+    px, py, pz : float32
+        Point, world, m.
+    rows : int64
+        Address of (n, WIDTH) float32.
+
+    Returns
+    -------
+    float32
+        From all directions together, in the unit of the rows' LUMINANCE times sr.
+    """
     k = WIDTH * np.int64(i)
     corner, middle, edge, side, square, near = _frame(i, px, py, pz, rows)
     normal, area, own = _vector(rows, k + NORMAL), load_float(rows, k + AREA), load_float(rows, k + LUMINANCE)
@@ -140,13 +155,29 @@ def _spherical(u, v, solid, a, b, c):  # type: ignore[no-untyped-def]
 
 @njit
 def triangle_direction(i, n1, n2, px, py, pz, rows):  # type: ignore[no-untyped-def]
-    """A direction towards triangle `i`, from two numbers in [0, 1).
+    """Sample a direction towards a triangle, by solid angle (Arvo 1995) or by area (PBRT 6.5.4).
+
+    Parameters
+    ----------
+    i : int64
+        Row of the triangle.
+    n1, n2 : float32
+        Random numbers in [0, 1).
+    px, py, pz : float32
+        Point, world, m.
+    rows : int64
+        Address of (n, WIDTH) float32.
 
     Returns
     -------
-    lx, ly, lz, t, u, v, density : float
-        Unit direction, distance (not positive when it is none: the triangle is seen from its edge), barycentric
-        coordinates of the second and third corner, density per solid angle.
+    lx, ly, lz : float32
+        Unit, world.
+    t : float32
+        Distance, m; not positive when it is none: the triangle is seen from its edge.
+    u, v : float32
+        Barycentric coordinates of the second and third corner.
+    density : float32
+        Pdf per solid angle, sr^-1.
     """
     k = WIDTH * np.int64(i)
     corner, _, edge, side, _, near = _frame(i, px, py, pz, rows)
@@ -175,7 +206,26 @@ def triangle_direction(i, n1, n2, px, py, pz, rows):  # type: ignore[no-untyped-
 
 @njit
 def triangle_density(i, px, py, pz, lx, ly, lz, t, rows):  # type: ignore[no-untyped-def]
-    """Density per solid angle with which `triangle_direction` draws the direction l, which meets it at distance t."""
+    """The pdf per solid angle with which `triangle_direction` draws a direction that meets the triangle.
+
+    Parameters
+    ----------
+    i : int64
+        Row of the triangle.
+    px, py, pz : float32
+        Point, world, m.
+    lx, ly, lz : float32
+        Direction from it, unit, world.
+    t : float32
+        Distance at which it meets the triangle, m.
+    rows : int64
+        Address of (n, WIDTH) float32.
+
+    Returns
+    -------
+    float32
+        sr^-1.
+    """
     k = WIDTH * np.int64(i)
     corner, _, edge, side, _, near = _frame(i, px, py, pz, rows)
     solid, _, _, _ = _angle(corner, edge, side, near)

@@ -161,13 +161,29 @@ _TRACED = types.Tuple((types.float32,) + (types.int32,) * 3 + (types.float32,) *
 
 @intrinsic
 def trace(typing, address, scene, ray):  # type: ignore[no-untyped-def]
-    """Closest hit of one ray, for compiled code: ``(t, group, primitive, instance, u, v, gx, gy, gz)``.
+    """Closest hit of one ray, for compiled code; the ray meets groups that have one of its mask's bits.
 
-    `address` is ``TriangleBVH.intersect_address`` and `scene` ``TriangleBVH.scene``, both int64; `ray` is a `Ray`, its
-    numbers of the very types that are given there: it meets groups that have one of its mask's bits. ``group`` is -1
-    when nothing is hit (then t is `tfar`); ``primitive`` counts from the group's first face; ``instance`` counts the
-    group's places, -1 for a group that stands in the world as it is. The hit is (1 - u - v) v0 + u v1 + v v2;
-    (gx, gy, gz) is the geometric normal (v1 - v0) x (v2 - v0), **not** of unit length, before the instance's matrix.
+    Parameters
+    ----------
+    address, scene : int64
+        ``TriangleBVH.intersect_address`` and ``TriangleBVH.scene``.
+    ray : Ray
+        Its numbers must be of exactly the types that `Ray` states.
+
+    Returns
+    -------
+    t : float32
+        Distance in lengths of the direction; `tfar` when nothing is hit.
+    group : int32
+        -1 when nothing is hit.
+    primitive : int32
+        Face, from the group's first one on.
+    instance : int32
+        Of the group's places; -1 for a group that stands in the world as it is.
+    u, v : float32
+        Barycentric coordinates: the hit is (1 - u - v) v0 + u v1 + v v2.
+    gx, gy, gz : float32
+        Geometric normal (v1 - v0) x (v2 - v0), **not** of unit length, before the instance's matrix.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -188,9 +204,17 @@ def trace(typing, address, scene, ray):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def blocked(typing, address, scene, ray):  # type: ignore[no-untyped-def]
-    """Return whether anything that has a bit of the ray's mask lies on it; see `trace`.
+    """Shadow ray: whether anything that has a bit of the ray's mask lies on it; see `trace`.
 
-    `address` is ``TriangleBVH.occluded_address``.
+    Parameters
+    ----------
+    address, scene : int64
+        ``TriangleBVH.occluded_address`` and ``TriangleBVH.scene``.
+    ray : Ray
+
+    Returns
+    -------
+    bool
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -83,7 +83,18 @@ class Geometry(NamedTuple):
 
 @njit
 def nearest(tracer, ray):  # type: ignore[no-untyped-def]
-    """Closest `Hit` of a `Ray`."""
+    """Closest hit of a ray among the meshes.
+
+    Parameters
+    ----------
+    tracer : Tracer
+        Or anything that has its fields.
+    ray : Ray
+
+    Returns
+    -------
+    Hit
+    """
     t, group, face, instance, u, v, gx, gy, gz = trace(tracer.intersect, tracer.scene, ray)
     if group >= 0:
         face = np.int32(face + load_int32(tracer.first_face, group))
@@ -94,7 +105,18 @@ def nearest(tracer, ray):  # type: ignore[no-untyped-def]
 
 @njit
 def shadowed(tracer, ray):  # type: ignore[no-untyped-def]
-    """Whether a shadow `Ray` is blocked by anything that its mask includes."""
+    """Whether a shadow `Ray` is blocked by anything that its mask includes.
+
+    Parameters
+    ----------
+    tracer : Tracer
+        Or anything that has its fields.
+    ray : Ray
+
+    Returns
+    -------
+    bool
+    """
     return blocked(tracer.occluded, tracer.scene, ray)
 
 
@@ -148,7 +170,21 @@ def _tables(geometry):  # type: ignore[no-untyped-def]
 
 @njit
 def emitted(face, u, v, geometry):  # type: ignore[no-untyped-def]
-    """(er, eg, eb) of `surface_at`: radiance that leaves a point of a face, on both sides."""
+    """Radiance that a point of a face emits, on both sides; as `surface_at` has it.
+
+    Parameters
+    ----------
+    face : int32
+        Of the scene.
+    u, v : float32
+        Barycentric coordinates of the second and third corner.
+    geometry : Geometry
+
+    Returns
+    -------
+    er, eg, eb : float32
+        Linear Rec.709.
+    """
     if face < geometry.vertex_faces:
         return ZERO, ZERO, ZERO
     own = np.int64(face) - geometry.vertex_faces
@@ -170,13 +206,20 @@ def surface_at(hit, direction, geometry):  # type: ignore[no-untyped-def]
     hit : Hit
         Of a face; `t` is not read.
     direction : tuple of float
-        Of the ray.
+        Of the ray, world, of any length.
     geometry : Geometry
 
     Returns
     -------
-    nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, object : float
-        Unit shading and geometric normal, albedo, emitted radiance; linear Rec.709.
+    nx, ny, nz, gx, gy, gz : float32
+        Unit shading and geometric normal, world.
+    r, g, b : float32
+        Albedo, linear Rec.709.
+    roughness, metallic : float32
+        In [0, 1].
+    er, eg, eb : float32
+        Emitted radiance, linear Rec.709.
+    object : int32
     """
     _, face, instance, u, v, gx, gy, gz = hit
     dx, dy, dz = direction
@@ -235,10 +278,19 @@ def position_at(face, instance, u, v, vertices, faces, instances):  # type: igno
 
     Parameters
     ----------
+    face, instance : int32
+        As of `Hit`.
+    u, v : float32
+        Barycentric coordinates of the second and third corner.
     vertices, faces : array
-        ``TriangleBVH``'s.
+        ``TriangleBVH``'s: (n, 3) float32, m, and (m, 3) int32.
     instances : (p, 3, 4) float32 array
         ``TraceScene.instances``.
+
+    Returns
+    -------
+    x, y, z : float64
+        World, m.
     """
     w = 1.0 - np.float64(u) - np.float64(v)
     a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]

@@ -60,7 +60,17 @@ class Rays(NamedTuple):
 
 @inlined
 def ray_at(rays, i):  # type: ignore[no-untyped-def]
-    """One `Ray` of many."""
+    """One `Ray` of many.
+
+    Parameters
+    ----------
+    rays : Rays
+    i : int64
+
+    Returns
+    -------
+    Ray
+    """
     origin = rays.origins[i, 0], rays.origins[i, 1], rays.origins[i, 2]
     direction = rays.directions[i, 0], rays.directions[i, 1], rays.directions[i, 2]
     return Ray(origin, direction, rays.tnear, rays.tfar, rays.mask)

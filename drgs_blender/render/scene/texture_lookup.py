@@ -202,7 +202,19 @@ def _emission(row, er, eg, eb, u, v, addresses):  # type: ignore[no-untyped-def]
 
 @njit
 def emits(material, addresses):  # type: ignore[no-untyped-def]
-    """Whether a material emits light, its texture apart."""
+    """Whether a material emits light, its texture apart.
+
+    Parameters
+    ----------
+    material : int32
+        Row of the table.
+    addresses : tuple of int
+        ``MaterialTable.addresses``.
+
+    Returns
+    -------
+    bool
+    """
     i = 8 * np.int64(material)
     return (
         max(load_float(addresses[0], i + 5), max(load_float(addresses[0], i + 6), load_float(addresses[0], i + 7))) > 0
@@ -211,7 +223,22 @@ def emits(material, addresses):  # type: ignore[no-untyped-def]
 
 @njit
 def emission_at(material, u, v, addresses):  # type: ignore[no-untyped-def]
-    """(er, eg, eb) of `material_at`."""
+    """Emitted radiance of a material at texture coordinates, as `material_at` has it.
+
+    Parameters
+    ----------
+    material : int32
+        Row of the table.
+    u, v : float32
+        Texture coordinates, v upwards.
+    addresses : tuple of int
+        ``MaterialTable.addresses``.
+
+    Returns
+    -------
+    er, eg, eb : float32
+        Linear Rec.709.
+    """
     i, row = 8 * np.int64(material), np.int64(load_int32(addresses[1], 4 * np.int64(material) + 3))
     er, eg, eb = load_float(addresses[0], i + 5), load_float(addresses[0], i + 6), load_float(addresses[0], i + 7)
     return _emission(row, er, eg, eb, u, v, addresses)

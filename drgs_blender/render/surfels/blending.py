@@ -66,7 +66,17 @@ _1, _2, _3, _4, _5, _6, _7 = (np.uintp(k) for k in range(1, 8))
 
 @njit
 def merge_sort(z, base, n, order):  # type: ignore[no-untyped-def]
-    """Stable order of z[base .. base + n] when these are many."""
+    """Order of many contributions by depth: merge sort, stable.
+
+    Parameters
+    ----------
+    z : (LANES * room,) float32 array
+        Depths, `Contributions.depth`.
+    base, n : int64
+        First entry of the sample, and how many.
+    order : (room,) int32 array
+        `n` entries are written: places from `base` on, nearest first.
+    """
     by_depth = np.argsort(z[base : base + n], kind="mergesort")
     for k in range(n):
         order[k] = by_depth[k]
@@ -74,7 +84,19 @@ def merge_sort(z, base, n, order):  # type: ignore[no-untyped-def]
 
 @njit
 def rank_sort(z, base, n, rank, order):  # type: ignore[no-untyped-def]
-    """Stable order of z[base .. base + n] by counting, for each, how many come before it: vector code, no branch."""
+    """Order of a few contributions by depth, stable: counts, for each, how many come before it. Vector code, no branch.
+
+    Parameters
+    ----------
+    z : (LANES * room,) float32 array
+        Depths, `Contributions.depth`; entries beyond the sample's up to a multiple of LANES are set to infinity.
+    base, n : int64
+        First entry of the sample, and how many.
+    rank : (LANES,) int32 array
+        Scratch.
+    order : (room,) int32 array
+        `n` entries are written: places from `base` on, nearest first.
+    """
     for k in range(n, (n + LANES - 1) // LANES * LANES):
         z[np.uintp(base + k)] = np.float32(np.inf)
     for at in range(0, n, LANES):
@@ -106,7 +128,16 @@ def rank_sort(z, base, n, rank, order):  # type: ignore[no-untyped-def]
 
 @njit
 def sort(lists, base, n, scratch):  # type: ignore[no-untyped-def]
-    """Put the contributions of a sample in order."""
+    """Sort the contributions of a sample by depth, front to back.
+
+    Parameters
+    ----------
+    lists : Contributions
+    base, n : int64
+        First entry of the sample, and how many.
+    scratch : Scratch
+        `order` is written.
+    """
     if n > MANY:
         merge_sort(lists.depth, base, n, scratch.order)
     else:
@@ -115,7 +146,22 @@ def sort(lists, base, n, scratch):  # type: ignore[no-untyped-def]
 
 @njit
 def prune(lists, base, n, scratch):  # type: ignore[no-untyped-def]
-    """Sort the contributions of a sample, drop those behind the point where it is opaque; how many remain."""
+    """Sort the contributions of a sample in place, and drop those behind the point where it is opaque.
+
+    Parameters
+    ----------
+    lists : Contributions
+        Written.
+    base, n : int64
+        First entry of the sample, and how many.
+    scratch : Scratch
+        Written.
+
+    Returns
+    -------
+    int64
+        How many remain.
+    """
     sort(lists, base, n, scratch)
     z, alpha, splat, order = lists.depth, lists.strength, lists.splat, scratch.order
     old_z, old_alpha, old_splat = (
@@ -136,20 +182,49 @@ def prune(lists, base, n, scratch):  # type: ignore[no-untyped-def]
 
 @njit
 def contributions(room):  # type: ignore[no-untyped-def]
-    """Empty lists."""
+    """Lists for the contributions of a block, not filled.
+
+    Parameters
+    ----------
+    room : int64
+        Places per sample, a multiple of LANES.
+
+    Returns
+    -------
+    Contributions
+    """
     size = LANES * room
     return Contributions(room, np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.int32))
 
 
 @njit
 def scratch_for(room):  # type: ignore[no-untyped-def]
-    """Scratch memory for lists with so much room."""
+    """Scratch memory for lists with so much room.
+
+    Parameters
+    ----------
+    room : int64
+        As of `contributions`.
+
+    Returns
+    -------
+    Scratch
+    """
     return Scratch(np.empty(LANES, np.int32), np.empty(room, np.int32), np.empty(room, np.float32))
 
 
 @njit
 def widen(lists):  # type: ignore[no-untyped-def]
-    """Copy of the lists with twice the capacity."""
+    """Copy of the lists with twice the capacity.
+
+    Parameters
+    ----------
+    lists : Contributions
+
+    Returns
+    -------
+    Contributions
+    """
     room, wider = lists.room, contributions(2 * lists.room)
     for lane in range(LANES):
         old, new = room * lane, 2 * room * lane
@@ -162,10 +237,32 @@ def widen(lists):  # type: ignore[no-untyped-def]
 
 @njit
 def weigh(surface, lists, base, n, scratch, pixel_base, pixel):  # type: ignore[no-untyped-def]
-    """Weights of the sorted contributions of a sample.
+    """Weights (transmittance times alpha) of the sorted contributions of a sample, and its heaviest cluster.
 
-    Returns its transmittance, and the weight, depth times weight, heaviest splat, first and last contribution of the
-    heaviest cluster. ``pixel_base + pixel z`` is the width of a pixel at depth z, metres.
+    Parameters
+    ----------
+    surface : (m, SPLAT) float32 array
+        Of the splats; see `columns`.
+    lists : Contributions
+    base, n : int64
+        First entry of the sample, and how many.
+    scratch : Scratch
+        `order` is read, see `sort`; `weights` is written.
+    pixel_base, pixel : float32
+        ``pixel_base + pixel z`` is the width of a pixel at depth z, m.
+
+    Returns
+    -------
+    t : float32
+        Transmittance of all.
+    weight : float32
+        Of the heaviest cluster; so the others.
+    depth : float32
+        Sum of depth times weight, m.
+    owner : int32
+        Splat of the largest weight.
+    begin, end : int64
+        Its contributions, half-open, in their order.
     """
     order, weights = scratch.order, scratch.weights
     depths, strengths, splats = lists.depth, lists.strength, lists.splat
@@ -198,7 +295,33 @@ def weigh(surface, lists, base, n, scratch, pixel_base, pixel):  # type: ignore[
 
 @njit
 def mean(surface, lists, base, scratch, total, begin, end):  # type: ignore[no-untyped-def]
-    """Unit normal and mean attributes of the contributions begin .. end, whose weights sum to `total`."""
+    """Mean attributes, by weight, of the contributions of a cluster.
+
+    Parameters
+    ----------
+    surface : (m, SPLAT) float32 array
+        Of the splats; see `columns`.
+    lists : Contributions
+    base : int64
+        First entry of the sample.
+    scratch : Scratch
+        As `weigh` left it.
+    total : float32
+        Sum of their weights.
+    begin, end : int64
+        The contributions, half-open, in their order.
+
+    Returns
+    -------
+    nx, ny, nz : float32
+        Shading normal, unit, world; 0 where normals cancel.
+    red, green, blue : float32
+        Albedo, linear Rec.709.
+    roughness, metallic : float32
+        In [0, 1].
+    size : float32
+        Larger standard deviation, m.
+    """
     order, weights, splats = scratch.order, scratch.weights, lists.splat
     zero, one = np.float32(0.0), np.float32(1.0)
     nx = ny = nz = red = green = blue = roughness = metallic = size = zero

@@ -1,11 +1,12 @@
 """The rasteriser: surfels to sub-pixel samples by exact ray-splat intersection, blended front to back, on the CPU.
 
-The splats of a frame come from `splats`, their alpha blending from `blending`. The kernel of a sample is G =
-max(exp(-(u^2 + v^2) / 2), exp(-n d^2)), d the distance in pixels between the sample and the projected centre, n the
-samples a pixel: the low-pass filter of 2DGS (Huang et al. 2024) at the rate at which the picture is sampled, so that
-silhouettes do not grow by a pixel where there are sub-samples. A sample that the low-pass decides has the centre's
-depth. Contributions alpha G below 1/255 are skipped, others clamped to 0.99 and blended until the transmittance is
-below 1e-4.
+The splats of a frame come from `splats`, their alpha blending from `blending`. A splat's alpha at a sample is opacity
+times its kernel G = max(exp(-(u^2 + v^2) / 2), c exp(-n d^2)), d the distance in pixels between the sample and the
+projected centre, n the samples per pixel: the low-pass filter of 2DGS (Huang et al. 2024) at the rate at which the
+picture is sampled, so that silhouettes do not grow by a pixel where there are sub-samples. c is the cosine at which
+the surfel is seen (`splats.DIM` is -2 ln c): it weakens the filter of surfels edge-on. A sample that the low-pass
+decides has the centre's depth. Alphas below 1/255 are skipped, others clamped to 0.99 and blended until the
+transmittance is below 1e-4.
 
 Order. Contributions are blended by the depth at which the ray meets them, not by that of the surfels' centres: every
 sample lists its contributions and sorts them once all are there. A list that is full is sorted early and cut where the
@@ -166,6 +167,15 @@ def gaussian(q):  # type: ignore[no-untyped-def]
     """exp(-q / 2) for 0 <= q <= 12, relative error below 4e-6: Taylor's series of exp(-q / 32) to the 16th power.
 
     Branch-free, so that a loop over samples becomes vector code.
+
+    Parameters
+    ----------
+    q : float32
+        Square radius in standard deviations.
+
+    Returns
+    -------
+    float32
     """
     t = q * np.float32(-1.0 / 32.0)
     y = np.float32(1.0 / 720.0)

@@ -77,8 +77,10 @@ class Splats(NamedTuple):
     nearest : (m,) float32 array
         Least depth of any contribution.
     object_index : (m,) int32 array
-    tile_start : array
-        (tiles + 1,) int64 and tile_list (k,) int32: splats of each tile, in order.
+    tile_start : (tiles + 1,) int64 array
+        First entry of each tile in ``tile_list``, row by row.
+    tile_list : (k,) int32 array
+        Splats of each tile, in order.
     x0, y0, x1, y1 : int
         The camera's window, full-picture pixels.
     parameters : array
@@ -150,7 +152,20 @@ def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
 
 @inlined
 def to_camera(p, x, y, z):  # type: ignore[no-untyped-def]
-    """World direction to camera coordinates (right, down, forward)."""
+    """World vector to camera coordinates: x right, y down, depth forward.
+
+    Parameters
+    ----------
+    p : (PARAMETERS,) float64 array
+        `camera.camera_parameters`.
+    x, y, z : float64
+        World, m; of a point, from the camera's position.
+
+    Returns
+    -------
+    right, down, forward : float64
+        Metres.
+    """
     right, up = p[0] * x + p[3] * y + p[6] * z, p[1] * x + p[4] * y + p[7] * z
     forward = p[LEAN] * right + p[LEAN + 1] * up - (p[2] * x + p[5] * y + p[8] * z)
     return right + p[LEAN] * forward, -(up + p[LEAN + 1] * forward), forward
@@ -160,8 +175,27 @@ def to_camera(p, x, y, z):  # type: ignore[no-untyped-def]
 def span(focal, centre, sc, pa, pb, sa, sb, r2):  # type: ignore[no-untyped-def]
     """Least and greatest screen coordinate of the disc u^2 + v^2 <= r2, wholly in front of the camera.
 
-    The tangent lines x = x0 + t of the disc's outline solve a quadratic in t; ``pa``, ``pb`` are the tangents'
-    components minus x0 times their depth components, x0 the centre's coordinate.
+    The tangent lines x = x0 + t of the disc's outline solve a quadratic in t; x0 is the centre's coordinate.
+
+    Parameters
+    ----------
+    focal : float64
+        Focal length, pixels; of an orthographic camera pixels per metre.
+    centre : float64
+        Screen coordinate of the disc's centre, pixels.
+    sc : float64
+        Depth of the centre, m; 1 for an orthographic camera.
+    pa, pb : float64
+        Components of the tangents along the axis, minus x0 times their depth components, m.
+    sa, sb : float64
+        Depth components of the tangents, m; 0 for an orthographic camera.
+    r2 : float64
+        Square radius in standard deviations.
+
+    Returns
+    -------
+    low, high : float64
+        Pixels.
     """
     qa = sc * sc - r2 * (sa * sa + sb * sb)
     qb = r2 * (pa * sa + pb * sb)
@@ -201,7 +235,21 @@ def _project(first, last, posed, p, window, screen, box, nearest):  # type: igno
 
 @njit
 def project_surfel(i, posed, p, window, screen, box, nearest):  # type: ignore[no-untyped-def]
-    """Fill screen record, box and nearest depth of surfel i; a culled surfel has an empty box (x1 = x0 = 0)."""
+    """Project a surfel: its screen record, box and nearest depth; a culled surfel has an empty box (x1 = x0 = 0).
+
+    Parameters
+    ----------
+    i : int64
+        Row of the surfel.
+    posed : Posed
+        World, m.
+    p : (PARAMETERS,) float64 array
+        `camera.camera_parameters`.
+    window : tuple of int
+        (x0, y0, x1, y1), full-picture pixels.
+    screen, box, nearest : array
+        Row `i` is written, see `Splats`.
+    """
     centre, tangent_u, tangent_v, opacity = posed.centre, posed.tangent_u, posed.tangent_v, posed.opacity
     wx0, wy0, wx1, wy1 = window
     near, far, ortho = p[CLIP_START], p[CLIP_END], p[ORTHOGRAPHIC] != 0.0
@@ -295,15 +343,34 @@ def _dim(along, whole):  # type: ignore[no-untyped-def]
 
 @inlined
 def depth_key(bits):  # type: ignore[no-untyped-def]
-    """Bits of a float32 as an integer that compares like the number: negative ones are reversed."""
+    """Key of a depth for a radix sort: the bits of a float32 as an integer that compares like the number.
+
+    Parameters
+    ----------
+    bits : uint32
+
+    Returns
+    -------
+    uint32
+    """
     return np.uint32(~bits if bits >> np.uint32(31) else bits | np.uint32(0x80000000))
 
 
 @njit
 def depth_order(centre_depth, box):  # type: ignore[no-untyped-def]
-    """Indices of the surfels with a box (n, 4), by centre depth (n,) float32; equal depths keep their order.
+    """Depth sort of the surfels that have a box (radix sort, 3 x 11 bits); equal depths keep their order.
 
-    Radix sort, 3 x 11 bits.
+    Parameters
+    ----------
+    centre_depth : (n,) float32 array
+        Metres along the view axis.
+    box : (n, 4) int32 array
+        See `Splats`.
+
+    Returns
+    -------
+    (m,) int64 array
+        Rows, nearest first.
     """
     n = 0
     for i in range(len(box)):
@@ -345,7 +412,17 @@ def _gather_surface(first, last, order, posed, out):  # type: ignore[no-untyped-
 
 @njit
 def pack_surface(i, k, posed, out):  # type: ignore[no-untyped-def]
-    """Pack what blending reads of surfel i as splat k."""
+    """Pack what blending reads of surfel i as splat k.
+
+    Parameters
+    ----------
+    i, k : int64
+        Row of the surfel; row of the splat.
+    posed : Posed
+        World, m.
+    out : (m, SPLAT) float32 array
+        Row `k` is written, see `Splats.surface`.
+    """
     tangent_u, tangent_v = posed.tangent_u, posed.tangent_v
     uu = vv = np.float32(0.0)
     for c in range(3):
@@ -359,13 +436,43 @@ def pack_surface(i, k, posed, out):  # type: ignore[no-untyped-def]
 
 @inlined
 def tiles_of(box, i):  # type: ignore[no-untyped-def]
-    """Columns and rows of tiles (x0, y0, x1, y1), half-open, that the box of splat i touches."""
+    """Tiles that the box of a splat touches.
+
+    Parameters
+    ----------
+    box : (m, 4) int32 array
+        See `Splats`.
+    i : int64
+        Row of the splat.
+
+    Returns
+    -------
+    x0, y0, x1, y1 : int64
+        Columns and rows of tiles in the full picture, half-open.
+    """
     return box[i, 0] // TILE, box[i, 1] // TILE, (box[i, 2] - 1) // TILE + 1, (box[i, 3] - 1) // TILE + 1
 
 
 @njit
 def list_by_tile(box, tile_x0, tile_y0, tiles_x, tiles_y):  # type: ignore[no-untyped-def]
-    """Counting sort of (tile, splat) pairs: start of each tile's list, and the lists, in splat order."""
+    """Lists of splats per tile: a counting sort of (tile, splat) pairs that keeps the order of the splats.
+
+    Parameters
+    ----------
+    box : (m, 4) int32 array
+        See `Splats`.
+    tile_x0, tile_y0 : int64
+        First column and row of tiles.
+    tiles_x, tiles_y : int64
+        Columns and rows of tiles.
+
+    Returns
+    -------
+    start : (tiles + 1,) int64 array
+        First entry of each tile in the lists, row by row.
+    listed : (k,) int32 array
+        Splats.
+    """
     start = np.zeros(tiles_x * tiles_y + 1, np.int64)
     for i in range(len(box)):
         x0, y0, x1, y1 = tiles_of(box, i)

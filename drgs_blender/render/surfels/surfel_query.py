@@ -5,6 +5,10 @@ A surfel is the disc u^2 + v^2 < 2 ln(255 opacity) of its plane c + u a + v b: b
 solves o + t d = c + u a + v b in double precision (Cramer's rule, as Moeller and Trumbore 1997 for triangles). So a
 surfel is met at most once, exactly where it is, and there is no diagonal or edge between triangles to fall through.
 
+Here alpha and transmittance of rays are computed: alpha is opacity times exp(-(u^2 + v^2) / 2), 0.99 at most. It
+differs from the rasteriser's (`raster`) in this: there is no low-pass filter, intersection and transmittance are in
+double precision, and a ray ends at a transmittance of 2e-5, not 1e-4.
+
 Callbacks speak with the function that casts the ray through a block of memory behind Embree's ray context, laid out
 below. A closest-hits callback keeps a list of the nearest contributions, sorted by (depth, index), and shortens the ray
 when the list is full or opaque; a shadow callback multiplies transmittances, whatever the order, and ends the ray
@@ -109,7 +113,12 @@ load_long, store_long = _access(types.int64, _long)
 
 @intrinsic
 def query_memory(typing):  # type: ignore[no-untyped-def]
-    """Address of memory for one query on the stack of the calling function, for compiled code."""
+    """Address of memory for one query on the stack of the calling function, for compiled code.
+
+    Returns
+    -------
+    int64
+    """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         memory = cgutils.alloca_once(builder, ir.ArrayType(_word, _WORDS))
@@ -133,7 +142,21 @@ def _call(typing, address, scene, ray, settings):  # type: ignore[no-untyped-def
 
 @njit
 def begin_query(query, ray, start):  # type: ignore[no-untyped-def]
-    """Fill all of a query but its range; returns the address of the part that callbacks write."""
+    """Fill all of a query but its range.
+
+    Parameters
+    ----------
+    query : int64
+        Address, `query_memory`.
+    ray : Ray
+        World; direction unit; mask as of ``SurfelBVH.update``.
+    start : Start
+
+    Returns
+    -------
+    int64
+        Address of the part that callbacks write: COUNT, DEPTHS, ALPHAS, INDICES, PRODUCT.
+    """
     (ox, oy, oz), (dx, dy, dz) = ray.origin, ray.direction
     context = query + 4 * _CONTEXT
     for index, value in ((0, ox), (1, oy), (2, oz), (4, dx), (5, dy), (6, dz), (7, np.float32(0.0))):
@@ -163,7 +186,19 @@ def begin_query(query, ray, start):  # type: ignore[no-untyped-def]
 
 @njit
 def cast(address, scene, query, tnear, tfar):  # type: ignore[no-untyped-def]
-    """Walk the tree once, `tnear` < t <= `tfar`; `address` is Embree's function."""
+    """Walk Embree's tree once along a query's ray.
+
+    Parameters
+    ----------
+    address : int64
+        Of Embree's function: ``SurfelBVH.intersect_address`` or ``occluded_address``.
+    scene : int64
+        ``SurfelBVH.scene``.
+    query : int64
+        Address, after `begin_query`.
+    tnear, tfar : float32
+        Range of depth, m: tnear < t <= tfar.
+    """
     store_single(query, _TNEAR, np.float32(tnear))
     store_single(query, _TFAR, np.float32(tfar))
     _call(address, scene, query, query + 4 * _ARGUMENTS)
@@ -262,7 +297,17 @@ def _gather(call):  # type: ignore[no-untyped-def]
 
 @njit
 def beyond(depth):  # type: ignore[no-untyped-def]
-    """A few units in the last place more."""
+    """A depth a few units in the last place farther.
+
+    Parameters
+    ----------
+    depth : float32
+        Metres.
+
+    Returns
+    -------
+    float32
+    """
     return np.float32(depth * np.float32(1.0000005))
 
 

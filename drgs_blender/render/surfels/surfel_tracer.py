@@ -111,15 +111,38 @@ def transmittance(tracer, ray, start):  # type: ignore[no-untyped-def]
 
 @njit
 def trace_surfels(tracer, ray, start, gap, number):  # type: ignore[no-untyped-def]
-    """Blend the surfels on a ray: ``(through, t, n (3), g (3), albedo (3), roughness, metallic, size, object, stop)``.
+    """Closest hit of a ray among surfels: these alpha-blended front to back into one virtual surface (Gu et al. 2025).
 
-    Parameters as for `transmittance`; `gap` is the jump of depth that separates surfaces, in sizes; `number` a float32
-    random number in [0, 1) that picks one of the surfaces by its weight, or HEAVIEST.
+    Parameters
+    ----------
+    tracer, ray, start : SurfelTracer, Ray or Start
+        As of `transmittance`.
+    gap : float32
+        Jump of depth that separates surfaces, in sizes; infinite: none does.
+    number : float32
+        Random number in [0, 1) that picks one of the surfaces by its weight, or HEAVIEST.
 
-    ``through`` is the share of light that passes (of all surfaces), t the mean depth by weight, n the shading and g the
-    geometric normal: both of unit length, g towards the ray's origin; size the mean larger standard deviation, metres;
-    object that of the heaviest surfel. Where nothing is met ``through`` is 1 and the object -1. ``stop`` is the depth
-    where the transmittance falls to `number`, else `tfar`: as often as light passes to some depth, it lies beyond.
+    Returns
+    -------
+    through : float32
+        Transmittance of all surfels on the ray; 1 where nothing is met.
+    t : float32
+        Mean depth by weight, m; `tfar` where nothing is met.
+    nx, ny, nz : float32
+        Shading normal, unit, world.
+    px, py, pz : float32
+        Geometric normal, unit, world, towards the ray's origin.
+    red, green, blue : float32
+        Albedo, linear Rec.709.
+    roughness, metallic : float32
+        In [0, 1].
+    size : float32
+        Mean larger standard deviation, m.
+    object : int32
+        Of the heaviest surfel; -1 where nothing is met.
+    stop : float32
+        Depth at which the transmittance falls to `number`, else `tfar`: as often as light passes to some depth, it lies
+        beyond.
     """
     query = query_memory()
     context = begin_query(query, ray, start)
@@ -231,7 +254,7 @@ class SurfelHits:
     albedo : (n, 3) float32 array
         In [0, 1]; linear Rec.709.
     roughness, metallic : (n,) float32 array
-        In [0, 1]; linear Rec.709.
+        In [0, 1].
     size : (n,) float32 array
         Metres: mean larger standard deviation of the surfels.
     object_index : (n,) int32 array

@@ -35,7 +35,23 @@ _NATIVES = {add_to: Native(_ADD, "add_to", "int64")}
 
 
 def number_particles(lane, lanes, room, x, origin, scale, bx, by, bz, out):  # type: ignore[no-untyped-def]
-    """Key of each particle, and its own number beside it; counts those outside or not finite."""
+    """Key of each particle, and its own number beside it; counts those outside or not finite.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+        See `compute.warp.kernels`; so of all kernels here.
+    x : (n, 3) float64 array
+        Positions, world, m.
+    origin : tuple of float
+        `Domain.origin`, m.
+    scale : float64
+        1 / spacing, 1/m.
+    bx, by, bz : int
+        `Domain.blocks`.
+    out : tuple of array
+        Keys, numbers of the particles, and `found` (LOST is added to); written.
+    """
     keys, order, found = out
     for p in range(lane, len(x), lanes):
         gx, gy, gz = (x[p, 0] - origin[0]) * scale, (x[p, 1] - origin[1]) * scale, (x[p, 2] - origin[2]) * scale
@@ -49,7 +65,18 @@ def number_particles(lane, lanes, room, x, origin, scale, bx, by, bz, out):  # t
 
 
 def list_blocks(lane, lanes, room, n, keys, out):  # type: ignore[no-untyped-def]
-    """Blocks with particles, once each, in any order."""
+    """Blocks with particles, once each, in any order.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+    n : int
+        Particles.
+    keys : array
+        Of `number_particles`, sorted.
+    out : tuple of array
+        `found`: OCCUPIED is added to, and BLOCKS on written.
+    """
     (found,) = out
     for p in range(lane, n, lanes):
         first = True
@@ -60,7 +87,22 @@ def list_blocks(lane, lanes, room, n, keys, out):  # type: ignore[no-untyped-def
 
 
 def index_blocks(lane, lanes, room, n, keys, numbers, sizes, out):  # type: ignore[no-untyped-def]
-    """Tables of the active blocks: their places, those around them, and where particles of their cells begin."""
+    """Tables of the active blocks: their places, those around them, and where particles of their cells begin.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+    n : int
+        Particles.
+    keys : array
+        Of `number_particles`, sorted.
+    numbers : array
+        Numbers of the active blocks, sorted.
+    sizes : array
+        How many these are, then the domain's blocks along y and z.
+    out : tuple of array
+        Places (a, 3), slots around (a, 27; -1: not active) and first particle of each cell (a, STARTS), int32; written.
+    """
     active, neighbour, first = out
     by, bz = sizes[1], sizes[2]
     for task in range(lane, sizes[0] * (27 + STARTS), lanes):
@@ -80,7 +122,16 @@ def index_blocks(lane, lanes, room, n, keys, numbers, sizes, out):  # type: igno
 
 
 def house_particles(lane, lanes, room, n, keys, numbers, sizes, out):  # type: ignore[no-untyped-def]
-    """Active block of each particle, sorted."""
+    """Active block of each particle, sorted.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+    n, keys, numbers, sizes : int or array
+        As of `index_blocks`.
+    out : tuple of array
+        Slot of each sorted particle, (n,) int32; written.
+    """
     (home,) = out
     for p in range(lane, n, lanes):
         home[p] = np.int32(first_of(numbers, sizes[0], keys[p] >> 6))

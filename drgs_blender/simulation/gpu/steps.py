@@ -101,7 +101,23 @@ NATIVES = {
 def prepare_particles(  # type: ignore[no-untyped-def]
     lane, lanes, room, order, particles, properties, grid, time, out
 ):
-    """P2G contribution of each particle to the nodes around it."""
+    """P2G contribution of each particle to the nodes around it.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+        See `compute.warp.kernels`; so of all kernels here.
+    order : array
+        Particles, sorted by cells.
+    particles : tuple of array
+        Position, velocity, `affine` and `tau`, see `Particles`.
+    properties : tuple of array
+        Mass (kg), volume (m^3) and pin (-1: none) of each particle.
+    grid, time : tuple
+        See this module's head.
+    out : tuple of array
+        (n, CELL) int32 and (n, PACKET) float32, in the order of `order`; written.
+    """
     x, v, affine, tau = particles
     mass, volume, pin = properties
     origin, spacing = grid
@@ -292,7 +308,24 @@ def carried(nodes: Any, neighbour: Any, b: Any, i: Any, j: Any, k: Any, wx: Any,
 
 
 def move_particles(lane, lanes, room, blocks, nodes, properties, pins, grid, time, out):  # type: ignore[no-untyped-def]
-    """Grid to particles: move them, deform them, and find their stress, as `p2g_g2p.g2p`."""
+    """Grid to particles: move them, deform them, and find their stress, as `p2g_g2p.g2p`.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+    blocks : tuple of array
+        Order of the particles, slot of each in that order, places of the slots and slots around them.
+    nodes : (slots * 64, 4) float32 array
+        Velocity (m/s) and mass (kg).
+    properties : tuple
+        Mass, model, parameters and solid, see `Properties`; whether `total` is kept.
+    pins : tuple
+        Pin of each particle (-1: none), velocity of each pin (m/s), whether there are any.
+    grid, time : tuple
+        See this module's head.
+    out : tuple of array
+        The fields of `Particles` and (SLOTS,) bits of the highest speed; written.
+    """
     order, home, active, neighbour = blocks
     mass, model, parameters, solid, apart = properties
     pin, pin_velocity, pinned = pins
@@ -354,7 +387,18 @@ def move_particles(lane, lanes, room, blocks, nodes, properties, pins, grid, tim
 
 
 def tick(lane, lanes, room, spacing, times, out):  # type: ignore[no-untyped-def]
-    """End a step: note the highest speed, and see whether the next one is still as it was planned."""
+    """End a step: note the highest speed, and see whether the next one is still as it was planned.
+
+    Parameters
+    ----------
+    lane, lanes, room : int64 or tuple
+    spacing : float
+        Metres.
+    times : array
+        A row per step: DT, DRAG_FACTOR, DAMPING_FACTOR, GAIN.
+    out : tuple of array
+        The clock, and (SLOTS,) bits of the highest speed, which begin anew.
+    """
     clock, fastest = out
     if clock[STOPPED] != 0.0:
         return
