@@ -30,8 +30,8 @@ def _constants(module: ModuleType, name: str, value: Any) -> Any:
 
 
 _BATCH = wavefront.Batch._make([
-    Room("float32", (wavefront._FLOATS // wavefront.LANES,)),
-    Room("uint32", (wavefront._INTS // wavefront.LANES,)),
+    Room("float32", (wavefront.PACKET_FLOATS // wavefront.LANES,)),
+    Room("uint32", (wavefront.PACKET_INTS // wavefront.LANES,)),
 ])  # fmt: skip
 #: As `integrate._scratch` makes it, for batches and blocks of one.
 _ROOMS = integrate.Scratch._make([

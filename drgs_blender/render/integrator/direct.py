@@ -14,6 +14,7 @@ from ..lights.light_sampler import emission_along, lights_along
 from ..lights.light_shapes import DIFFUSE, GLOSSY
 from ..sampling import ONE, ZERO, F, luminance
 from ..scene import ray_masks
+from . import mis
 from . import wavefront as w
 from .indirect import CARRIED, INDIRECT, trace_paths
 from .intersect import FAR, light_radiance, meet, passed, put_hit
@@ -92,7 +93,7 @@ def deliver(count, found, limit, sums):  # type: ignore[no-untyped-def]
 def _see_lights(rays, slot, reach, hit, taking_part, scene, sums):  # type: ignore[no-untyped-def]
     """What lights between a point and what its ray hit shine, and what that emits; the BRDF is not yet weighed.
 
-    `taking_part` says (1 or 0) whether cosine and GGX sampling do, as in `wavefront.weigh`.
+    `taking_part` says (1 or 0) whether cosine and GGX sampling do, as in `mis.balance_heuristic`.
     """
     s = rays.floats
     lights = scene.lights
@@ -154,9 +155,9 @@ def _trace_envmap(rays, count, scene, settings, sums):  # type: ignore[no-untype
     w.environment_directions(rays, count, scene.envmap)
     w.evaluate(rays, count, settings.shading_model)
     if scene.traits.lobes_apart:
-        w.weigh_apart(rays, count)
+        mis.balance_heuristic_per_lobe(rays, count)
     else:
-        w.weigh(rays, count, ONE, ONE)
+        mis.balance_heuristic(rays, count, ONE, ONE)
     w.warm(rays, count, scene.envmap)
     mask = np.int32(ray_masks.SHADOW << settings.shift)
     for slot in range(count):
@@ -209,7 +210,7 @@ def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: igno
     see_lights = scene.traits.lights or scene.traits.emissive
     # Lights are seen before the BRDF is weighed, for they have densities of their own: such rays are traced first.
     if not see_lights:
-        w.weigh(rays, count, cosine, ggx)
+        mis.balance_heuristic(rays, count, cosine, ggx)
     if scene.traits.environment:
         w.warm(rays, count, envmap)
     for slot in range(count):
@@ -220,7 +221,7 @@ def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: igno
         through, reach, hit = meet(tracer, rays, slot, mask)
         if see_lights:
             _see_lights(rays, slot, reach, hit, (cosine, ggx), scene, sums)
-            w.weigh_one(s, i, cosine, ggx)
+            mis.balance_heuristic_at(s, i, cosine, ggx)
         s[i + w.LIVE] = through
         if through == ONE or settings.bounces == 0:
             continue

@@ -18,7 +18,7 @@ from ..lights.light_shapes import DIFFUSE, GLOSSY
 from ..lights.product_sampling import product_row
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
-from . import brdf
+from . import brdf, mis
 from . import wavefront as w
 from .intersect import FAR, light_radiance, meet, passed, put_hit, surface_of
 
@@ -78,7 +78,7 @@ def _surfaces(rays, count, scene, settings):  # type: ignore[no-untyped-def]
 
 @njit
 def _towards_envmap(rays, count, scene, shift, found):  # type: ignore[no-untyped-def]
-    """The environment samples that `environment_directions` drew and `carry` weighed."""
+    """The environment samples that `environment_directions` drew and `path_weights` weighed."""
     s, ints = rays
     tracer, envmap = scene.tracer, scene.envmap
     for slot in range(count):
@@ -201,7 +201,7 @@ def trace_paths(rays, count, scene, settings, found):  # type: ignore[no-untyped
             w.fresh_numbers(rays, count, GOLDEN)
             w.environment_directions(rays, count, envmap)
             w.evaluate(rays, count, shading_model)
-            w.carry(rays, count, ONE)
+            mis.path_weights(rays, count, ONE)
             _towards_envmap(rays, count, scene, shift, found)
         if scene.traits.lights:
             w.fresh_numbers(rays, count, U(0x2C1B3C6D))
@@ -211,5 +211,5 @@ def trace_paths(rays, count, scene, settings, found):  # type: ignore[no-untyped
         w.fresh_numbers(rays, count, U(0x7FEB352D))
         w.brdf_directions(rays, count)
         w.evaluate(rays, count, shading_model)
-        w.carry(rays, count, ZERO)
+        mis.path_weights(rays, count, ZERO)
         count = _onwards(rays, count, bounce, bounce + 1 == settings.bounces, scene, shift, found)

@@ -38,14 +38,14 @@ MU, MV, PE = (LANES * i for i in range(33, 36))
 TR, TG, TB, SHARE, ER, EG, EB = (LANES * i for i in range(36, 43))
 # of a point's samples: how many each strategy draws there; where rays meet surfels: size of those that they start on
 WC, WG, WE, WL, SIZE = (LANES * i for i in range(43, 48))
-_FLOATS = 48 * LANES
+PACKET_FLOATS = 48 * LANES
 # uint32 fields: three random numbers, the key of more, the owner (a point, or a path), a place in a table, the row of
 # the normal in the light's tables, the object of the surfels that the ray starts on (or -1)
 N0, N1, N2, KEY, OWNER, CELL, ROW, OWN = (LANES * i for i in range(8))
-_INTS = 8 * LANES
+PACKET_INTS = 8 * LANES
 #: All constants above count in LANES. A device has one lane: there they are divided by it, by this table.
 IN_LANES = (
-    "LANES", "_FLOATS", "_INTS",
+    "LANES", "PACKET_FLOATS", "PACKET_INTS",
     "OX", "OY", "OZ", "NX", "NY", "NZ", "MX", "MY", "MZ", "GX", "GY", "GZ", "VX", "VY", "VZ",
     "AR", "AG", "AB", "METALLIC", "A2", "KD",
     "LX", "LY", "LZ", "LIVE", "QR", "QG", "QB", "SR", "SG", "SB", "PC", "PG",
@@ -86,7 +86,7 @@ def batch(capacity):  # type: ignore[no-untyped-def]
         All fields 0.
     """
     packets = (capacity + LANES - 1) // LANES
-    return Batch(np.zeros(packets * _FLOATS, np.float32), np.zeros(packets * _INTS, np.uint32))
+    return Batch(np.zeros(packets * PACKET_FLOATS, np.float32), np.zeros(packets * PACKET_INTS, np.uint32))
 
 
 @inlined
@@ -103,7 +103,7 @@ def at(slot):  # type: ignore[no-untyped-def]
         Index in `Batch.floats` and in `Batch.ints`; a field's constant is added to it.
     """
     packet, lane = slot // LANES, slot % LANES
-    return packet * _FLOATS + lane, packet * _INTS + lane
+    return packet * PACKET_FLOATS + lane, packet * PACKET_INTS + lane
 
 
 @inlined
@@ -134,7 +134,7 @@ def scramble(rays, count):  # type: ignore[no-untyped-def]
     """
     ints = rays.ints
     for p in range(packets(count)):
-        c = p * _INTS
+        c = p * PACKET_INTS
         for i in range(c, c + LANES):
             key = ints[i + CELL]
             ints[i + N0] = scrambled(ints[i + N0], mix(U(key + U(1))))
@@ -177,7 +177,7 @@ def cosine_directions(rays, count):  # type: ignore[no-untyped-def]
     """
     s, ints = rays
     for p in range(packets(count)):
-        b, c = p * _FLOATS, p * _INTS
+        b, c = p * PACKET_FLOATS, p * PACKET_INTS
         for k in range(LANES):
             i = b + k
             x, y, z = _cosine_direction(s, i, unit(ints[c + k + N0]), unit(ints[c + k + N1]))
@@ -197,7 +197,7 @@ def ggx_directions(rays, count):  # type: ignore[no-untyped-def]
     """
     s, ints = rays
     for p in range(packets(count)):
-        b, c = p * _FLOATS, p * _INTS
+        b, c = p * PACKET_FLOATS, p * PACKET_INTS
         for k in range(LANES):
             i = b + k
             x, y, z = _ggx_direction(s, i, unit(ints[c + k + N0]), unit(ints[c + k + N1]))
@@ -218,7 +218,7 @@ def brdf_directions(rays, count):  # type: ignore[no-untyped-def]
     """
     s, ints = rays
     for p in range(packets(count)):
-        b, c = p * _FLOATS, p * _INTS
+        b, c = p * PACKET_FLOATS, p * PACKET_INTS
         for k in range(LANES):
             i = b + k
             u, v = unit(ints[c + k + N0]), unit(ints[c + k + N1])
@@ -270,7 +270,7 @@ def environment_directions(rays, count, envmap):  # type: ignore[no-untyped-def]
         _, column, s[i + MV], s[i + LZ], density = cell_at(ints[c + CELL], envmap)
         s[i + MU], s[i + PE] = F(column), density * s[i + ER]
     for p in range(packets(count)):
-        b, c = p * _FLOATS, p * _INTS
+        b, c = p * PACKET_FLOATS, p * PACKET_INTS
         for k in range(LANES):
             i = b + k
             s[i + LX], s[i + LY], s[i + LZ], s[i + MU], s[i + MV] = direction_in_cell(
@@ -318,7 +318,7 @@ def look_up(rays, count, envmap):  # type: ignore[no-untyped-def]
     """
     s, ints = rays
     for p in range(packets(count)):
-        for i in range(p * _FLOATS, p * _FLOATS + LANES):
+        for i in range(p * PACKET_FLOATS, p * PACKET_FLOATS + LANES):
             s[i + MU], s[i + MV] = map_at(s[i + LX], s[i + LY], s[i + LZ], envmap)
     for slot in range(count):
         i, c = at(slot)
@@ -364,7 +364,7 @@ def evaluate(rays, count, shading_model):  # type: ignore[no-untyped-def]
     """
     s = rays.floats
     for p in range(packets(count)):
-        for i in range(p * _FLOATS, p * _FLOATS + LANES):
+        for i in range(p * PACKET_FLOATS, p * PACKET_FLOATS + LANES):
             lx, ly, lz = s[i + LX], s[i + LY], s[i + LZ]
             mx, my, mz, vx, vy, vz = s[i + MX], s[i + MY], s[i + MZ], s[i + VX], s[i + VY], s[i + VZ]
             nl = max(s[i + NX] * lx + s[i + NY] * ly + s[i + NZ] * lz, ZERO)
@@ -392,81 +392,6 @@ def evaluate(rays, count, shading_model):  # type: ignore[no-untyped-def]
             s[i + LIVE] = ONE if out > ZERO else ZERO
 
 
-@inlined
-def _factor(s, i, cosine, ggx):  # type: ignore[no-untyped-def]
-    """One over the density of all strategies together for the slot at i."""
-    brdf_density = cosine * s[i + WC] * s[i + PC] + ggx * s[i + WG] * s[i + PG]
-    return ONE / max(brdf_density + s[i + WE] * s[i + PE], _TINY)
-
-
-@inlined
-def _scale(s, i, k):  # type: ignore[no-untyped-def]
-    """Multiply both lobes of the slot at i."""
-    s[i + QR], s[i + QG], s[i + QB] = s[i + QR] * k, s[i + QG] * k, s[i + QB] * k
-    s[i + SR], s[i + SG], s[i + SB] = s[i + SR] * k, s[i + SG] * k, s[i + SB] * k
-
-
-@inlined
-def weigh_one(s, i, cosine, ggx):  # type: ignore[no-untyped-def]
-    """`weigh` for one slot.
-
-    Parameters
-    ----------
-    s : (packets * 48 * LANES,) float32 array
-        `Batch.floats`.
-    i : int64
-        Index of the slot in it, see `at`.
-    cosine, ggx : float32
-        As of `weigh`.
-    """
-    _scale(s, i, _factor(s, i, cosine, ggx))
-
-
-@njit
-def weigh(rays, count, cosine, ggx):  # type: ignore[no-untyped-def]
-    """MIS weight over pdf (balance heuristic, PBRT 2.2.3): divide both lobes by the sum of count times pdf.
-
-    The strategies are environment, cosine and GGX; lights have a density of their own, see `light_radiance`.
-
-    Parameters
-    ----------
-    rays : Batch
-        WC, WG, WE (counts) and PC, PG, PE (pdfs) are read; QR, QG, QB, SR, SG, SB are divided; ER is overwritten.
-    count : int64
-        Slots.
-    cosine, ggx : float32
-        1 or 0: whether cosine and GGX sampling take part.
-    """
-    s = rays.floats
-    for p in range(packets(count)):
-        # Two loops, for LLVM vectorises none that reads and writes this many arrays.
-        for i in range(p * _FLOATS, p * _FLOATS + LANES):
-            s[i + ER] = _factor(s, i, cosine, ggx)
-        for i in range(p * _FLOATS, p * _FLOATS + LANES):
-            _scale(s, i, s[i + ER])
-
-
-@njit
-def weigh_apart(rays, count):  # type: ignore[no-untyped-def]
-    """`weigh` where cosine sampling is of the diffuse lobe alone, GGX sampling of the specular one alone.
-
-    Parameters
-    ----------
-    rays : Batch
-        As of `weigh`; ER stays as it is.
-    count : int64
-        Slots.
-    """
-    s = rays.floats
-    for p in range(packets(count)):
-        for i in range(p * _FLOATS, p * _FLOATS + LANES):
-            light = s[i + WE] * s[i + PE]
-            k = ONE / max(s[i + WC] * s[i + PC] + light, _TINY)
-            s[i + QR], s[i + QG], s[i + QB] = s[i + QR] * k, s[i + QG] * k, s[i + QB] * k
-            k = ONE / max(s[i + WG] * s[i + PG] + light, _TINY)
-            s[i + SR], s[i + SG], s[i + SB] = s[i + SR] * k, s[i + SG] * k, s[i + SB] * k
-
-
 @njit
 def drop(rays, count, lobe):  # type: ignore[no-untyped-def]
     """Take a lobe out of the BRDF.
@@ -482,7 +407,7 @@ def drop(rays, count, lobe):  # type: ignore[no-untyped-def]
     """
     s = rays.floats
     for p in range(packets(count)):
-        for i in range(p * _FLOATS + lobe, p * _FLOATS + lobe + 3 * LANES):
+        for i in range(p * PACKET_FLOATS + lobe, p * PACKET_FLOATS + lobe + 3 * LANES):
             s[i] = ZERO
 
 
@@ -530,35 +455,9 @@ def lobe_shares(rays, count, shading_model):  # type: ignore[no-untyped-def]
     """
     s = rays.floats
     for p in range(packets(count)):
-        for i in range(p * _FLOATS, p * _FLOATS + LANES):
+        for i in range(p * PACKET_FLOATS, p * PACKET_FLOATS + LANES):
             mv = s[i + MX] * s[i + VX] + s[i + MY] * s[i + VY] + s[i + MZ] * s[i + VZ]
             s[i + SHARE] = diffuse_share(mv, s[i + AR], s[i + AG], s[i + AB], s[i + KD], s[i + METALLIC], shading_model)
-
-
-@njit
-def carry(rays, count, light):  # type: ignore[no-untyped-def]
-    """Throughput of a path times both lobes, and the pdfs that its samples are divided by.
-
-    Parameters
-    ----------
-    rays : Batch
-        TR, TG, TB (throughput), both lobes, PC, PG, PE and SHARE are read. Written: QR, QG, QB (throughput times BRDF
-        times cosine, linear Rec.709), PG (pdf of the mixture of lobes, sr^-1), PE (that plus `light` times the pdf of
-        environment sampling).
-    count : int64
-        Slots.
-    light : float32
-        1 or 0: whether an environment sample is part of the MIS weight in PE.
-    """
-    s = rays.floats
-    for p in range(packets(count)):
-        for i in range(p * _FLOATS, p * _FLOATS + LANES):
-            s[i + QR] = s[i + TR] * (s[i + QR] + s[i + SR])
-            s[i + QG] = s[i + TG] * (s[i + QG] + s[i + SG])
-            s[i + QB] = s[i + TB] * (s[i + QB] + s[i + SB])
-            density = max(s[i + SHARE] * s[i + PC] + (ONE - s[i + SHARE]) * s[i + PG], _TINY)
-            s[i + PG] = density
-            s[i + PE] = density + light * s[i + PE]
 
 
 @njit
@@ -576,7 +475,7 @@ def fresh_numbers(rays, count, step):  # type: ignore[no-untyped-def]
     """
     ints = rays.ints
     for p in range(packets(count)):
-        c = p * _INTS
+        c = p * PACKET_INTS
         for i in range(c, c + LANES):
             key = U(ints[i + KEY] + step)
             ints[i + KEY] = key

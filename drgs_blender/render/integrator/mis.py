@@ -1,0 +1,116 @@
+"""Multiple importance sampling (MIS): the balance heuristic, which joins strategies that sample the same integral.
+
+A sample is divided by the sum, over the strategies that might have drawn it, of number of samples times pdf (Veach
+1997; PBRT 2.2.3): that is its weight over its pdf. The strategies are cosine and GGX sampling (two lobes of a BRDF),
+the environment, and lights, of which `intersect.light_radiance` has the weight, since it is known only when the light
+is.
+"""
+
+from __future__ import annotations
+
+from ...compute.jit import inlined, njit
+from ..sampling import ONE, F
+from . import wavefront as w
+
+_TINY = F(1e-30)
+
+
+@inlined
+def _weight_over_pdf(s, i, cosine, ggx):  # type: ignore[no-untyped-def]
+    """One over the density of all strategies together for the slot at i."""
+    brdf_density = cosine * s[i + w.WC] * s[i + w.PC] + ggx * s[i + w.WG] * s[i + w.PG]
+    return ONE / max(brdf_density + s[i + w.WE] * s[i + w.PE], _TINY)
+
+
+@inlined
+def _scale(s, i, k):  # type: ignore[no-untyped-def]
+    """Multiply both lobes of the slot at i."""
+    s[i + w.QR], s[i + w.QG], s[i + w.QB] = s[i + w.QR] * k, s[i + w.QG] * k, s[i + w.QB] * k
+    s[i + w.SR], s[i + w.SG], s[i + w.SB] = s[i + w.SR] * k, s[i + w.SG] * k, s[i + w.SB] * k
+
+
+@inlined
+def balance_heuristic_at(s, i, cosine, ggx):  # type: ignore[no-untyped-def]
+    """`balance_heuristic` for one slot.
+
+    Parameters
+    ----------
+    s : (packets * 48 * LANES,) float32 array
+        `Batch.floats`.
+    i : int64
+        Index of the slot in it, see `wavefront.at`.
+    cosine, ggx : float32
+        As of `balance_heuristic`.
+    """
+    _scale(s, i, _weight_over_pdf(s, i, cosine, ggx))
+
+
+@njit
+def balance_heuristic(rays, count, cosine, ggx):  # type: ignore[no-untyped-def]
+    """MIS weight over pdf (balance heuristic, PBRT 2.2.3): divide both lobes by the sum of count times pdf.
+
+    The strategies are environment, cosine and GGX; lights have a density of their own, see `intersect.light_radiance`.
+
+    Parameters
+    ----------
+    rays : Batch
+        WC, WG, WE (counts) and PC, PG, PE (pdfs) are read; QR, QG, QB, SR, SG, SB are divided; ER is overwritten.
+    count : int64
+        Slots.
+    cosine, ggx : float32
+        1 or 0: whether cosine and GGX sampling take part.
+    """
+    s = rays.floats
+    for p in range(w.packets(count)):
+        # Two loops, for LLVM vectorises none that reads and writes this many arrays.
+        for i in range(p * w.PACKET_FLOATS, p * w.PACKET_FLOATS + w.LANES):
+            s[i + w.ER] = _weight_over_pdf(s, i, cosine, ggx)
+        for i in range(p * w.PACKET_FLOATS, p * w.PACKET_FLOATS + w.LANES):
+            _scale(s, i, s[i + w.ER])
+
+
+@njit
+def balance_heuristic_per_lobe(rays, count):  # type: ignore[no-untyped-def]
+    """`balance_heuristic` where cosine sampling is of the diffuse lobe alone, GGX sampling of the specular one alone.
+
+    Parameters
+    ----------
+    rays : Batch
+        As of `balance_heuristic`; ER stays as it is.
+    count : int64
+        Slots.
+    """
+    s = rays.floats
+    for p in range(w.packets(count)):
+        for i in range(p * w.PACKET_FLOATS, p * w.PACKET_FLOATS + w.LANES):
+            light = s[i + w.WE] * s[i + w.PE]
+            k = ONE / max(s[i + w.WC] * s[i + w.PC] + light, _TINY)
+            s[i + w.QR], s[i + w.QG], s[i + w.QB] = s[i + w.QR] * k, s[i + w.QG] * k, s[i + w.QB] * k
+            k = ONE / max(s[i + w.WG] * s[i + w.PG] + light, _TINY)
+            s[i + w.SR], s[i + w.SG], s[i + w.SB] = s[i + w.SR] * k, s[i + w.SG] * k, s[i + w.SB] * k
+
+
+@njit
+def path_weights(rays, count, light):  # type: ignore[no-untyped-def]
+    """Throughput of a path times both lobes, and the pdfs that its samples are divided by.
+
+    Parameters
+    ----------
+    rays : Batch
+        TR, TG, TB (throughput), both lobes, PC, PG, PE and SHARE are read. Written: QR, QG, QB (throughput times BRDF
+        times cosine, linear Rec.709), PG (pdf of the mixture of lobes, sr^-1), PE (that plus `light` times the pdf of
+        environment sampling).
+    count : int64
+        Slots.
+    light : float32
+        1 or 0: whether an environment sample is part of the MIS weight in PE.
+    """
+    s = rays.floats
+    for p in range(w.packets(count)):
+        for i in range(p * w.PACKET_FLOATS, p * w.PACKET_FLOATS + w.LANES):
+            s[i + w.QR] = s[i + w.TR] * (s[i + w.QR] + s[i + w.SR])
+            s[i + w.QG] = s[i + w.TG] * (s[i + w.QG] + s[i + w.SG])
+            s[i + w.QB] = s[i + w.TB] * (s[i + w.QB] + s[i + w.SB])
+            density = max(s[i + w.SHARE] * s[i + w.PC] + (ONE - s[i + w.SHARE]) * s[i + w.PG], _TINY)
+            s[i + w.PG] = density
+            s[i + w.PE] = density + light * s[i + w.PE]
