@@ -12,13 +12,16 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 from ..core.errors import EXIT_CANNOT_WRITE, EXIT_INTERRUPTED, Cancelled, DrgsError
+from ..core.memory import available_memory
 from ..core.phases import PREPARING
 from . import manifest, shipped
 from .folders import cache_folder
 from .kernel_cache import KernelCache
 from .manifest import Kernel
+from .worker_pool import BYTES as _BYTES
 from .worker_pool import Known, Pool, target_codegen
 
 log = logging.getLogger(__name__)
@@ -26,6 +29,7 @@ log = logging.getLogger(__name__)
 PHASE = PREPARING
 _POLL = 0.1
 _REPORT = 0.4
+_ROOT = Path("/")
 Progress = Callable[[str, float], None]
 
 
@@ -64,7 +68,7 @@ def _compile(
     missing = _missing(manifest.needed(jobs))
     if not missing:
         return
-    with contextlib.closing(Pool(missing)) as pool:
+    with contextlib.closing(Pool(missing, processes())) as pool:
         reported = 0.0
         while pool.is_working():
             if cancelled is not None and cancelled():
@@ -129,6 +133,24 @@ def count_kernels() -> KernelCounts:
         else:
             missing += 1
     return KernelCounts(brought, compiled, missing)
+
+
+def processes(root: Path = _ROOT) -> int:
+    """Number of kernels compiled at once: one per processor that this process may use, as memory allows.
+
+    Parameters
+    ----------
+    root : Path
+        Folder that holds `sys` and `proc`.
+    """
+    allowed = os.cpu_count() or 1
+    with contextlib.suppress(AttributeError, OSError):  # not every system has it
+        allowed = len(os.sched_getaffinity(0))
+    with contextlib.suppress(OSError, ValueError):  # Linux: a limit of a container counts
+        quota, period = (root / "sys/fs/cgroup/cpu.max").read_text().split()
+        allowed = min(allowed, max(1, int(quota) // int(period)))
+    most = available_memory(root) / _BYTES
+    return allowed if most >= allowed else max(1, int(most))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -12,7 +12,6 @@ import sys
 import threading
 import time
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 from ..core.memory import available_memory
@@ -25,7 +24,7 @@ log = logging.getLogger(__name__)
 #: Seconds without any progress after which what another process has begun is compiled here as well.
 _PATIENCE = 180.0
 #: Of memory, which a process that compiles takes.
-_BYTES = 700 << 20
+BYTES = 700 << 20
 #: Processes that compile a kernel, where they end over it.
 _ATTEMPTS = 2
 #: Processes that end one after the other, with no kernel compiled, after which no more are started.
@@ -36,7 +35,6 @@ _END = 5.0
 _LOWER = 5
 #: A kernel, its cache and its argument types.
 Known = tuple[Kernel, KernelCache, tuple[Any, ...]]
-_ROOT = Path("/")
 
 
 def target_codegen() -> Any:
@@ -46,29 +44,18 @@ def target_codegen() -> Any:
     return numba.core.registry.cpu_target.target_context.codegen()
 
 
-def processes(root: Path = _ROOT) -> int:
-    """Number of kernels compiled at once: one per processor that this process may use, as memory allows.
-
-    Parameters
-    ----------
-    root : Path
-        Folder that holds `sys` and `proc`.
-    """
-    allowed = os.cpu_count() or 1
-    with contextlib.suppress(AttributeError, OSError):  # not every system has it
-        allowed = len(os.sched_getaffinity(0))
-    with contextlib.suppress(OSError, ValueError):  # Linux: a limit of a container counts
-        quota, period = (root / "sys/fs/cgroup/cpu.max").read_text().split()
-        allowed = min(allowed, max(1, int(quota) // int(period)))
-    most = available_memory(root) / _BYTES
-    return allowed if most >= allowed else max(1, int(most))
-
-
 class Pool:
     """Worker processes, each compiling one kernel at a time: first the longest, on which all wait, then in order.
 
     What another process compiles at the same time, here or on another machine with the same folder, is left to it. A
     worker that ends is replaced; a kernel over which they end is left to its first call. When one cannot write, all is.
+
+    Parameters
+    ----------
+    kernels : list of tuple
+        What is not compiled yet.
+    most : int
+        Of processes.
 
     Attributes
     ----------
@@ -78,7 +65,7 @@ class Pool:
         Part of the time of compiling them all that lies behind.
     """
 
-    def __init__(self, kernels: list[Known]) -> None:
+    def __init__(self, kernels: list[Known], most: int) -> None:
         self._longest = max(kernels, key=lambda known: known[0].seconds)
         self._remaining = sorted(kernels, key=lambda known: known is not self._longest)
         self._codegen = target_codegen()
@@ -87,7 +74,7 @@ class Pool:
         self._progress = time.monotonic()
         self._results: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._workers: list[Worker] = []
-        self._most = min(len(kernels), processes())
+        self._most = min(len(kernels), most)
         self._failures: Counter[Kernel] = Counter()
         self._deaths = 0
         try:
@@ -174,7 +161,7 @@ class Pool:
 
     def _start(self, yields: bool) -> Worker | None:
         """Another worker; None where there can be no more, for lack of memory or as the system refuses."""
-        if self._workers and available_memory() < _BYTES:
+        if self._workers and available_memory() < BYTES:
             self._most = len(self._workers)
             return None
         try:

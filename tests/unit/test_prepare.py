@@ -66,16 +66,15 @@ def test_the_first_job_comes_first_beside_the_longest_kernel(monkeypatch) -> Non
             claim.close()
 
     monkeypatch.setattr(worker_pool, "Worker", Recorder)
-    monkeypatch.setattr(worker_pool, "processes", lambda: 2)
     monkeypatch.setattr(worker_pool.KernelCache, "is_there", lambda *_: False)
-    worker_pool.Pool(list(prepare._known(kernels)))
+    worker_pool.Pool(list(prepare._known(kernels)), 2)
     longest = max(kernels, key=lambda kernel: kernel.seconds)
     assert started == [(longest.name, False), (first[0].name, True)]
 
 
 def test_no_process_is_started_for_what_others_compile(small) -> None:
     taken = claims(small)
-    pool = worker_pool.Pool(small)
+    pool = worker_pool.Pool(small, 2)
     try:
         assert pool.is_working() and not pool._workers
         for claim in taken:
@@ -100,7 +99,7 @@ def test_processes_or_threads_that_cannot_be_started_leave_nothing_behind(small,
 
     monkeypatch.setattr(worker_pool.subprocess, "Popen", record)
     monkeypatch.setattr(threading.Thread, "start", refuse)
-    pool = worker_pool.Pool(small)
+    pool = worker_pool.Pool(small, 2)
     assert not pool.is_working() and len(made) == 1 and made[0].poll() is not None
     free = claims(small)
     assert None not in free
@@ -111,7 +110,7 @@ def test_processes_or_threads_that_cannot_be_started_leave_nothing_behind(small,
 def test_what_another_process_has_begun_is_compiled_here_after_some_minutes_without_progress(small) -> None:
     """It may hang, or hold its lock on a machine that is gone."""
     taken = claims(small)
-    pool = worker_pool.Pool(small)
+    pool = worker_pool.Pool(small, 2)
     try:
         pool._progress -= 30.0
         pool.wait(0.0)
@@ -147,10 +146,9 @@ def kill_over(pool: worker_pool.Pool, names: set[str], times: int = 100) -> list
 
 
 @pytest.mark.parametrize("most", [1, 2])
-def test_a_process_that_ends_is_replaced(small, monkeypatch, caplog, most: int) -> None:
+def test_a_process_that_ends_is_replaced(small, caplog, most: int) -> None:
     """As one does that the system kills for lack of memory."""
-    monkeypatch.setattr(worker_pool, "processes", lambda: most)
-    with contextlib.closing(worker_pool.Pool(small)) as pool:
+    with contextlib.closing(worker_pool.Pool(small, most)) as pool:
         assert kill_over(pool, {"mix"}, times=1) == ["mix"]
         assert pool.done == len(small)
     assert not prepare.not_compiled([known[0] for known in small])
@@ -158,9 +156,8 @@ def test_a_process_that_ends_is_replaced(small, monkeypatch, caplog, most: int) 
     assert "kernel mix" in told and (os.name == "nt" or "code -9" in told)
 
 
-def test_a_kernel_over_which_processes_end_is_left_to_its_first_call(small, monkeypatch, caplog) -> None:
-    monkeypatch.setattr(worker_pool, "processes", lambda: 1)
-    with contextlib.closing(worker_pool.Pool(small)) as pool:
+def test_a_kernel_over_which_processes_end_is_left_to_its_first_call(small, caplog) -> None:
+    with contextlib.closing(worker_pool.Pool(small, 1)) as pool:
         assert kill_over(pool, {"mix"}) == ["mix"] * 2
         assert pool.done == len(small) - 1
     assert [kernel.name for kernel in prepare.not_compiled([known[0] for known in small])] == ["mix"]
@@ -173,10 +170,9 @@ def test_a_kernel_over_which_processes_end_is_left_to_its_first_call(small, monk
 
 def test_it_ends_where_every_process_dies(small, monkeypatch, caplog) -> None:
     """As where the engine's packages cannot be loaded any more: that is not found out for each kernel anew."""
-    monkeypatch.setattr(worker_pool, "processes", lambda: 1)
     kernels = list(prepare._known(manifest.needed(["import"])))
     monkeypatch.setattr(worker_pool.KernelCache, "is_there", lambda *_: False)
-    with contextlib.closing(worker_pool.Pool(kernels)) as pool:
+    with contextlib.closing(worker_pool.Pool(kernels, 1)) as pool:
         killed = kill_over(pool, {known[0].name for known in kernels})
         assert 2 < len(killed) < len(kernels) and pool.done == 0
     assert "kernels are compiled when they are called" in caplog.messages[-1]
@@ -194,7 +190,7 @@ def test_a_damaged_kernel_is_compiled_again_ahead(small) -> None:
         for path, data in zip(paths, whole, strict=True):
             path.write_bytes(data[:left])
         assert prepare.not_compiled(kernels) == kernels
-    with contextlib.closing(worker_pool.Pool(small)) as pool:
+    with contextlib.closing(worker_pool.Pool(small, 2)) as pool:
         finish(pool)
     assert not prepare.not_compiled(kernels) and 0 not in [path.stat().st_size for path in paths]
 
@@ -205,6 +201,7 @@ def full(small_disk) -> Path:
     return small_disk("size=16k") / "kernels"
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_preparing_and_is_named(full: Path, tmp_path: Path) -> None:
     """Other kernels are not compiled for nothing."""
     record = tmp_path / "record"
@@ -237,6 +234,7 @@ def test_an_engine_with_a_full_disk_goes_on(full: Path, small, monkeypatch, capl
         manifest.dispatcher(kernel).compile(manifest.signature(kernel))
 
 
+@pytest.mark.slow
 def test_a_sealed_disk_that_has_all_kernels_is_ready(small_disk, tmp_path: Path) -> None:
     disk = small_disk("size=32m")
     with contextlib.suppress(OSError):  # what tests before have compiled
@@ -262,13 +260,12 @@ def test_a_containers_share_of_the_processors_counts(tmp_path: Path, limit: str,
     group = tmp_path / "sys/fs/cgroup"
     group.mkdir(parents=True)
     (group / "cpu.max").write_text(f"{limit}\n")
-    assert min(worker_pool.processes(tmp_path), 2) == most
+    assert min(prepare.processes(tmp_path), 2) == most
 
 
 @pytest.mark.skipif(not hasattr(os, "setpriority"), reason="no priorities here")
-def test_workers_yield_but_the_one_with_the_longest_kernel(small, monkeypatch) -> None:
-    monkeypatch.setattr(worker_pool, "processes", lambda: 2)
-    pool = worker_pool.Pool(small)
+def test_workers_yield_but_the_one_with_the_longest_kernel(small) -> None:
+    pool = worker_pool.Pool(small, 2)
     try:
         own = os.getpriority(os.PRIO_PROCESS, 0)
         found = [os.getpriority(os.PRIO_PROCESS, worker._process.pid) for worker in pool._workers]
