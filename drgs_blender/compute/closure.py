@@ -174,10 +174,14 @@ class _Index:
         self.added = False
 
     @functools.cached_property
+    def name(self) -> str:
+        version = hashlib.sha256(sys.version.encode() + Path(__file__).read_bytes()).hexdigest()[:_DIGITS]
+        return f"sources-{version}.json"
+
+    @property
     def path(self) -> Path | None:
         folder = cache_folder().path
-        version = hashlib.sha256(sys.version.encode() + Path(__file__).read_bytes()).hexdigest()[:_DIGITS]
-        return folder and folder / f"sources-{version}.json"
+        return folder and folder / self.name
 
     @functools.cached_property
     def rows(self) -> dict[str, tuple[str, list[str]]]:
@@ -185,9 +189,10 @@ class _Index:
         if self.path:
             with contextlib.suppress(OSError):
                 os.utime(self.path)  # what is used is not removed
-        for path in (SHIPPED / shipped_index(), self.path):
+        own = (folder / self.name for folder in cache_folder().sources)
+        for path in (SHIPPED / shipped_index(), *own):
             with contextlib.suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
-                rows = unpacked(path.read_bytes()) if path else {}
+                rows = unpacked(path.read_bytes())
                 found |= {str(key): (str(facts), [str(n) for n in names]) for key, (facts, names) in rows.items()}
         return found
 

@@ -36,7 +36,7 @@ from numba.core.serialize import dumps
 
 from ..core.file_lock import FileLock
 from . import closure, shipped
-from .folders import cache_folder, write_atomically
+from .folders import cache_folder, read_own, write_atomically
 from .kernel_compiler import KernelCompiler, LoadedLibrary, is_nested
 
 log = logging.getLogger(__name__)
@@ -135,11 +135,11 @@ class KernelCache(NullCache):
             cache_folder().failed(path, error)
 
     def is_there(self, sig: Any, codegen: Any) -> bool:
-        """Whether the compiled form for `sig` need not be compiled."""
+        """Whether the compiled form for `sig` need not be compiled; a damaged file is as good as none."""
         name = self.file_name(sig, codegen)
         if name is None:
             return True  # it would not be kept
-        return shipped.has(name) or ((path := self._path(name)) is not None and path.is_file())
+        return shipped.has(name) or any(map(_is_whole, self._kept(name)))
 
     def claim(self, sig: Any, codegen: Any) -> Claim | None:
         """The right to compile for `sig`, until it is closed; None while another process has it."""
@@ -182,16 +182,20 @@ class KernelCache(NullCache):
     def _found(self, name: str) -> Iterator[bytes]:
         if (data := shipped.read(name)) is not None:
             yield data
-        if (path := self._path(name)) is not None:
+        yield from self._kept(name)
+
+    def _kept(self, name: str) -> Iterator[bytes]:
+        for folder in cache_folder().sources:
+            path = folder / self._folder / name
             try:
-                data = _read_own(path)
+                data = read_own(path)
                 with contextlib.suppress(OSError):
                     os.utime(path.parent)
             except FileNotFoundError:
-                return
+                continue
             except OSError as error:
                 log.info("%s: %s", path, error)
-                return
+                continue
             yield data
 
     @functools.cached_property
@@ -212,20 +216,11 @@ class KernelCache(NullCache):
         folder = cache_folder().path
         if folder is None or not self._closure:
             return None
-        return folder / f"{self.function.__module__.rpartition('.')[2]}-{self._closure}" / name
+        return folder / self._folder / name
 
-
-def _read_own(path: Path) -> bytes:
-    """The bytes of a file of this user's: it is executed, and the folder may once have been open to others.
-
-    Raises
-    ------
-    OSError
-    """
-    with path.open("rb") as file:
-        if hasattr(os, "geteuid") and (owner := os.fstat(file.fileno()).st_uid) != os.geteuid():
-            raise PermissionError(f"is of user {owner}, not of this one")
-        return file.read()
+    @property
+    def _folder(self) -> str:
+        return f"{self.function.__module__.rpartition('.')[2]}-{self._closure}"
 
 
 def _code_facts(function: Any) -> tuple[str, str]:
@@ -260,6 +255,14 @@ def _source(name: str) -> Path:
 def pack(content: bytes) -> bytes:
     """The bytes of a file."""
     return _MAGIC + hashlib.sha256(content).digest() + content
+
+
+def _is_whole(data: bytes) -> bool:
+    try:
+        _checked(data)
+    except DamagedError:
+        return False
+    return True
 
 
 def _checked(data: bytes) -> bytes:

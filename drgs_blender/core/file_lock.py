@@ -61,7 +61,7 @@ class FileLock:
 
     def __init__(self, path: Path) -> None:
         flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOINHERIT", 0)
-        self._file = os.open(path, flags, 0o600)
+        self._file, self._process = os.open(path, flags, 0o600), os.getpid()
 
     def acquire(self, patience: float = 0.0) -> bool:
         """Lock the file, and say whether that was possible within `patience` seconds.
@@ -82,8 +82,9 @@ class FileLock:
         if self._file is None:
             return
         file, self._file = self._file, None
-        with contextlib.suppress(OSError):  # of what is not locked
-            _unlock(file)
+        if self._process == os.getpid():  # else of a fork, which has the file open as well: the lock is not its own
+            with contextlib.suppress(OSError):  # of what is not locked
+                _unlock(file)
         os.close(file)
 
     def __enter__(self) -> FileLock:

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
+import shutil
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
-from drgs_blender.compute import folders, manifest, prepare
+from drgs_blender.compute import folders, manifest, prepare, worker_pool
 from drgs_blender.compute.jit import numba
+from drgs_blender.core.errors import EXIT_CANNOT_WRITE
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -25,14 +34,14 @@ def small(tmp_path, monkeypatch):
     folders.cache_folder.cache_clear()
 
 
-def finish(pool: prepare._Pool, seconds: float = 60.0) -> None:
+def finish(pool: worker_pool.Pool, seconds: float = 60.0) -> None:
     deadline = time.monotonic() + seconds
     while pool.is_working():
         assert time.monotonic() < deadline
         pool.wait(0.05)
 
 
-def claims(kernels: list[prepare._Known]) -> list[object]:
+def claims(kernels: list[worker_pool.Known]) -> list[object]:
     codegen = numba.core.registry.cpu_target.target_context.codegen()
     return [cache.claim(signature, codegen) for _, cache, signature in kernels]
 
@@ -46,28 +55,26 @@ def test_the_first_job_comes_first_beside_the_longest_kernel(monkeypatch) -> Non
     started: list[tuple[str, bool]] = []
 
     class Recorder:
-        is_alive, kernel = True, None
+        known = None
 
         def __init__(self, results: object, yields: bool) -> None:
             self._yields = yields
 
-        def assign(self, kernel: manifest.Kernel, claim: prepare.Claim) -> bool:
-            started.append((kernel.name, self._yields))
-            self.kernel = kernel
+        def assign(self, known: worker_pool.Known, claim: worker_pool.Claim) -> None:
+            started.append((known[0].name, self._yields))
+            self.known = known
             claim.close()
-            return True
 
-    monkeypatch.setattr(prepare, "_Worker", Recorder)
-    monkeypatch.setattr(prepare, "processes", lambda: 2)
-    monkeypatch.setattr(prepare.KernelCache, "is_there", lambda *_: False)
-    prepare._Pool(list(prepare._known(kernels)))
+    monkeypatch.setattr(worker_pool, "Worker", Recorder)
+    monkeypatch.setattr(worker_pool.KernelCache, "is_there", lambda *_: False)
+    worker_pool.Pool(list(prepare._known(kernels)), 2)
     longest = max(kernels, key=lambda kernel: kernel.seconds)
     assert started == [(longest.name, False), (first[0].name, True)]
 
 
 def test_no_process_is_started_for_what_others_compile(small) -> None:
     taken = claims(small)
-    pool = prepare._Pool(small)
+    pool = worker_pool.Pool(small, 2)
     try:
         assert pool.is_working() and not pool._workers
         for claim in taken:
@@ -80,8 +87,8 @@ def test_no_process_is_started_for_what_others_compile(small) -> None:
 
 def test_processes_or_threads_that_cannot_be_started_leave_nothing_behind(small, monkeypatch) -> None:
     """The job goes on, its kernels are compiled when they are called; others may compile them at once."""
-    made: list[prepare.subprocess.Popen] = []
-    popen = prepare.subprocess.Popen
+    made: list[worker_pool.subprocess.Popen] = []
+    popen = worker_pool.subprocess.Popen
 
     def record(*args: object, **options: object) -> object:
         made.append(popen(*args, **options))
@@ -90,9 +97,9 @@ def test_processes_or_threads_that_cannot_be_started_leave_nothing_behind(small,
     def refuse(self: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
-    monkeypatch.setattr(prepare.subprocess, "Popen", record)
+    monkeypatch.setattr(worker_pool.subprocess, "Popen", record)
     monkeypatch.setattr(threading.Thread, "start", refuse)
-    pool = prepare._Pool(small)
+    pool = worker_pool.Pool(small, 2)
     assert not pool.is_working() and len(made) == 1 and made[0].poll() is not None
     free = claims(small)
     assert None not in free
@@ -100,24 +107,168 @@ def test_processes_or_threads_that_cannot_be_started_leave_nothing_behind(small,
         claim.close()
 
 
-def test_it_ends_when_all_processes_have_died(small, monkeypatch) -> None:
-    monkeypatch.setattr(prepare, "processes", lambda: 1)
-    pool = prepare._Pool(small)
+def test_what_another_process_has_begun_is_compiled_here_after_some_minutes_without_progress(small) -> None:
+    """It may hang, or hold its lock on a machine that is gone."""
+    taken = claims(small)
+    pool = worker_pool.Pool(small, 2)
     try:
-        pool._workers[0]._process.kill()
-        finish(pool)
-        assert pool.done < len(small)
+        pool._progress -= 30.0
+        pool.wait(0.0)
+        assert not pool._workers
+        pool._progress -= 600.0
+        pool.wait(0.0)
+        assert len(pool._workers) == 1
+        while pool.is_working():  # minutes in a moment
+            pool._progress -= 600.0
+            pool.wait(0.05)
+        assert not prepare.not_compiled([known[0] for known in small])
     finally:
         pool.close()
+        for claim in taken:
+            claim.close()
+
+
+def kill_over(pool: worker_pool.Pool, names: set[str], times: int = 100) -> list[str]:
+    """Work, and kill each process that has one of these kernels, so often at most; the kernels of those killed."""
+    killed: list[str] = []
+    dead: set[int] = set()
+    deadline = time.monotonic() + 60.0
+    while pool.is_working():
+        assert time.monotonic() < deadline
+        for worker in pool._workers:
+            process = worker._process
+            if worker.known and worker.known[0].name in names and process.pid not in dead and len(killed) < times:
+                killed.append(worker.known[0].name)
+                dead.add(process.pid)
+                process.kill()
+        pool.wait(0.02)
+    return killed
+
+
+@pytest.mark.parametrize("most", [1, 2])
+def test_a_process_that_ends_is_replaced(small, caplog, most: int) -> None:
+    """As one does that the system kills for lack of memory."""
+    with contextlib.closing(worker_pool.Pool(small, most)) as pool:
+        assert kill_over(pool, {"mix"}, times=1) == ["mix"]
+        assert pool.done == len(small)
+    assert not prepare.not_compiled([known[0] for known in small])
+    (told,) = caplog.messages
+    assert "kernel mix" in told and (os.name == "nt" or "code -9" in told)
+
+
+def test_a_kernel_over_which_processes_end_is_left_to_its_first_call(small, caplog) -> None:
+    with contextlib.closing(worker_pool.Pool(small, 1)) as pool:
+        assert kill_over(pool, {"mix"}) == ["mix"] * 2
+        assert pool.done == len(small) - 1
+    assert [kernel.name for kernel in prepare.not_compiled([known[0] for known in small])] == ["mix"]
+    assert len(caplog.messages) == 2 and "kernel mix" in caplog.messages[1] and "when it is called" in caplog.text
+    free = claims(small)
+    assert None not in free
+    for claim in free:
+        claim.close()
+
+
+def test_it_ends_where_every_process_dies(small, monkeypatch, caplog) -> None:
+    """As where the engine's packages cannot be loaded any more: that is not found out for each kernel anew."""
+    kernels = list(prepare._known(manifest.needed(["import"])))
+    monkeypatch.setattr(worker_pool.KernelCache, "is_there", lambda *_: False)
+    with contextlib.closing(worker_pool.Pool(kernels, 1)) as pool:
+        killed = kill_over(pool, {known[0].name for known in kernels})
+        assert 2 < len(killed) < len(kernels) and pool.done == 0
+    assert "kernels are compiled when they are called" in caplog.messages[-1]
+
+
+def test_a_damaged_kernel_is_compiled_again_ahead(small) -> None:
+    """Where the power was lost a file may be empty, or end before its time."""
+    kernels = [known[0] for known in small]
+    for kernel in kernels:
+        manifest.dispatcher(kernel).compile(manifest.signature(kernel))
+    paths = sorted(folders.cache_folder().path.rglob("*.kernel"))
+    whole = [path.read_bytes() for path in paths]
+    assert len(paths) == len(kernels) and not prepare.not_compiled(kernels)
+    for left in (-1, 20, 0):
+        for path, data in zip(paths, whole, strict=True):
+            path.write_bytes(data[:left])
+        assert prepare.not_compiled(kernels) == kernels
+    with contextlib.closing(worker_pool.Pool(small, 2)) as pool:
+        finish(pool)
+    assert not prepare.not_compiled(kernels) and 0 not in [path.stat().st_size for path in paths]
+
+
+@pytest.fixture
+def full(small_disk) -> Path:
+    """A folder that can be written, on a disk without room for a kernel of any size."""
+    return small_disk("size=16k") / "kernels"
+
+
+@pytest.mark.slow
+def test_a_full_disk_ends_preparing_and_is_named(full: Path, tmp_path: Path) -> None:
+    """Other kernels are not compiled for nothing."""
+    record = tmp_path / "record"
+    variables = {"DRGS_CACHE_DIR": str(full), "DRGS_SHIPPED": "0", "DRGS_RECORD_KERNELS": str(record)}
+    done = subprocess.run(
+        [sys.executable, "-m", "drgs_blender.compute.prepare", "import"],
+        env=os.environ | variables | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == EXIT_CANNOT_WRITE and "ready" not in done.stdout
+    assert done.stderr.count("No space left on device") == 1 and str(full) in done.stderr
+    compiled = [row for row in map(json.loads, record.read_text().splitlines()) if row[3] > 0.0]
+    assert 0 < len(compiled) < len(manifest.needed(["import"])) / 2
+
+
+def test_an_engine_with_a_full_disk_goes_on(full: Path, small, monkeypatch, caplog) -> None:
+    kernels = [known[0] for known in small]
+    monkeypatch.setenv("DRGS_CACHE_DIR", str(full))
+    folders.cache_folder.cache_clear()
+    monkeypatch.setattr(manifest, "needed", lambda _: kernels)
+    assert not folders.cache_folder().trouble
+    (full / "filler").write_bytes(bytes(12 << 10))
+    for _ in range(2):  # the second time there is no try
+        prepare.prepare_kernels(["any"])
+    assert len(caplog.messages) == 1 and str(full) in folders.cache_folder().trouble
+    assert prepare.not_compiled(kernels) == kernels
+    (full / "filler").unlink()
+    for kernel in kernels:
+        manifest.dispatcher(kernel).compile(manifest.signature(kernel))
+
+
+@pytest.mark.slow
+def test_a_sealed_disk_that_has_all_kernels_is_ready(small_disk, tmp_path: Path) -> None:
+    disk = small_disk("size=32m")
+    with contextlib.suppress(OSError):  # what tests before have compiled
+        kept = folders.cache_folder().path
+        shutil.copytree(kept, disk / "kernels", ignore=shutil.ignore_patterns("warp", "numba"))
+    (disk / "kernels").mkdir(exist_ok=True)
+    (disk / "kernels").chmod(0o700)
+
+    def prepared() -> subprocess.CompletedProcess[str]:
+        variables = {"DRGS_CACHE_DIR": str(disk / "kernels"), "PYTHONPATH": str(ROOT)}
+        command = [sys.executable, "-m", "drgs_blender.compute.prepare", "import"]
+        return subprocess.run(command, env=os.environ | variables, capture_output=True, text=True)
+
+    assert prepared().returncode == 0
+    small_disk("ro")
+    done = prepared()
+    assert done.returncode == 0 and "ready" in done.stdout and "Read-only file system" in done.stderr
+
+
+@pytest.mark.skipif((len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1) < 2, reason="one core")
+@pytest.mark.parametrize(("limit", "most"), [("100000 100000", 1), ("50000 100000", 1), ("max 100000", 2)])
+def test_a_containers_share_of_the_processors_counts(tmp_path: Path, limit: str, most: int) -> None:
+    group = tmp_path / "sys/fs/cgroup"
+    group.mkdir(parents=True)
+    (group / "cpu.max").write_text(f"{limit}\n")
+    assert min(prepare.processes(tmp_path), 2) == most
 
 
 @pytest.mark.skipif(not hasattr(os, "setpriority"), reason="no priorities here")
-def test_workers_yield_but_the_one_with_the_longest_kernel(small, monkeypatch) -> None:
-    monkeypatch.setattr(prepare, "processes", lambda: 2)
-    pool = prepare._Pool(small)
+def test_workers_yield_but_the_one_with_the_longest_kernel(small) -> None:
+    pool = worker_pool.Pool(small, 2)
     try:
         own = os.getpriority(os.PRIO_PROCESS, 0)
         found = [os.getpriority(os.PRIO_PROCESS, worker._process.pid) for worker in pool._workers]
-        assert found == [own, min(own + prepare._LOWER, 19)]
+        assert found == [own, min(own + worker_pool._LOWER, 19)]
     finally:
         pool.close()
