@@ -14,7 +14,7 @@ import bpy
 T = TypeVar("T")
 
 #: Types of datablocks that say how surfaces and the world look; what else changes has no part in that.
-SHADING_MODELS = (bpy.types.Material, bpy.types.NodeTree, bpy.types.Image, bpy.types.Texture, bpy.types.World)
+SHADING_DATABLOCKS = (bpy.types.Material, bpy.types.NodeTree, bpy.types.Image, bpy.types.Texture, bpy.types.World)
 #: First item of the keys of what is made of such datablocks.
 SHADED = ("mesh", "world")
 
@@ -48,7 +48,7 @@ class ExportCache:
         """Forget what the changes that `depsgraph` was updated for make wrong."""
         looks, shapes = False, set()
         for update in depsgraph.updates:
-            if isinstance(update.id, SHADING_MODELS):
+            if isinstance(update.id, SHADING_DATABLOCKS):
                 looks = True
             elif update.is_updated_geometry:
                 shapes.add(uid(update.id))

@@ -20,7 +20,7 @@ _SAME_SIDE = 0.3
 _BROAD = 0.3
 
 
-class Walked(NamedTuple):
+class MeshAdjacency(NamedTuple):
     """A mesh to walk on.
 
     Attributes
@@ -42,7 +42,7 @@ class Walked(NamedTuple):
     corner: Array
 
 
-class Feet(NamedTuple):
+class SurfelSpots(NamedTuple):
     """Attachment of surfels to a mesh.
 
     Attributes
@@ -103,8 +103,8 @@ def spans(
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         across = np.cross(faces.normal[own], along)
         start, corner = corner_table(indices, len(vertices))
-        mesh = Walked(vertices.astype(np.float64), indices, normals, faces.normal, start, corner)
-        found[wanted] = _walk(mesh, Feet(own, foot, along, across, reach[wanted].astype(np.float64)))
+        mesh = MeshAdjacency(vertices.astype(np.float64), indices, normals, faces.normal, start, corner)
+        found[wanted] = _walk(mesh, SurfelSpots(own, foot, along, across, reach[wanted].astype(np.float64)))
         triangle = vertices[found[wanted]].astype(np.float64)
         edges = np.roll(triangle, -1, axis=1) - triangle
         area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
@@ -115,7 +115,7 @@ def spans(
 
 
 @njit
-def _walk(mesh: Walked, feet: Feet) -> Array:
+def _walk(mesh: MeshAdjacency, feet: SurfelSpots) -> Array:
     """For each surfel the vertices nearest to three places around its foot."""
     vertices, indices, normals, face_normals, start, corner = mesh
     face, foot, along, across, reach = feet

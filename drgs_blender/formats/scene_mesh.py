@@ -16,8 +16,8 @@ from ..core.errors import AssetError
 from . import trimesh_scene
 from .files import Image, MaterialFile, MeshFile
 from .obj import beside, load_texture
-from .soup import join_equal
 from .subprocess_reader import read_in_subprocess
+from .triangle_soup import join_equal
 from .trimesh_scene import ABOUT
 
 Array = np.ndarray

@@ -27,7 +27,7 @@ from .capture.training_views import background_of, composed
 from .gpu.select_backend import select_backend
 from .inverse_rendering.run import Decoupled, decouple
 from .inverse_rendering.settings import Settings as Decoupling
-from .jit_warmup import rehearse
+from .jit_warmup import warm_up
 from .losses.photometric import Photograph, structural_similarity
 from .meshing.depth_fusion import fuse, grid
 from .meshing.normal_integration import follow_normals, shaded_by, shaded_by_own
@@ -157,7 +157,7 @@ def reconstruct(
     prepare_kernels(("reconstruct",), lambda phase, part: work.on_progress(Progress(phase, part)), work.cancelled)
     if settings.minutes is not None:
         work.on_progress(Progress(PHASE, 0.0))
-        rehearse(settings, have_silhouettes(capture), work.backend, work.cancelled)
+        warm_up(settings, have_silhouettes(capture), work.backend, work.cancelled)
     training = Training(
         capture, region, settings.schedule, seconds=work.seconds(SURFEL_TIME_FRACTION), backend=work.backend
     )
@@ -169,7 +169,7 @@ def reconstruct(
     binding: Binding | None = None
     if settings.variant == "m":
         final, binding = _on_mesh(work, mesh, free, region, report)
-    report |= judge(final, capture)
+    report |= held_out_metrics(final, capture)
     visible = final.opacities().detach().numpy() >= UNSEEN
     surfels = _visible_surfels(final, visible)
     found, thin, smooth = None, False, VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
@@ -351,7 +351,7 @@ def preview(gaussians: Gaussians, capture: Capture) -> Array:
     return np.concatenate([_drawn(gaussians, view, capture), composed(view, capture)], axis=1)
 
 
-def judge(gaussians: Gaussians, capture: Capture) -> dict[str, float]:
+def held_out_metrics(gaussians: Gaussians, capture: Capture) -> dict[str, float]:
     """Figures of the views left out, whole pictures.
 
     "psnr" is the mean of that of each, as in published tables and in `drgs evaluate`; "psnr_pooled" that of the mean

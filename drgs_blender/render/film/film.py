@@ -27,8 +27,8 @@ from ...core.frame import Camera, RenderSettings
 from ..camera import FX, FY, ORTHOGRAPHIC, WIDTH, sample_ray
 from ..gbuffer.gbuffer import GBuffer
 from ..lights.environment import EnvironmentLight, envmap_radiance, map_at
-from ..points import CATCHER, Radiance
 from ..sampling import luminance
+from ..shading_points import CATCHER, Radiance
 from .guides import Guides
 
 Array = np.ndarray

@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from .starts import TRIAL
+from .initialisation_trial import TRIAL
 
 
-class Clock:
+class TimeBudget:
     """Time spent on steps, and what part of a schedule that is.
 
     Parameters

@@ -7,7 +7,7 @@ import numpy as np
 Array = np.ndarray
 
 
-def number_rows(*columns: Array) -> Array:
+def distinct_row_indices(*columns: Array) -> Array:
     """Number (n,) of each row among the distinct ones in lexicographic order.
 
     These are the indices that ``np.unique(rows, axis=0, return_inverse=True)`` returns second. Columns are ranked one
@@ -19,7 +19,7 @@ def number_rows(*columns: Array) -> Array:
 
     Examples
     --------
-    >>> number_rows(np.array([2, 0, 2, 0]), np.array([1, 5, 0, 5]))
+    >>> distinct_row_indices(np.array([2, 0, 2, 0]), np.array([1, 5, 0, 5]))
     array([2, 0, 1, 0])
     """
     number = np.unique(columns[0], return_inverse=True)[1]
