@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("noisy", metavar="PATTERN", help="noisy EXR files; #### is the frame's number")
     parser.add_argument("--frames", required=True, help="frames to denoise: 1-24, 1-24x2,30")
     parser.add_argument("--out", required=True, metavar="PATTERN", help="EXR files to write")
-    parser.add_argument("--window", type=odd, default=5, metavar="N", help="frames that make one, odd; default 5")
+    parser.add_argument("--window", type=odd, default=5, metavar="N", help="frames averaged into one, odd; default 5")
     parser.add_argument(
         "--sequence",
         metavar="FRAMES",

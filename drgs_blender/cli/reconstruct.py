@@ -83,13 +83,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--device",
         choices=("cpu", "cuda"),
         default="cpu",
-        help="what learns; without a card the processor does. Default cpu",
+        help="device of the optimisation: cpu or cuda; falls back to cpu. Default cpu",
     )
     parser.add_argument(
         "--axes",
         choices=tuple(CAMERAS),
         default="opengl",
-        help="what the cameras' matrices are taken for; default opengl: the convention of the layout",
+        help="convention of the camera matrices; default opengl: that of the layout",
     )
     parser.add_argument("--up", choices=tuple(UP_AXES), help="up axis of the capture's world; default: found")
 

@@ -1,4 +1,4 @@
-"""Wide support: the three vertices that a surfel follows which is larger than the face it is bound to."""
+"""Wide support: the three vertices that a surfel follows if it is larger than its face."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def spans(
     Returns
     -------
     (n, 3) int32 array
-        -1 where the own face is to be taken, also for want of a broad triangle larger than that.
+        -1 for surfels that follow their own face: small ones, and those without a broad triangle that is larger.
     """
     wanted = np.flatnonzero((reach > faces.mean_edge[face]) & ~faces.degenerate[face])
     found = np.full((len(face), 3), -1, np.int32)

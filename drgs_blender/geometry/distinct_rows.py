@@ -1,4 +1,4 @@
-"""Rows of numbers told apart."""
+"""Indices of the distinct rows of a table of numbers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ Array = np.ndarray
 
 
 def distinct_row_indices(*columns: Array) -> Array:
-    """Number (n,) of each row among the distinct ones in lexicographic order.
+    """Index (n,) of each row in the sorted distinct rows.
 
     These are the indices that ``np.unique(rows, axis=0, return_inverse=True)`` returns second. Columns are ranked one
     by one, which is several times as fast as comparing whole rows.

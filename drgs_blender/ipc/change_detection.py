@@ -1,4 +1,4 @@
-"""Change detection: what of a frame is the same as in the last one keeps its identity."""
+"""Change detection: unchanged parts of a frame keep the identity of those in the last one."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ T = TypeVar("T")
 
 
 def reuse_equal(value: T, known: Any) -> T:
-    """`known` itself when it equals `value`, else a copy of `value` that nobody can change.
+    """`known` itself when it equals `value`, else a read-only copy of `value`.
 
-    Arrays are compared bit by bit. Wherever a part of `value` (a field, an item) equals that of `known`, the copy holds
-    the latter: whoever looks at it sees by identity what changed.
+    Arrays are compared bit by bit. Where a part of `value` (a field, an item) equals that of `known`, the copy holds
+    the latter, so that later stages recognise changes by identity.
     """
     made: Any
     if isinstance(value, np.ndarray):

@@ -195,7 +195,7 @@ def strip_height(width: int, subpixels: int) -> int:
 
 
 def _own_surfels(buffer: GBuffer, tree: SurfelBVH, objects: int) -> None:
-    """Tell the points on meshes of DR-GS objects which surfels are their own: those about as large as usual there."""
+    """Set ``own`` and ``size`` of points on meshes of DR-GS objects: the object, and its surfels' mean size."""
     points, owner = buffer.points, buffer.object_index
     points.own = np.where(owner < objects, owner, -1).astype(np.int32)
     points.size = np.append(tree.sizes(objects), np.float32(0.0))[points.own]

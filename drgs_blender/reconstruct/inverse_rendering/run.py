@@ -112,7 +112,7 @@ def decouple(
         Gives the normals behind pixels in place of the mesh. They count where they are within 60 degrees of the
         face, as for surfels that are rendered; what is learned of normals is added to them.
     now : callable
-        Seconds since whenever.
+        Monotonic clock, seconds.
 
     Raises
     ------

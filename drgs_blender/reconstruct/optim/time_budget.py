@@ -17,7 +17,7 @@ class TimeBudget:
     limit : float, optional
         Seconds that the whole schedule may take; without, time does not count.
     now : callable
-        Seconds since whenever.
+        Monotonic clock, seconds.
 
     Attributes
     ----------

@@ -49,7 +49,7 @@ class Training:
     backend : LearningBackend
         Backend of the steps; where it fails, they go on on the CPU.
     now : callable
-        Seconds since whenever.
+        Monotonic clock, seconds.
 
     Attributes
     ----------

@@ -77,7 +77,7 @@ def deliver(count, found, limit, sums):  # type: ignore[no-untyped-def]
 
 @njit
 def _see_lights(rays, slot, reach, hit, taking_part, scene, sums):  # type: ignore[no-untyped-def]
-    """What lights between a point and what its ray hit shine, and what that emits; the BRDF is not yet weighed.
+    """Add the radiance of lights between a point and its ray's hit, and the emission of the hit, times the BRDF.
 
     `taking_part` says (1 or 0) whether cosine and GGX sampling do, as in `wavefront.weigh`.
     """

@@ -119,7 +119,7 @@ def trace_surfels(tracer, ray, start, gap, number):  # type: ignore[no-untyped-d
     ``through`` is the share of light that passes (of all surfaces), t the mean depth by weight, n the shading and g the
     geometric normal: both of unit length, g towards the ray's origin; size the mean larger standard deviation, metres;
     object that of the heaviest surfel. Where nothing is met ``through`` is 1 and the object -1. ``stop`` is the depth
-    where the transmittance falls to `number`, else `tfar`: as often as light passes to some depth, it lies beyond.
+    where the transmittance falls to `number`, else `tfar`: P(stop > t) equals the transmittance to depth t.
     """
     query = query_memory()
     context = begin_query(query, ray, start)
