@@ -65,7 +65,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--voxels", type=int_range(16, 1024), metavar="N", help="of the mesh's longest side; default 256"
     )
     parser.add_argument(
-        "--time-budget", type=_minutes, metavar="M", help="all stages together, about, once kernels are compiled"
+        "--time-budget",
+        type=_minutes,
+        metavar="M",
+        help="minutes of all stages together, about, once kernels are compiled",
     )
     parser.add_argument(
         "--test-every",

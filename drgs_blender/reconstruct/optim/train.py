@@ -45,7 +45,7 @@ class Training:
     gaussians : Gaussians, optional
         To go on with; without, both of `initialisation` are tried.
     seconds : float, optional
-        Where the steps would take longer, the schedule runs by the clock.
+        Time budget; where the steps would take longer, the schedule runs by the time spent.
     backend : LearningBackend
         Backend of the steps; where it fails, they go on on the CPU.
     now : callable

@@ -66,7 +66,7 @@ def denoise(
     Parameters
     ----------
     components : (h, w, 4, 3) float32 array
-        Premultiplied light, see `points.Radiance`; non-finite values are replaced.
+        Premultiplied light, see `shading_points.Radiance`; non-finite values are replaced.
     variance : (h, w, 2) float32 array
         Of the luminance of the diffuse and the glossy sum.
     guides : Guides

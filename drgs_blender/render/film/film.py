@@ -50,7 +50,7 @@ class Pixels(NamedTuple):
     position, normal, albedo : (h, w, 3) array
     roughness, metallic, pass_index, depth : (h, w) array
     components : (h, w, 4, 3) array
-        In the order of `points.Radiance.components`, premultiplied.
+        In the order of `shading_points.Radiance.components`, premultiplied.
     variance : (h, w, 2) array
         Of the luminance of the premultiplied diffuse and glossy sums.
     emission : (h, w, 3) array
