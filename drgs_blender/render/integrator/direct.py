@@ -77,7 +77,9 @@ def deliver(count, found, limit, sums):  # type: ignore[no-untyped-def]
 
 @njit
 def _see_lights(rays, slot, reach, hit, taking_part, scene, sums):  # type: ignore[no-untyped-def]
-    """Add the radiance of lights between a point and its ray's hit, and the emission of the hit, times the BRDF.
+    """Add reflected light of the lights between a point and its ray's hit, and of the hit's emission, with MIS weights.
+
+    Called before `wavefront.weigh_one`, while the BRDF of the slot is not yet divided by densities.
 
     `taking_part` says (1 or 0) whether cosine and GGX sampling do, as in `wavefront.weigh`.
     """
