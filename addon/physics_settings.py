@@ -68,7 +68,7 @@ class _MaterialNumbers:
 
     material: EnumProperty(
         name="Material",
-        description="What it is made of. Choosing one fills in its numbers",
+        description="Material. Choosing one sets its parameters",
         items=MATERIAL_ITEMS,
         default=_FIRST.name,
         update=_take_preset,
@@ -105,7 +105,7 @@ class _MaterialNumbers:
     )
     yield_stress: FloatProperty(
         name="Yield Stress (Pa)",
-        description="Stress beyond which it does not spring back, pascals",
+        description="Stress beyond which deformation is permanent, pascals",
         min=0.0,
         max=1e12,
         soft_max=1e7,
@@ -137,7 +137,7 @@ class _MaterialNumbers:
     )
     cohesion: FloatProperty(
         name="Cohesion",
-        description="Share of its volume by which it may be pulled apart before it comes apart",
+        description="Volumetric strain, as a share of the volume, at which it comes apart",
         min=0.0,
         max=1.0,
         soft_max=0.1,
@@ -162,7 +162,7 @@ class _MaterialNumbers:
 
 
 class DrgsPhysicsRegion(_MaterialNumbers, bpy.types.PropertyGroup):
-    """A part of the object that is made of something else."""
+    """A part of the object with another material."""
 
     group: StringProperty(
         name="Group",
@@ -212,10 +212,10 @@ class DrgsPhysicsSettings(_MaterialNumbers, bpy.types.PropertyGroup):
         options=set(),
     )
     regions: CollectionProperty(
-        type=DrgsPhysicsRegion, name="Regions", description="Parts of the object that are made of something else"
+        type=DrgsPhysicsRegion, name="Regions", description="Parts of the object with another material"
     )
     colliders: CollectionProperty(
-        type=DrgsPhysicsCollider, name="Colliders", description="Meshes that the simulated object meets"
+        type=DrgsPhysicsCollider, name="Colliders", description="Meshes with which the simulated object collides"
     )
     solver: EnumProperty(
         name="Solver",
@@ -292,7 +292,7 @@ class DrgsPhysicsSettings(_MaterialNumbers, bpy.types.PropertyGroup):
         default=1.0,
     )
     damping: FloatProperty(
-        name="Damping", description="Share of its speed that it loses per second", min=0.0, max=1e4, soft_max=10.0
+        name="Damping", description="Share of the speed lost per second", min=0.0, max=1e4, soft_max=10.0
     )
     velocity: FloatVectorProperty(
         name="Velocity", description="At the start, metres per second, world", subtype="XYZ", unit="VELOCITY"
@@ -305,7 +305,7 @@ class DrgsPhysicsSettings(_MaterialNumbers, bpy.types.PropertyGroup):
     )
     pin_group: StringProperty(
         name="Pin Group",
-        description="Vertex group (weights of 0.5 and more) or point attribute of what is held; it follows the "
+        description="Vertex group (weights of 0.5 and more) or point attribute of the pinned part; it follows the "
         "object's own animation: armature, shape keys, transforms",
     )
     use_floor: BoolProperty(name="Floor", description="A level floor without end", default=False, options=set())
@@ -321,7 +321,7 @@ class DrgsPhysicsSettings(_MaterialNumbers, bpy.types.PropertyGroup):
         "object's size",
         poll=lambda self, obj: obj.type == "MESH",
     )
-    walls: EnumProperty(name="Walls", description="What the sides of the domain do", items=WALL_ITEMS)
+    walls: EnumProperty(name="Walls", description="Contact at the sides of the domain", items=WALL_ITEMS)
     frame_start: IntProperty(
         name="First Frame",
         description="Frame in which all is at rest and the simulation begins; at first the scene's first one",

@@ -78,7 +78,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     device: EnumProperty(
         name="Device",
-        description="What renders, simulates and reconstructs. Without a supported card the CPU is used, with a "
+        description="Device that renders, simulates and reconstructs. Without a supported card the CPU is used, with a "
         "warning",
         items=[
             ("CPU", "CPU", "Use the CPU"),
@@ -111,7 +111,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     subpixel_samples: IntProperty(
         name="Sub-Pixel Samples",
-        description="Places in a pixel among which its samples are divided: edges and textures get smoother. 0 chooses "
+        description="Positions per pixel among which samples are divided: edges and textures get smoother. 0 chooses "
         "by the number of samples",
         min=0,
         soft_max=64,
@@ -131,7 +131,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     camera_sees: EnumProperty(
         name="Camera Sees",
-        description="What of DR-GS objects is in the picture",
+        description="Representation of DR-GS objects in the picture",
         items=(
             ("surfels", "Surfels", "The captured Gaussians, with their soft edges and fine detail"),
             ("mesh", "Mesh", "The triangle mesh that carries them"),
@@ -140,7 +140,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     rays_see: EnumProperty(
         name="Rays See",
-        description="What shadows, reflections and indirect light use of DR-GS objects",
+        description="Representation of DR-GS objects for shadows, reflections and indirect light",
         items=(
             ("mesh", "Mesh", "The triangle mesh that carries the surfels; fast"),
             (

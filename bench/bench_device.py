@@ -31,8 +31,8 @@ from drgs_blender.render.camera import camera_parameters
 from drgs_blender.render.gbuffer.mesh import primary_mesh
 from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.points import Radiance
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
+from drgs_blender.render.shading_points import Radiance
 
 #: Rows, and the processor for each; a card stands in its row whether there is one or not.
 ROWS = ("Numba, Embree, all threads", "Numba, Embree, 1 thread", "Warp on the processor, 1 thread", "Warp on CUDA")

@@ -14,8 +14,8 @@ from drgs_blender.core.frame import RenderSettings, World
 from drgs_blender.formats.registry import read_environment
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.points import ShadingPoints
 from drgs_blender.render.scene.trace_scene import TraceScene
+from drgs_blender.render.shading_points import ShadingPoints
 
 EMPTY = TraceScene()
 

@@ -34,7 +34,7 @@ from drgs_blender.reconstruct.model.gaussians import Gaussians
 from drgs_blender.reconstruct.model.raster import rasterise
 from drgs_blender.reconstruct.optim.schedule import Schedule
 from drgs_blender.reconstruct.optim.train import Training
-from drgs_blender.reconstruct.pipeline import ON_MESH, judge, mesh_of
+from drgs_blender.reconstruct.pipeline import ON_MESH, held_out_metrics, mesh_of
 from drgs_blender.reconstruct.readers import read_capture
 
 ROWS = OUT / "reconstruct"
@@ -142,7 +142,7 @@ def trained(capture: Capture, schedule: Schedule, seconds: float | None) -> tupl
     while not training.finished:
         training.step()
     cost = {"cpu": processor_seconds() - begun, "wall": time.perf_counter() - wall, "steps": training.iteration}
-    return training, cost | {"surfels": len(training.gaussians)} | judge(training.gaussians, capture)
+    return training, cost | {"surfels": len(training.gaussians)} | held_out_metrics(training.gaussians, capture)
 
 
 def warm(capture: Capture) -> None:
@@ -228,7 +228,9 @@ def variants(options: argparse.Namespace) -> None:
         again = Training(capture, training.region, schedule.on_mesh(ON_MESH), attached)
         while not again.finished:
             again.step()
-        result = {"surfels": len(attached), "cpu": processor_seconds() - begun} | judge(again.gaussians, capture)
+        result = {"surfels": len(attached), "cpu": processor_seconds() - begun} | held_out_metrics(
+            again.gaussians, capture
+        )
         rows = store_row(ROWS / "variants.json", name, result)
     cells = [(n, r["surfels"], *(formatted(r[k]) for k in ("psnr", "ssim", "cpu"))) for n, r in rows.items()]
     head = ("Variant", "Surfels", "PSNR dB", "SSIM", "processor s")

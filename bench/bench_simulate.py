@@ -27,8 +27,8 @@ from drgs_blender.core.asset.model import Mesh
 from drgs_blender.core.particle_cache import ParticleCache
 from drgs_blender.deform.gmls import bind_points, carry
 from drgs_blender.deform.source_driven import _update
-from drgs_blender.simulation.blocks import arrange
 from drgs_blender.simulation.fill import fill
+from drgs_blender.simulation.grid_blocks import arrange
 from drgs_blender.simulation.job import PER_CELL, prepare
 from drgs_blender.simulation.settings import parse_settings
 from drgs_blender.simulation.solver import Solver

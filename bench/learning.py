@@ -20,7 +20,7 @@ from drgs_blender.reconstruct.gpu.warp_backend import WarpLearningBackend
 from drgs_blender.reconstruct.meshing.visual_hull import find_region
 from drgs_blender.reconstruct.optim.schedule import Schedule
 from drgs_blender.reconstruct.optim.train import Training
-from drgs_blender.reconstruct.pipeline import judge
+from drgs_blender.reconstruct.pipeline import held_out_metrics
 
 #: Views around the object, every fourth left out; steps of a run that is not timed, which compiles.
 VIEWS, FIRST = 24, 20
@@ -57,8 +57,8 @@ def learning(path: Path, size: int, steps: int, surfels: int, missing: str) -> s
         train(replace(schedule, iterations=FIRST), backend)
         training = train(schedule, backend)
         use_threads(0)
-        found = judge(training.gaussians.on(CPU), capture)
-        rate = f"{steps / training.clock.spent:.1f}"
+        found = held_out_metrics(training.gaussians.on(CPU), capture)
+        rate = f"{steps / training.time_budget.spent:.1f}"
         return [rate, f"{len(training.gaussians)}", f"{found['psnr']:.2f} dB", f"{found['ssim']:.4f}"]
 
     rows = [["Numba and torch, all threads", *run(CPU, 0)], ["Numba and torch, 1 thread", *run(CPU, 1)]]

@@ -33,8 +33,8 @@ from drgs_blender.render.camera import camera_parameters
 from drgs_blender.render.gbuffer.mesh import primary_mesh
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.points import ShadingPoints
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
+from drgs_blender.render.shading_points import ShadingPoints
 
 Array = np.ndarray
 RAYS, RUNS = 32, 3

@@ -45,7 +45,7 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
     minutes: FloatProperty(
-        name="Time Limit (min)", description="About how long it may take", default=10.0, min=0.1, max=1e4
+        name="Time Budget (min)", description="About how long it may take", default=10.0, min=0.1, max=1e4
     )
     resolution: IntProperty(
         name="Resolution", description="Longer side of the photographs, reduced; 0 is as they are", default=400, min=0

@@ -148,11 +148,11 @@ def engine(folder: Path, what: str) -> None:
 def reconstruct(variant: str) -> None:
     """The trial run that every reconstruction with a time budget begins with."""
     from drgs_blender.reconstruct.backend import CPU
-    from drgs_blender.reconstruct.jit_warmup import rehearse
+    from drgs_blender.reconstruct.jit_warmup import warm_up
     from drgs_blender.reconstruct.pipeline import Settings
 
     for masked in (True, False):
-        rehearse(Settings(variant=variant), masked, CPU, lambda: False)  # type: ignore[arg-type]
+        warm_up(Settings(variant=variant), masked, CPU, lambda: False)  # type: ignore[arg-type]
 
 
 def do(what: str, folder: Path) -> None:

@@ -1,7 +1,7 @@
-"""The export cache: what earlier exports made, for as long as nothing that it was made of changes.
+"""The export cache: results of earlier exports, until the datablocks that they depend on change.
 
-A viewport exports after every change; only what changed is read again. What is remembered is frozen, so that the
-engine's client sees by identity that it need not be sent.
+A viewport exports after every change; only changed datablocks are read again. Cached arrays are frozen, so that the
+engine's client recognises by identity what it need not send again.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import bpy
 
 T = TypeVar("T")
 
-#: Types of datablocks that say how surfaces and the world look; what else changes has no part in that.
-SHADING_MODELS = (bpy.types.Material, bpy.types.NodeTree, bpy.types.Image, bpy.types.Texture, bpy.types.World)
-#: First item of the keys of what is made of such datablocks.
+#: Types of datablocks on which the shading of surfaces and of the world depends.
+SHADING_DATABLOCKS = (bpy.types.Material, bpy.types.NodeTree, bpy.types.Image, bpy.types.Texture, bpy.types.World)
+#: First items of the keys of entries that depend on such datablocks.
 SHADED = ("mesh", "world")
 
 
@@ -45,10 +45,10 @@ class ExportCache:
         return self._known[key][1]
 
     def note(self, depsgraph: bpy.types.Depsgraph) -> None:
-        """Forget what the changes that `depsgraph` was updated for make wrong."""
+        """Drop entries that the depsgraph's updates invalidate."""
         looks, shapes = False, set()
         for update in depsgraph.updates:
-            if isinstance(update.id, SHADING_MODELS):
+            if isinstance(update.id, SHADING_DATABLOCKS):
                 looks = True
             elif update.is_updated_geometry:
                 shapes.add(uid(update.id))

@@ -12,7 +12,7 @@ from ...drgs_blender.core.frame import Light
 from .instances import Visible
 from .node_math import rgb
 from .nodes import Walker
-from .paint import Paint, once, uniform
+from .socket_value import SocketValue, once, uniform
 from .sockets import SocketRef, surface_of
 
 Warn = Callable[[str], None]
@@ -108,16 +108,16 @@ class _Tree(Walker):
         self.warn(node, f"{node.bl_label} is not supported in a light; its own colour is used")
         return np.ones(3)
 
-    def node_light_falloff(self, output: SocketRef) -> Paint:
+    def node_light_falloff(self, output: SocketRef) -> SocketValue:
         strength = self.number(output.input("Strength"))
         if output.socket.name != "Quadratic" or self.value(output.input("Smooth")) != 0:
             self.warn(output.node, "only the natural, quadratic falloff is rendered")
         return strength
 
-    def node_tex_ies(self, output: SocketRef) -> Paint:
+    def node_tex_ies(self, output: SocketRef) -> SocketValue:
         self.warn(output.node, "IES profiles are not rendered; it shines evenly")
         return self.number(output.input("Strength")) if "Strength" in output.node.inputs else uniform(1)
 
-    def node_tex_image(self, output: SocketRef) -> Paint:
+    def node_tex_image(self, output: SocketRef) -> SocketValue:
         self.warn(output.node, "images are not projected by lights; white is used")
         return uniform(1)

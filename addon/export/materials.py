@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.core.frame import Image, Material, Texture
-from .paint import Paint, Warn
+from .socket_value import SocketValue, Warn
 from .surface_nodes import SurfaceWalker
 from .texture_refs import TextureRef
 
@@ -66,9 +66,9 @@ class Materials:
         }
         values: dict[str, Any] = {}
         maps: list[str] = []
-        for name, paint in paints.items():
-            picture = paint.texture
-            values[name] = _usable(tree, name, paint, getattr(DEFAULT_MATERIAL, name))
+        for name, value in paints.items():
+            picture = value.texture
+            values[name] = _usable(tree, name, value, getattr(DEFAULT_MATERIAL, name))
             if isinstance(picture, TextureRef):
                 values[f"{name}_texture"] = self._texture(picture)
                 maps.append(picture.uv_map)
@@ -83,13 +83,13 @@ class Materials:
         return picture.texture(exported.name)
 
 
-def _usable(tree: SurfaceWalker, name: str, paint: Paint, default: tuple[float, float, float] | float) -> object:
+def _usable(tree: SurfaceWalker, name: str, value: SocketValue, default: tuple[float, float, float] | float) -> object:
     """The number or colour of a field of frame.Material, finite and where it can be."""
-    colour = paint.colour
+    colour = value.colour
     if not np.isfinite(colour).all():
         tree.report(f"its {name.replace('_', ' ')} is not finite; Blender's default is used. Check its drivers")
         colour = np.broadcast_to(default, 3)
     colour = np.maximum(colour, 0)
-    if name in ("roughness", "metallic") and paint.texture is None:
+    if name in ("roughness", "metallic") and value.texture is None:
         colour = np.minimum(colour, 1)
     return tuple(map(float, colour)) if name in ("base_colour", "emission") else float(colour[0])

@@ -16,7 +16,7 @@ from mathutils import Euler, Matrix
 
 from ...drgs_blender.core.color import LUMINANCE as REC709
 from .node_math import BLENDS, OPERATIONS, blackbody, by_row, divide, hsl, hsv, hue_saturation, in_system
-from .paint import Array, Paint, Warn, constant, once, uniform
+from .socket_value import Array, SocketValue, Warn, constant, once, uniform
 from .sockets import SocketRef
 
 #: Luminance weights of Rec.709.
@@ -26,7 +26,7 @@ _PROBES = np.array(((0.9, 0.6, 0.3), (0.2, 0.5, 0.8), (0.04, 0.02, 0.07)))
 
 
 class Walker:
-    """Evaluates the sockets of one node tree. A method ``node_<type>`` gives the paint of an output of such nodes."""
+    """Evaluates the sockets of one node tree. A method ``node_<type>`` gives the value of an output of such nodes."""
 
     #: Grey for a colour that nothing is known of.
     unknown = 0.5
@@ -55,79 +55,79 @@ class Walker:
         """The texture reduced to "r", "g", "b" or "luminance"; None where there is no such thing."""
         return None
 
-    def curved(self, texture: Hashable, function: Callable[[Array], Array]) -> Paint | None:
+    def curved(self, texture: Hashable, function: Callable[[Array], Array]) -> SocketValue | None:
         """The texture with `function` of (n, 3) colours done to its values; None where that cannot be."""
         return None
 
     # Sockets
 
     @once(lambda self: uniform(self.unknown))
-    def colour(self, ref: SocketRef) -> Paint:
+    def colour(self, ref: SocketRef) -> SocketValue:
         """Value of a colour or vector input."""
         origin = ref.origin()
         if not origin.socket.is_output:
-            return Paint(constant(origin.socket))
+            return SocketValue(constant(origin.socket))
         evaluate = getattr(self, f"node_{origin.node.type.lower()}", None)
         return evaluate(origin) if evaluate is not None else self.nearest(origin, ref)
 
-    def number(self, ref: SocketRef) -> Paint:
+    def number(self, ref: SocketRef) -> SocketValue:
         """Value of a number input; of a colour its luminance, of a vector its mean."""
-        paint, source = self.colour(ref), ref.origin()
+        value, source = self.colour(ref), ref.origin()
         if not source.socket.is_output or source.socket.type == "VALUE":
-            return paint
+            return value
         if source.socket.type == "VECTOR":
-            return uniform(self.flat(source.node, paint).mean())
-        return self.grey(source.node, paint)
+            return uniform(self.flat(source.node, value).mean())
+        return self.grey(source.node, value)
 
     def fixed(self, ref: SocketRef) -> Array:
         """(3,): an input that must not vary over the surface."""
-        paint = self.colour(ref)
-        return self.flat(ref.origin().node, paint)
+        value = self.colour(ref)
+        return self.flat(ref.origin().node, value)
 
     def value(self, ref: SocketRef) -> float:
         """A number that must not vary over the surface."""
         return float(self.flat(ref.origin().node, self.number(ref))[0])
 
-    def flat(self, node: bpy.types.Node, paint: Paint) -> Array:
-        """(3,): the mean of a paint."""
-        if paint.texture is None:
-            return paint.colour
+    def flat(self, node: bpy.types.Node, value: SocketValue) -> Array:
+        """(3,): the mean of a value."""
+        if value.texture is None:
+            return value.colour
         self.warn(node, "a texture cannot vary this; its mean is used")
-        return paint.colour * self.mean(paint.texture)
+        return value.colour * self.mean(value.texture)
 
-    def grey(self, node: bpy.types.Node, paint: Paint) -> Paint:
+    def grey(self, node: bpy.types.Node, value: SocketValue) -> SocketValue:
         """Luminance."""
-        if paint.texture is None:
-            return uniform(paint.colour @ LUMINANCE)
-        texture = self.channel(paint.texture, "luminance")
+        if value.texture is None:
+            return uniform(value.colour @ LUMINANCE)
+        texture = self.channel(value.texture, "luminance")
         if texture is None:
-            return uniform(self.flat(node, paint) @ LUMINANCE)
-        if texture == paint.texture or np.ptp(paint.colour) < 1e-6:
-            return Paint(uniform(paint.colour @ LUMINANCE).colour, texture)
+            return uniform(self.flat(node, value) @ LUMINANCE)
+        if texture == value.texture or np.ptp(value.colour) < 1e-6:
+            return SocketValue(uniform(value.colour @ LUMINANCE).colour, texture)
         self.warn(node, "the luminance of a tinted image is that of the image, scaled")
-        mean = self.mean(paint.texture)
-        return Paint(uniform((paint.colour * mean) @ LUMINANCE / max(mean @ LUMINANCE, 1e-9)).colour, texture)
+        mean = self.mean(value.texture)
+        return SocketValue(uniform((value.colour * mean) @ LUMINANCE / max(mean @ LUMINANCE, 1e-9)).colour, texture)
 
-    def part(self, node: bpy.types.Node, paint: Paint, index: int) -> Paint:
+    def part(self, node: bpy.types.Node, value: SocketValue, index: int) -> SocketValue:
         """Red, green or blue."""
-        if paint.texture is None:
-            return uniform(paint.colour[index])
-        texture = self.channel(paint.texture, "rgb"[index])
+        if value.texture is None:
+            return uniform(value.colour[index])
+        texture = self.channel(value.texture, "rgb"[index])
         if texture is None:
-            return uniform(self.flat(node, paint)[index])
-        return Paint(uniform(paint.colour[index]).colour, texture)
+            return uniform(self.flat(node, value)[index])
+        return SocketValue(uniform(value.colour[index]).colour, texture)
 
-    def combine(self, node: bpy.types.Node, function: Callable[..., Array], *paints: Paint) -> Paint:
-        """`function` of (..., 3) arrays for paints.
+    def combine(self, node: bpy.types.Node, function: Callable[..., Array], *values: SocketValue) -> SocketValue:
+        """`function` of (..., 3) arrays for values.
 
         Exact for constants, where the result is a scaled texture, and where the texture takes curves. Else the texture
         with the most influence stays, scaled so that the mean is right; where the result falls as the texture rises,
         the mean alone.
         """
-        textures = dict.fromkeys(p.texture for p in paints if p.texture is not None and not p.black)
+        textures = dict.fromkeys(p.texture for p in values if p.texture is not None and not p.black)
 
         def at(levels: dict[Hashable, Array]) -> Array:
-            return np.asarray(function(*(p.colour * levels.get(p.texture, 0 if p.texture else 1) for p in paints)))
+            return np.asarray(function(*(p.colour * levels.get(p.texture, 0 if p.texture else 1) for p in values)))
 
         if not textures:
             return uniform(at({}))
@@ -136,7 +136,7 @@ class Walker:
             zero, *probed = (at({texture: level}) for level in (np.zeros(3), *_PROBES))
             scales = np.array(probed) / _PROBES
             if not zero.any() and np.allclose(scales, scales[0], rtol=1e-5, atol=1e-7):
-                return Paint(scales[0], texture)
+                return SocketValue(scales[0], texture)
         means = {t: self.mean(t) for t in textures}
         whole = at(means)
         influence = {t: np.abs(whole - at({**means, t: np.zeros(3)})).max() for t in textures}
@@ -144,7 +144,7 @@ class Walker:
         if influence[texture] < 1e-6:
             return uniform(whole)
         if len(textures) > 1 and sorted(influence.values())[-2] < 1e-6:
-            return self.combine(node, function, *(_fixed_but(p, texture, means) for p in paints))
+            return self.combine(node, function, *(_fixed_but(p, texture, means) for p in values))
         curved = self.curved(texture, lambda value: at({**means, texture: value}))
         if curved is not None:
             if len(textures) > 1:
@@ -156,9 +156,9 @@ class Walker:
             return uniform(whole)
         self.warn(node, "this cannot be done to an image exactly; the image is scaled to the right mean")
         mean = means[texture]
-        return Paint(np.where(mean > 1e-9, whole / np.maximum(mean, 1e-9), 1.0), texture)
+        return SocketValue(np.where(mean > 1e-9, whole / np.maximum(mean, 1e-9), 1.0), texture)
 
-    def nearest(self, origin: SocketRef, ref: SocketRef) -> Paint:
+    def nearest(self, origin: SocketRef, ref: SocketRef) -> SocketValue:
         """An unknown node: its first linked colour, the mean of its own colours, or what the input is without it."""
         node = origin.node
         colours = [SocketRef(s, origin.groups) for s in node.inputs if s.type == "RGBA" and s.enabled]
@@ -178,15 +178,15 @@ class Walker:
 
     # Nodes
 
-    def node_rgb(self, output: SocketRef) -> Paint:
-        return Paint(constant(output.socket))
+    def node_rgb(self, output: SocketRef) -> SocketValue:
+        return SocketValue(constant(output.socket))
 
     node_value = node_rgb
 
-    def node_blackbody(self, output: SocketRef) -> Paint:
-        return Paint(blackbody(self.value(output.input("Temperature"))))
+    def node_blackbody(self, output: SocketRef) -> SocketValue:
+        return SocketValue(blackbody(self.value(output.input("Temperature"))))
 
-    def node_mix(self, output: SocketRef) -> Paint:
+    def node_mix(self, output: SocketRef) -> SocketValue:
         node, inputs = output.node, output.inputs()
         kind = {"FLOAT": "Float", "VECTOR": "Vector", "RGBA": "Color"}.get(node.data_type)
         if kind is None:
@@ -198,14 +198,21 @@ class Walker:
         blend = node.blend_type if kind == "Color" else "MIX"
         return self.blended(node, blend, node.clamp_factor, node.clamp_result, factor, *operands)
 
-    def node_mix_rgb(self, output: SocketRef) -> Paint:
+    def node_mix_rgb(self, output: SocketRef) -> SocketValue:
         node = output.node
         operands = self.number(output.input(0)), self.colour(output.input(1)), self.colour(output.input(2))
         return self.blended(node, node.blend_type, True, node.use_clamp, *operands)
 
     def blended(
-        self, node: bpy.types.Node, kind: str, clamp_factor: bool, clamp: bool, factor: Paint, a: Paint, b: Paint
-    ) -> Paint:
+        self,
+        node: bpy.types.Node,
+        kind: str,
+        clamp_factor: bool,
+        clamp: bool,
+        factor: SocketValue,
+        a: SocketValue,
+        b: SocketValue,
+    ) -> SocketValue:
         """Mix Color: from `a` to what `kind` makes of both."""
         if kind not in BLENDS:
             self.warn(node, f"blending by {kind.title()} is not supported; its first colour is used")
@@ -218,7 +225,7 @@ class Walker:
 
         return self.combine(node, mix, factor, a, b)
 
-    def node_math(self, output: SocketRef) -> Paint:
+    def node_math(self, output: SocketRef) -> SocketValue:
         node = output.node
         if node.operation not in OPERATIONS:
             return self.first_input(output)
@@ -226,7 +233,7 @@ class Walker:
         operands = [self.number(output.input(i)) for i in range(count)]
         return self.combine(node, (lambda *v: np.clip(function(*v), 0, 1)) if node.use_clamp else function, *operands)
 
-    def node_vect_math(self, output: SocketRef) -> Paint:
+    def node_vect_math(self, output: SocketRef) -> SocketValue:
         node = output.node
         if node.operation == "SCALE":
             scale = self.number(output.input("Scale"))
@@ -236,16 +243,16 @@ class Walker:
         count, function = OPERATIONS[node.operation]
         return self.combine(node, function, *(self.colour(output.input(i)) for i in range(count)))
 
-    def first_input(self, output: SocketRef) -> Paint:
+    def first_input(self, output: SocketRef) -> SocketValue:
         """Pass on what goes into an operation that is not known."""
         self.warn(output.node, f"{output.node.operation.title()} is not supported; its first input is used")
         return self.colour(output.input(0))
 
-    def node_clamp(self, output: SocketRef) -> Paint:
+    def node_clamp(self, output: SocketRef) -> SocketValue:
         operands = [self.number(output.input(i)) for i in range(3)]
         return self.combine(output.node, np.clip, *operands)
 
-    def node_map_range(self, output: SocketRef) -> Paint:
+    def node_map_range(self, output: SocketRef) -> SocketValue:
         node = output.node
         if node.data_type != "FLOAT" or node.interpolation_type != "LINEAR":
             return self.nearest(output, output)
@@ -259,24 +266,24 @@ class Walker:
         inputs = output.inputs()
         return self.combine(node, mapped, *(self.number(inputs[name]) for name in names))
 
-    def node_gamma(self, output: SocketRef) -> Paint:
+    def node_gamma(self, output: SocketRef) -> SocketValue:
         operands = self.colour(output.input("Color")), self.number(output.input("Gamma"))
         return self.combine(output.node, lambda c, g: np.maximum(c, 0) ** g, *operands)
 
-    def node_invert(self, output: SocketRef) -> Paint:
+    def node_invert(self, output: SocketRef) -> SocketValue:
         operands = self.number(output.input(0)), self.colour(output.input("Color"))
         return self.combine(output.node, lambda f, c: c + f * (1 - 2 * c), *operands)
 
-    def node_brightcontrast(self, output: SocketRef) -> Paint:
+    def node_brightcontrast(self, output: SocketRef) -> SocketValue:
         operands = (self.colour(output.input(0)), self.number(output.input(1)), self.number(output.input(2)))
         return self.combine(output.node, lambda c, b, k: np.maximum((1 + k) * c + b - k / 2, 0), *operands)
 
-    def node_hue_sat(self, output: SocketRef) -> Paint:
+    def node_hue_sat(self, output: SocketRef) -> SocketValue:
         inputs = output.inputs()
         operands = [self.number(inputs[name]) for name in ("Hue", "Saturation", "Value", "Fac")]
         return self.combine(output.node, hue_saturation, *operands, self.colour(inputs["Color"]))
 
-    def node_curve_rgb(self, output: SocketRef) -> Paint:
+    def node_curve_rgb(self, output: SocketRef) -> SocketValue:
         mapping = output.node.mapping
         mapping.initialize()
 
@@ -288,7 +295,7 @@ class Walker:
 
         return self.combine(output.node, curved, self.number(output.input(0)), self.colour(output.input("Color")))
 
-    def node_valtorgb(self, output: SocketRef) -> Paint:
+    def node_valtorgb(self, output: SocketRef) -> SocketValue:
         ramp, alpha = output.node.color_ramp, output.socket.name == "Alpha"
 
         @by_row
@@ -297,10 +304,10 @@ class Walker:
 
         return self.combine(output.node, ramped, self.number(output.input(0)))
 
-    def node_rgbtobw(self, output: SocketRef) -> Paint:
+    def node_rgbtobw(self, output: SocketRef) -> SocketValue:
         return self.grey(output.node, self.colour(output.input(0)))
 
-    def node_separate_color(self, output: SocketRef) -> Paint:
+    def node_separate_color(self, output: SocketRef) -> SocketValue:
         node, colour = output.node, self.colour(output.input(0))
         index = list(node.outputs).index(output.socket)
         mode = getattr(node, "mode", "RGB")
@@ -310,7 +317,7 @@ class Walker:
 
     node_seprgb = node_sepxyz = node_separate_color
 
-    def node_combine_color(self, output: SocketRef) -> Paint:
+    def node_combine_color(self, output: SocketRef) -> SocketValue:
         mode = getattr(output.node, "mode", "RGB")
 
         @by_row
@@ -325,11 +332,11 @@ class Walker:
     node_combrgb = node_combxyz = node_combine_color
 
 
-def _fixed_but(paint: Paint, texture: Hashable, means: dict[Hashable, Array]) -> Paint:
-    """`paint`, flattened to its mean unless it has this texture."""
-    if paint.texture is None or paint.texture == texture:
-        return paint
-    return Paint(paint.colour * means.get(paint.texture, 0))
+def _fixed_but(value: SocketValue, texture: Hashable, means: dict[Hashable, Array]) -> SocketValue:
+    """`value`, flattened to its mean unless it has this texture."""
+    if value.texture is None or value.texture == texture:
+        return value
+    return SocketValue(value.colour * means.get(value.texture, 0))
 
 
 def euler(angles: Array) -> Array:

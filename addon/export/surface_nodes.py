@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 from .node_math import reflectance
-from .paint import Array, Paint, constant, once, uniform
+from .socket_value import Array, SocketValue, constant, once, uniform
 from .sockets import SocketRef, surface_of
 from .texture_nodes import TextureWalker
 
@@ -31,10 +31,10 @@ class Surface:
     ``base`` is already times the share that is scattered.
     """
 
-    base: Paint = field(default_factory=lambda: uniform(0))
-    roughness: Paint = field(default_factory=lambda: uniform(1))
-    metallic: Paint = field(default_factory=lambda: uniform(0))
-    emission: Paint = field(default_factory=lambda: uniform(0))
+    base: SocketValue = field(default_factory=lambda: uniform(0))
+    roughness: SocketValue = field(default_factory=lambda: uniform(1))
+    metallic: SocketValue = field(default_factory=lambda: uniform(0))
+    emission: SocketValue = field(default_factory=lambda: uniform(0))
     scattered: float = 0.0
     clear: float = 0.0
 
@@ -176,7 +176,7 @@ class SurfaceWalker(TextureWalker):
             clear=min(1.0, first.clear + second.clear),
         )
 
-    def mixed(self, node: bpy.types.Node, first: Surface, second: Surface, share: Paint) -> Surface:
+    def mixed(self, node: bpy.types.Node, first: Surface, second: Surface, share: SocketValue) -> Surface:
         """`share` of the second surface, the rest of the first; of roughness and metallic by what each scatters."""
 
         def mix(f: Array, a: Array, b: Array) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from . import images
 from .node_math import reflectance
 from .nodes import Walker, euler, vector_rotate
-from .paint import Array, Paint, Warn, uniform
+from .socket_value import Array, SocketValue, Warn, uniform
 from .sockets import SocketRef
 from .texture_refs import Channel, TextureRef
 
@@ -36,23 +36,23 @@ class TextureWalker(Walker):
     def channel(self, texture: Any, name: str) -> TextureRef:
         return texture.only(cast(Channel, name))
 
-    def curved(self, texture: Any, function: Callable[[Array], Array]) -> Paint | None:
+    def curved(self, texture: Any, function: Callable[[Array], Array]) -> SocketValue | None:
         found = texture.curved(function, self._warn)
-        return None if found is None else Paint(np.full(3, found[1]), found[0])
+        return None if found is None else SocketValue(np.full(3, found[1]), found[0])
 
-    def node_tex_image(self, output: SocketRef) -> Paint:
+    def node_tex_image(self, output: SocketRef) -> SocketValue:
         node, image = output.node, output.node.image
         straight = node.outputs["Alpha"].is_linked
         if image is None or images.export_image(image, straight, self._warn) is None:
             name = "has no image" if image is None else f'image "{image.name}" cannot be read'
             self.warn(node, f"{name}; as in Cycles it is magenta. Choose another, or find its file")
-            return uniform(1) if output.socket.name == "Alpha" else Paint(np.array(images.MISSING))
+            return uniform(1) if output.socket.name == "Alpha" else SocketValue(np.array(images.MISSING))
         if node.projection != "FLAT":
             self.warn(node, f"the {node.projection.title()} projection is not supported; the UV map is used")
         if node.interpolation not in ("Linear", "Closest"):
             self.warn(node, f"{node.interpolation} interpolation is read as Linear")
         matrix, uv_map = self.coordinates(output.input("Vector"))
-        return Paint(
+        return SocketValue(
             np.ones(3),
             TextureRef(
                 image,
@@ -65,23 +65,23 @@ class TextureWalker(Walker):
             ),
         )
 
-    def node_tex_environment(self, output: SocketRef) -> Paint:
+    def node_tex_environment(self, output: SocketRef) -> SocketValue:
         node = output.node
         if node.image is not None and (picture := images.export_image(node.image, False, self._warn)) is not None:
             self.warn(node, "an Environment Texture is not supported on surfaces; its mean colour is used")
-            return Paint(images.mean_colour(picture)[:3])
+            return SocketValue(images.mean_colour(picture)[:3])
         return self.nearest(output, output)
 
-    def node_vertex_color(self, output: SocketRef) -> Paint:
+    def node_vertex_color(self, output: SocketRef) -> SocketValue:
         return self.attribute(output, output.node.layer_name)
 
-    def node_attribute(self, output: SocketRef) -> Paint:
+    def node_attribute(self, output: SocketRef) -> SocketValue:
         node = output.node
         if node.attribute_type != "GEOMETRY":
             return self.nearest(output, output)
         return self.attribute(output, node.attribute_name)
 
-    def attribute(self, output: SocketRef, name: str) -> Paint:
+    def attribute(self, output: SocketRef, name: str) -> SocketValue:
         """The mean of an attribute of the mesh; "" is the colour attribute that renders."""
         self.uses_mesh = True
         if name == "" and len(self.mesh.color_attributes):
@@ -96,18 +96,18 @@ class TextureWalker(Walker):
             return uniform(mean[3] if len(mean) == 4 else 1)
         return uniform(mean[:3].mean()) if output.socket.identifier == "Fac" else uniform(mean[:3])
 
-    def node_ambient_occlusion(self, output: SocketRef) -> Paint:
+    def node_ambient_occlusion(self, output: SocketRef) -> SocketValue:
         if output.socket.type == "RGBA":
             return self.nearest(output, output)
         self.warn(output.node, "Ambient Occlusion is not supported; 1 is used")
         return uniform(1)
 
-    def node_fresnel(self, output: SocketRef) -> Paint:
+    def node_fresnel(self, output: SocketRef) -> SocketValue:
         ior = self.value(output.input("IOR"))
         self.warn(output.node, "it cannot depend on the direction; the value when seen from the front is used")
         return uniform(reflectance(ior))
 
-    def node_layer_weight(self, output: SocketRef) -> Paint:
+    def node_layer_weight(self, output: SocketRef) -> SocketValue:
         blend = np.clip(self.value(output.input("Blend")), 0, 0.99999)
         self.warn(output.node, "it cannot depend on the direction; the value when seen from the front is used")
         if output.socket.name == "Facing":

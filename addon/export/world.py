@@ -14,7 +14,7 @@ from ...drgs_blender.core.frame import World
 from .images import linear_pixels
 from .node_math import rgb
 from .nodes import Walker, euler, vector_rotate
-from .paint import Paint, once, uniform
+from .socket_value import SocketValue, once, uniform
 from .sockets import SocketRef, surface_of
 
 Warn = Callable[[str], None]
@@ -49,7 +49,7 @@ def export_world(world: bpy.types.World | None, warn: Warn) -> World:
                 f'World "{world.name}": image "{light.texture.image.name}" cannot be read; its colour is taken as '
                 "grey. Choose File > External Data > Find Missing Files, or another image"
             )
-            light = Paint(light.colour * FALLBACK)
+            light = SocketValue(light.colour * FALLBACK)
     colour = light.colour
     if world is not None:
         colour = _usable(colour, rotation, world.name, warn)
@@ -89,12 +89,12 @@ class _Tree(Walker):
         super().__init__(f'World "{world.name}"', warn)
         self.world = world
 
-    def light(self) -> Paint:
+    def light(self) -> SocketValue:
         """Light of the world."""
         tree = self.world.node_tree
         # From Blender 5.0 on every world has nodes, and the switch is deprecated.
         if tree is None or (bpy.app.version < (5, 0, 0) and not self.world.use_nodes):
-            return Paint(np.array(self.world.color, np.float64))
+            return SocketValue(np.array(self.world.color, np.float64))
         surface = surface_of(tree)
         if surface is None:
             return BLACK
@@ -113,7 +113,7 @@ class _Tree(Walker):
     # Shaders
 
     @once(lambda self: uniform(self.unknown))
-    def shader(self, ref: SocketRef) -> Paint:
+    def shader(self, ref: SocketRef) -> SocketValue:
         """Light of a shader input."""
         origin = ref.origin()
         if not origin.socket.is_output:
@@ -135,13 +135,13 @@ class _Tree(Walker):
         self.warn(node, f"{node.bl_label} is not supported as light of the world; a dim grey is used")
         return uniform(FALLBACK)
 
-    def sum(self, node: bpy.types.Node, first: Paint, second: Paint) -> Paint:
+    def sum(self, node: bpy.types.Node, first: SocketValue, second: SocketValue) -> SocketValue:
         """Sum of two lights."""
         return self.combine(node, np.add, first, second)
 
     # Textures
 
-    def node_tex_environment(self, output: SocketRef) -> Paint:
+    def node_tex_environment(self, output: SocketRef) -> SocketValue:
         node = output.node
         if node.image is None:
             self.warn(node, "has no image; Blender shows magenta, a dim grey is used. Choose one")
@@ -151,15 +151,15 @@ class _Tree(Walker):
         if node.interpolation != "Linear":
             self.warn(node, f"{node.interpolation} interpolation is read as Linear")
         turn = self.rotation(output.input("Vector"))
-        return Paint(np.ones(3), Sky(node.image, tuple(map(tuple, turn.tolist()))))
+        return SocketValue(np.ones(3), Sky(node.image, tuple(map(tuple, turn.tolist()))))
 
-    def node_tex_image(self, output: SocketRef) -> Paint:
+    def node_tex_image(self, output: SocketRef) -> SocketValue:
         self.warn(output.node, "an Image Texture is read as an Environment Texture")
         return self.node_tex_environment(output)
 
-    def node_tex_sky(self, output: SocketRef) -> Paint:
+    def node_tex_sky(self, output: SocketRef) -> SocketValue:
         self.warn(output.node, "the sky is replaced by plain light of its usual colour. Bake it to an image")
-        return Paint(np.array((0.35, 0.55, 1.0)))
+        return SocketValue(np.array((0.35, 0.55, 1.0)))
 
     # Directions
 

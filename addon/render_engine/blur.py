@@ -114,7 +114,7 @@ def pictures(
                 frame_set(whole, now + step.time - whole)
                 frame = export()
             camera = depsgraph.scene_eval.camera.evaluated_get(depsgraph)
-            seen = blur.through(frame.camera, step.lens, focus_distance(camera, depsgraph))
+            seen = blur.camera_on_lens(frame.camera, step.lens, focus_distance(camera, depsgraph))
             yield replace(frame, noise_index=sharp.noise_index, camera=seen, previous=None, next=None)
     finally:
         if moves:

@@ -13,7 +13,7 @@ from ...drgs_blender.core import cryptomatte
 from ...drgs_blender.core.errors import EXIT_INTERNAL, Cancelled, DrgsError
 from ...drgs_blender.core.frame import Frame
 from ...drgs_blender.core.phases import is_preparing
-from ...drgs_blender.ipc.blur import averaged, share, sharp
+from ...drgs_blender.ipc.blur import averaged, sample_frame, sharp_frame
 from ...drgs_blender.ipc.protocol import Passes
 from .. import background_render, engine_link, messages
 from ..export import export_frame
@@ -154,10 +154,10 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
 
         def parts() -> Iterator[Passes]:
             nonlocal done
-            if (still := sharp(frame)) is not None:
+            if (still := sharp_frame(frame)) is not None:
                 yield engine_link.render(still, report, self._stopped)
             for step in blur.pictures(frame, steps, depsgraph, export, self._frame_set):
-                yield engine_link.render(share(step, len(steps), done), report, self._stopped)
+                yield engine_link.render(sample_frame(step, len(steps), done), report, self._stopped)
                 done += 1
 
         passes = averaged(parts(), len(steps))

@@ -11,7 +11,7 @@ import bpy
 
 from ...drgs_blender.core.errors import DrgsError
 from ...drgs_blender.core.frame import Frame
-from ...drgs_blender.ipc.change_detection import renewed
+from ...drgs_blender.ipc.change_detection import reuse_equal
 from .. import messages
 from ..export import export_frame
 from ..export.camera import NO_CAMERA
@@ -60,7 +60,7 @@ def exported(
     scene = _scenes.setdefault(key, _Scene())
     if not scene.current or scene.exported is None:
         made = _export(depsgraph, scene.cache, is_visible)
-        scene.exported, scene.current = renewed(made, scene.exported), True
+        scene.exported, scene.current = reuse_equal(made, scene.exported), True
     return scene.exported
 
 

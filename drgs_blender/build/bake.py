@@ -7,8 +7,8 @@ import numpy as np
 from ..compute.jit import njit
 from ..core.errors import UsageError
 from ..geometry.normals import VertexNormals
-from ..render.points import ShadingPoints
 from ..render.scene.trace_scene import TraceObject
+from ..render.shading_points import ShadingPoints
 from .relit import points_along
 
 Array = np.ndarray

@@ -21,7 +21,7 @@ from ..formats.mesh import check_extent
 from ..geometry.normals import rotation_matrices
 from ..geometry.tsdf import DepthMaps, SignedDistanceField
 from ..render.camera import camera_parameters
-from ..render.columns import NORMAL
+from ..render.surfel_columns import NORMAL
 from ..render.surfels.raster import rasterise
 from ..render.surfels.splats import prepare
 

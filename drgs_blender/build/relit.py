@@ -14,8 +14,8 @@ from ..geometry.normals import rotation_matrices
 from ..render.integrator.integrate import integrate
 from ..render.lights.environment import EnvironmentLight
 from ..render.lights.light_sampler import Lights
-from ..render.points import ShadingPoints
 from ..render.scene.trace_scene import TraceObject, TraceScene
+from ..render.shading_points import ShadingPoints
 from ..render.surfels.surfel_bvh import SurfelBVH
 
 Array = np.ndarray

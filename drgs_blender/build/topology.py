@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry.rows import number_rows
+from ..geometry.distinct_rows import distinct_row_indices
 
 Array = np.ndarray
 
@@ -67,14 +67,14 @@ def weld(
     """
     extent = np.ptp(vertices, axis=0).max(initial=0.0)
     grid = np.round((vertices - vertices.min(axis=0)) / max(extent * 2e-7, 1e-30)).astype(np.int64)
-    place = number_rows(*grid.T)
+    place = distinct_row_indices(*grid.T)
     corner_vertex = faces.reshape(-1)
     corner_place, corner_key = place[corner_vertex], np.repeat(keys, 3)
-    group = number_rows(corner_place, corner_key)
+    group = distinct_row_indices(corner_place, corner_key)
     label = np.zeros(len(group), np.int64)
     if normals is not None:
         label = _clusters(group, normals.reshape(-1, 3), agree)
-    _, first, new = np.unique(number_rows(group, label), return_index=True, return_inverse=True)
+    _, first, new = np.unique(distinct_row_indices(group, label), return_index=True, return_inverse=True)
     point = np.unique(corner_place[first], return_inverse=True)[1].reshape(-1)
     return corner_vertex[first], point, new.reshape(-1, 3)
 

@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=int_range(16, 16384), default=1024, metavar="N", help="image side; default 1024")
     parser.add_argument(
         "--light", choices=("all", "diffuse"), default="all",
-        help="all light, highlights as seen along the normal, or what looks the same from everywhere; default all",
+        help="all light with highlights as seen along the normal, or the view-independent part; default all",
     )  # fmt: skip
     parser.add_argument(
         "--samples", type=int_range(3, 65536), default=256, metavar="N", help="samples a point; default 256"

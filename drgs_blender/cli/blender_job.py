@@ -1,7 +1,7 @@
 """Runs inside Blender for ``drgs render``: evaluates frames and sends their descriptions to the waiting parent.
 
 Started as a plain script, so nothing is imported from this package before the extension is enabled. What Blender
-prints goes to stderr; stdin and the original stdout become a link of engine.protocol, on which this side plays the
+prints goes to stderr; stdin and the original stdout become a link of ipc.protocol, on which this side plays the
 client: LoadAsset for every asset, Render for every frame and view layer, Failed when something is wrong.
 """
 

@@ -282,7 +282,7 @@ class BlenderProcess:
             raise EngineError("Blender", f"did not answer for {seconds:g} s and was ended", "Try again")
 
     def _listen(self) -> None:
-        """Gather what Blender prints: shown with -vv, and its last words when it dies."""
+        """Gather what Blender prints: shown with -vv, and its last line when it dies."""
         assert self._process.stderr is not None
         for line in self._process.stderr:
             self._note(line)
@@ -299,4 +299,4 @@ class BlenderProcess:
         self._listener.join(2)
         code = self._process.poll()
         end = "it closed its pipe" if code is None else f"exit code {code}"
-        return f"{end}, last words: {self._words[-1][:300] if self._words else 'none'}"
+        return f"{end}; last log line: {self._words[-1][:300] if self._words else 'none'}"

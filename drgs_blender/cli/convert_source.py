@@ -62,7 +62,7 @@ def open_source(args: argparse.Namespace) -> Source:
 
     suffix = args.input.suffix.lower()
     if suffix in (".drgs", SUFFIX) and args.from_up not in (None, "z"):
-        raise UsageError("--from-up", "is given for what is always Z up", "Leave it out")
+        raise UsageError("--from-up", "is given for a file that is always Z up", "Leave it out")
     if suffix == ".drgs":
         from ..core.asset.container import read_asset
 

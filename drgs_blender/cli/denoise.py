@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("noisy", metavar="PATTERN", help="noisy EXR files; #### is the frame's number")
     parser.add_argument("--frames", required=True, help="frames to denoise: 1-24, 1-24x2,30")
     parser.add_argument("--out", required=True, metavar="PATTERN", help="EXR files to write")
-    parser.add_argument("--window", type=odd, default=5, metavar="N", help="frames that make one, odd; default 5")
+    parser.add_argument("--window", type=odd, default=5, metavar="N", help="frames averaged into one, odd; default 5")
     parser.add_argument(
         "--sequence",
         metavar="FRAMES",
@@ -176,7 +177,7 @@ class _Source:
 
     def denoise(self, number: int, passes: tuple[str, ...] | None) -> tuple[NoisyFrame, dict[str, np.ndarray], bool]:
         """The noisy frame, its denoised passes, and whether a neighbour has the very same noise."""
-        from ..render.denoise.svgf_temporal import Shot
+        from ..render.denoise.svgf_temporal import NoisyPicture
         from ..render.denoise.svgf_window import window
         from ..render.film.film import COMPONENTS
 
@@ -185,16 +186,16 @@ class _Source:
             del self._held[old]
         noisy = [None if k is None else self.frame(k) for k in around]
         middle = self.frame(number)
-        shots: list[Shot | None] = []
+        pictures: list[NoisyPicture | None] = []
         for before, item in zip([None, *noisy], noisy):
             if item is None:
-                shots.append(None)
+                pictures.append(None)
                 continue
-            shot = item.shot
+            picture = item.picture
             linked = before is not None and item.follows(before)
-            shots.append(Shot(shot.components, shot.variance, shot.guides, shot.motion if linked else None))
+            pictures.append(replace(picture, motion=picture.motion if linked else None))
         wanted = passes or _held(middle)
-        light = window(shots, split=any(name in COMPONENTS for name in wanted))
+        light = window(pictures, split=any(name in COMPONENTS for name in wanted))
         made = {name: light[:, :, i] for i, name in enumerate(COMPONENTS)}
         made |= middle.passes | {"Combined": middle.beauty(light), "Noisy Image": middle.passes["Combined"]}
         absent = [name for name in wanted if name not in made]

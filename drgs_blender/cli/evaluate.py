@@ -181,14 +181,16 @@ def session_renderer(
     session: Session, key: str, settings: RenderSettings, visibility: Visibility | None = None
 ) -> Renderer:
     """Renders the loaded asset `key` for `evaluate.compare`, with `settings` on a transparent film."""
-    from ..evaluate.compare import PASSES
+    from ..evaluate.compare import COMPARED_PASSES
 
     settings = replace(settings, film_transparent=True)
 
     def render(camera: Camera, radiance: np.ndarray, vertices: np.ndarray | None) -> dict[str, np.ndarray]:
         state = ObjectState(Path(key).stem, key, vertices=vertices, visibility=visibility or Visibility())
         world = World(radiance)
-        frame = Frame(noise_index=1, camera=camera, objects=[state], world=world, settings=settings, passes=PASSES)
+        frame = Frame(
+            noise_index=1, camera=camera, objects=[state], world=world, settings=settings, passes=COMPARED_PASSES
+        )
         return dict(session.render(frame))
 
     return render

@@ -40,7 +40,7 @@ class Blender:
         Raises
         ------
         DeviceError
-            When it does not start; with its last words.
+            When it does not start; with its last log line.
         """
         ask = ["-c", "import bpy; print('Blender', bpy.app.version_string)"] if self.is_module else ["--version"]
         try:

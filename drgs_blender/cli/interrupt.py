@@ -29,7 +29,7 @@ def interruptible() -> Iterator[Callable[[], bool]]:
         if len(came) > 1:
             _end(number)
         with contextlib.suppress(OSError):  # not by sys.stderr, which may be in the middle of writing
-            os.write(2, b"\ndrgs: stopping after what is under way; again: at once\n")
+            os.write(2, b"\ndrgs: stopping after the current step; again: at once\n")
 
     previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -99,7 +99,7 @@ class Machine:
         return key
 
     def check_assets(self) -> None:
-        """Refuse what was rendered while an asset was rewritten: nobody knows of which of its contents it is.
+        """Refuse a frame that was rendered while an asset was rewritten: it may show the old or the new content.
 
         Raises
         ------

@@ -48,10 +48,10 @@ class Picture:
         if not self._shot.count:
             yield self.frame
             return
-        if (sharp := blur.sharp(self.frame)) is not None:
+        if (sharp := blur.sharp_frame(self.frame)) is not None:
             yield sharp
         for i, frame in enumerate(self._shot.pictures()):
-            yield blur.share(self._overridden(frame), self._shot.count, i)
+            yield blur.sample_frame(self._overridden(frame), self._shot.count, i)
 
     def settings_hash(self, assets: Mapping[str, Path]) -> str:
         """`frame_store.settings_hash` of all that is rendered for it."""

@@ -65,7 +65,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--voxels", type=int_range(16, 1024), metavar="N", help="of the mesh's longest side; default 256"
     )
     parser.add_argument(
-        "--time-budget", type=_minutes, metavar="M", help="all stages together, about, once kernels are compiled"
+        "--time-budget",
+        type=_minutes,
+        metavar="M",
+        help="minutes of all stages together, about, once kernels are compiled",
     )
     parser.add_argument(
         "--test-every",
@@ -83,13 +86,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--device",
         choices=("cpu", "cuda"),
         default="cpu",
-        help="what learns; without a card the processor does. Default cpu",
+        help="device of the optimisation: cpu or cuda; falls back to cpu. Default cpu",
     )
     parser.add_argument(
         "--axes",
         choices=tuple(CAMERAS),
         default="opengl",
-        help="what the cameras' matrices are taken for; default opengl: the convention of the layout",
+        help="convention of the camera matrices; default opengl: that of the layout",
     )
     parser.add_argument("--up", choices=tuple(UP_AXES), help="up axis of the capture's world; default: found")
 

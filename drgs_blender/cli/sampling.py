@@ -58,26 +58,26 @@ def add_arguments(
     add(
         "--subpixel-samples",
         "subpixel_samples",
-        "places in a pixel among which its samples are divided, 0 for as many as suit them",
+        "sub-pixel positions per pixel; samples are divided among them. 0: chosen by the number of samples",
         type=int_range(0, 1024),
     )
     add(
         "--filter-width",
         "filter_width",
-        "pixels that the filter is wide (Blackman-Harris, Cycles has 1.5); 0 for a box of one pixel",
+        "width of the pixel filter in pixels (Blackman-Harris, Cycles has 1.5); 0: a box of one pixel",
         type=at_least_zero,
     )
     add("--camera-sees", "camera_sees", "what the camera sees: surfels or the mesh", choices=choices("camera_sees"))
     add(
         "--rays-see",
         "rays_see",
-        "what shadow and indirect rays meet of DR-GS objects: the mesh or the surfels",
+        "representation of DR-GS objects for shadow and indirect rays: mesh or surfels",
         choices=choices("rays_see"),
     )
     add("--denoise", "denoise", "denoiser", choices=choices("denoise"))
     add("--shading-model", "shading_model", "reflection model", choices=choices("shading_model"))
     add("--seed", "seed", "seed of the noise", type=int_range(0, 2**31 - 1))
-    add("--device", "device", "what traces light; without a card the processor does", choices=choices("device"))
+    add("--device", "device", "device of the renderer: cpu or cuda; falls back to cpu", choices=choices("device"))
     add("--threads", "threads", "threads, 0 for all cores", type=int_range(0, 1024))
     if not output:
         return

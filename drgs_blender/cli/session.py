@@ -71,7 +71,7 @@ def start(folder: Path, idle: int) -> int:
         if not acquire(lock, folder):
             raise UsageError(f"session {folder}", "is running", "Stop it, or choose another folder")
     command = [sys.executable, "-m", "drgs_blender.cli.main", "session", "serve", str(folder), f"--idle={idle}"]
-    # It inherits no stream: whoever runs this command would wait until it ends.
+    # It inherits no stream: the caller of this command would wait for its end.
     log = folder / "log"
     apart = {"creationflags": 0x208} if os.name == "nt" else {"start_new_session": True}  # detached, in a group
     with open(log, "wb") as out:

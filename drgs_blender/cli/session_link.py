@@ -111,7 +111,7 @@ def _wait_until_ended(folder: Path, seconds: float) -> bool:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of commands that a session can run."""
     parser.add_argument(
-        "--session", type=Path, metavar="FOLDER", help="let the process of `drgs session start` do it, which is warm"
+        "--session", type=Path, metavar="FOLDER", help="run in the warm process of `drgs session start`"
     )
     parser.add_argument("--openjd", action="store_true", help="report progress to an Open Job Description session")
 

@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs simulate``."""
     parser.add_argument("asset", type=Path, metavar="ASSET", help=".drgs file")
     parser.add_argument("--out", type=Path, required=True, metavar="CACHE", help="folder of the frames")
-    parser.add_argument("--settings", type=Path, metavar="S.json", help="what is simulated")
+    parser.add_argument("--settings", type=Path, metavar="S.json", help="settings of the simulation")
     parser.add_argument("--overwrite", action="store_true", help="remove what the folder holds of other settings")
     parser.add_argument("--threads", type=int_range(0, 1024), default=0, help="threads, 0 for all cores")
     group = parser.add_argument_group("settings, over those of the file")
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
     if report["dropped_parts"]:
         logger.warning("%d small parts of the mesh's interior are left out", report["dropped_parts"])
     if report["bare_vertices"]:
-        logger.warning("%d vertices are on walls too thin to fill; they follow what is near", report["bare_vertices"])
+        logger.warning("%d vertices are on walls too thin to fill; they follow near particles", report["bare_vertices"])
     cache = ParticleCache(args.out)
     count = settings.last - settings.first + 1
     with FractionBar(args, "simulating") as bar, interruptible() as stopped:

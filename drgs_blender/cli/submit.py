@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("check")
     group.add_argument("--no-check", action="store_true", help="submit without looking at the scene")
     group.add_argument(
-        "--shared", type=Path, action="append", default=[], metavar="FOLDER", help="what every node sees; repeatable"
+        "--shared", type=Path, action="append", default=[], metavar="FOLDER", help="folder on all nodes; repeatable"
     )
     group.add_argument("--blender", metavar="PATH", help="blender program, or a Python that has bpy, for the check")
     group = parser.add_argument_group("managers")

@@ -269,7 +269,7 @@ class Light:
     radius : float
         Metres, of point and spot lights.
     soft_falloff : bool
-        Point and spot lights are disks that face whoever looks (Blender's default), else spheres.
+        Point and spot lights are disks that face the shading point (Blender's default), else spheres.
     angle : float
         Radians, apparent diameter of a sun.
     spot_size : float

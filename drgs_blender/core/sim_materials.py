@@ -35,7 +35,7 @@ MOST_HARDENING = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """Matter, in SI units.
+    """Parameters of a material, in SI units.
 
     Attributes
     ----------
@@ -187,7 +187,7 @@ def make_material(name: str, changes: Mapping[str, Any] | None = None, subject: 
 
 
 @dataclass(slots=True)
-class Matter:
+class ParticleMaterials:
     """Material parameters of each particle, as arrays.
 
     Attributes
@@ -212,13 +212,13 @@ class Matter:
     keeps_shape: Array
 
 
-def matter_of(materials: list[Material], which: Array) -> Matter:
-    """Matter of particles of which each is of ``materials[which]``."""
+def particle_materials(materials: list[Material], which: Array) -> ParticleMaterials:
+    """Parameters of particles; that of index i consists of ``materials[which[i]]``."""
 
     def pick(values: list[Any], kind: type) -> Array:
         return np.ascontiguousarray(np.array(values, kind)[which])
 
-    return Matter(
+    return ParticleMaterials(
         pick([MODELS[m.model] for m in materials], np.uint8),
         pick([m.row() for m in materials], np.float32),
         pick([m.density for m in materials], np.float32),

@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 
 from ..core.asset.model import Binding, Mesh, Surfels
 from ..core.errors import AssetError
+from ..geometry.distinct_rows import distinct_row_indices
 from ..geometry.normals import lengths, quaternions, unit
-from ..geometry.rows import number_rows
 from .binding import project
 from .face_frames import Faces, product
 
@@ -178,7 +178,7 @@ def sharp_edges(mesh: Mesh, faces: Faces) -> Array:
 
     Vertices at one place count as one, so that hard edges whose vertices are split are judged by their angle.
     """
-    place = number_rows(*mesh.vertices.T)
+    place = distinct_row_indices(*mesh.vertices.T)
     corner = place[mesh.faces]
     start, end = corner[:, [1, 2, 0]], corner[:, [2, 0, 1]]
     key = np.minimum(start, end) * len(place) + np.maximum(start, end)

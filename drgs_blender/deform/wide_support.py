@@ -1,4 +1,4 @@
-"""Wide support: the three vertices that a surfel follows which is larger than the face it is bound to."""
+"""Wide support: the three vertices that a surfel follows if it is larger than its face."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SAME_SIDE = 0.3
 _BROAD = 0.3
 
 
-class Walked(NamedTuple):
+class MeshAdjacency(NamedTuple):
     """A mesh to walk on.
 
     Attributes
@@ -42,7 +42,7 @@ class Walked(NamedTuple):
     corner: Array
 
 
-class Feet(NamedTuple):
+class SurfelSpots(NamedTuple):
     """Attachment of surfels to a mesh.
 
     Attributes
@@ -90,7 +90,7 @@ def spans(
     Returns
     -------
     (n, 3) int32 array
-        -1 where the own face is to be taken, also for want of a broad triangle larger than that.
+        -1 for surfels that follow their own face: small ones, and those without a broad triangle that is larger.
     """
     wanted = np.flatnonzero((reach > faces.mean_edge[face]) & ~faces.degenerate[face])
     found = np.full((len(face), 3), -1, np.int32)
@@ -103,8 +103,8 @@ def spans(
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         across = np.cross(faces.normal[own], along)
         start, corner = corner_table(indices, len(vertices))
-        mesh = Walked(vertices.astype(np.float64), indices, normals, faces.normal, start, corner)
-        found[wanted] = _walk(mesh, Feet(own, foot, along, across, reach[wanted].astype(np.float64)))
+        mesh = MeshAdjacency(vertices.astype(np.float64), indices, normals, faces.normal, start, corner)
+        found[wanted] = _walk(mesh, SurfelSpots(own, foot, along, across, reach[wanted].astype(np.float64)))
         triangle = vertices[found[wanted]].astype(np.float64)
         edges = np.roll(triangle, -1, axis=1) - triangle
         area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
@@ -115,7 +115,7 @@ def spans(
 
 
 @njit
-def _walk(mesh: Walked, feet: Feet) -> Array:
+def _walk(mesh: MeshAdjacency, feet: SurfelSpots) -> Array:
     """For each surfel the vertices nearest to three places around its foot."""
     vertices, indices, normals, face_normals, start, corner = mesh
     face, foot, along, across, reach = feet

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..core.arrays import same_bits
 from ..core.frame import Frame
-from ..ipc.change_detection import renewed
+from ..ipc.change_detection import reuse_equal
 from ..render.camera import camera_parameters
 from ..render.denoise.svgf_temporal import History
 from ..render.film.film import COMPONENTS
@@ -66,7 +66,7 @@ class Histories:
         lasting = replace(
             settings, seed=0, threads=0, device="cpu", samples=0, strategy_samples=None, noise_threshold=0.0
         )
-        situation = renewed(camera, old.situation[0]), renewed(lasting, old.situation[1]), *static_state
+        situation = reuse_equal(camera, old.situation[0]), reuse_equal(lasting, old.situation[1]), *static_state
         split = any(name in frame.passes for name in COMPONENTS)
         fit = (
             scene.layout,

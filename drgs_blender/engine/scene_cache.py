@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from ..compute.warp.posed_surfels import PosedThere, joined
+from ..compute.warp.posed_surfels import DevicePosedSurfels, joined
 from ..core.asset.container import read_asset
 from ..core.asset.model import Asset, PosedSurfels, Surfels
 from ..core.errors import AssetError, UsageError
 from ..core.frame import Frame, Image, Light, MeshState, Moment, ObjectState, RenderSettings, World
 from ..deform.gpu.mesh_driven import Deformer
 from ..deform.mesh_driven import MeshDriven
-from ..ipc.change_detection import renewed
+from ..ipc.change_detection import reuse_equal
 from ..render.backend import CPU, RenderBackend
 from ..render.camera import camera_parameters
 from ..render.film.motion_vectors import Instant
@@ -146,7 +146,7 @@ class SceneCache:
         """Copy of a frame that is safe from later changes of its arrays; those of the scene are copies already."""
         states = [item.state for item in self.objects]
         world = frame.world if self.world is None else self.world
-        return renewed(replace(frame, objects=states, meshes=self.meshes, images=self.images, world=world), None)
+        return reuse_equal(replace(frame, objects=states, meshes=self.meshes, images=self.images, world=world), None)
 
     def pose(self, frame: Frame, backend: RenderBackend = CPU) -> PosedSurfels:
         """Bring the trace scene up to date; return the surfels of all objects, posed where they will be needed."""
@@ -162,7 +162,7 @@ class SceneCache:
                 )
             _check_surface(state, loaded.asset, frame.settings)
             known = self.objects[index] if index < len(self.objects) else None
-            kept = renewed(state, None if known is None else known.state)
+            kept = reuse_equal(state, None if known is None else known.state)
             if known is not None and known.loaded is loaded and known.state is kept and known.traced.seen_only == met:
                 item = known
             else:
@@ -171,7 +171,7 @@ class SceneCache:
                 given = item.state, index, loaded.surfels_of(item.state), item.traced
                 item.posed, item.hidden_count = posed_surfels(*given, self._poser(backend))
             objects.append(item)
-        meshes, images = renewed(frame.meshes, self.meshes), renewed(frame.images, self.images)
+        meshes, images = reuse_equal(frame.meshes, self.meshes), reuse_equal(frame.images, self.images)
         same = len(objects) == len(self.objects) and all(a is b for a, b in zip(objects, self.objects))
         if not (self._current and same and meshes is self.meshes and images is self.images):
             self._current = False  # an update that fails half way leaves nothing to be taken for current
@@ -205,7 +205,7 @@ class SceneCache:
     def _joined(self, parts: list[PosedSurfels], backend: RenderBackend) -> PosedSurfels:
         """The surfels of all objects as one, on a device if it has posed any."""
         on_cpu, launcher = functools.partial(join, parts), backend.launcher
-        if launcher is None or len(parts) < 2 or not any(isinstance(part, PosedThere) for part in parts):
+        if launcher is None or len(parts) < 2 or not any(isinstance(part, DevicePosedSurfels) for part in parts):
             return on_cpu()
         return backend.with_fallback(lambda: joined(launcher, parts, on_cpu), on_cpu)
 
@@ -274,7 +274,7 @@ class SceneCache:
 
     def environment_of(self, world: World) -> EnvironmentLight:
         """The light of `world`, made again only when something about it changed; a rotation costs nothing."""
-        known, kept = self.world, renewed(world, self.world)
+        known, kept = self.world, reuse_equal(world, self.world)
         if self.environment is None or known is None:
             self.environment = EnvironmentLight(kept)
         elif kept is not known:

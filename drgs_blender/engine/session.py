@@ -19,7 +19,7 @@ from ..compute.threads import use_threads
 from ..core.asset.model import Asset, PosedSurfels
 from ..core.errors import Cancelled, UsageError
 from ..core.frame import Frame, Light, ObjectState, RenderSettings
-from ..ipc.change_detection import renewed
+from ..ipc.change_detection import reuse_equal
 from ..ipc.protocol import Passes
 from ..render.backend import CPU, RenderBackend
 from ..render.gpu.select_backend import Backends
@@ -243,7 +243,7 @@ class Session:
         """The frame's picture as a whole, part of a sequence where it names one."""
         sequence, statistics = None, {}
         if frame.history and frame.settings.denoise == "svgf":
-            self._lights = renewed(frame.lights, self._lights)
+            self._lights = reuse_equal(frame.lights, self._lights)
             static_state = *self._scene_cache.static_state, self._lights
             sequence = self._histories.continued(frame, prepared.scene, static_state)
             statistics["history"] = float(sequence.pictures)

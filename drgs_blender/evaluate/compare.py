@@ -22,9 +22,9 @@ Array = np.ndarray
 logger = logging.getLogger(__name__)
 
 #: (camera, radiance of the light (h, w, 3), vertices of the asset's mesh or None at rest) -> pass name -> (h, w, c):
-#: the passes `PASSES`, on a transparent film.
+#: the passes `COMPARED_PASSES`, on a transparent film.
 Renderer = Callable[[Camera, Array, Array | None], dict[str, Array]]
-PASSES = ("Combined", "Depth", "Normal", "Albedo", "Roughness", "Metallic", "Coverage")
+COMPARED_PASSES = ("Combined", "Depth", "Normal", "Albedo", "Roughness", "Metallic", "Coverage")
 #: A perceptual distance of two encoded pictures.
 Distance = Callable[[Array, Array], float]
 #: By name; None where it is not computed.

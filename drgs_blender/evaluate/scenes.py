@@ -240,7 +240,7 @@ def _converse(command: list[str], job: dict[str, Any]) -> Iterator[tuple[str, st
 
 
 class _Listener:
-    """Keeps the last words of a stream, which would otherwise fill its pipe."""
+    """Keeps the last lines of a stream, which would otherwise fill its pipe."""
 
     def __init__(self, stream: Any) -> None:
         self._words: deque[str] = deque(maxlen=20)

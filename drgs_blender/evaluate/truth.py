@@ -19,8 +19,8 @@ from ..formats.images import load_image
 from ..formats.registry import read_environment
 from ..reconstruct.capture.capture import View
 from ..reconstruct.readers import read_capture
-from ..reconstruct.readers.develop import shrink
 from ..reconstruct.readers.layout import read_json
+from ..reconstruct.readers.photograph_loading import shrink
 from ..render.film.frame_files import read_frame
 
 Array = np.ndarray

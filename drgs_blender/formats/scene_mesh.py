@@ -16,8 +16,8 @@ from ..core.errors import AssetError
 from . import trimesh_scene
 from .files import Image, MaterialFile, MeshFile
 from .obj import beside, load_texture
-from .soup import join_equal
 from .subprocess_reader import read_in_subprocess
+from .triangle_soup import join_equal
 from .trimesh_scene import ABOUT
 
 Array = np.ndarray
@@ -70,7 +70,7 @@ def read_scene_mesh(path: Path) -> MeshFile:
     left_out = [name for tags, name in _LEFT_OUT[kind].items() if any(found.get(tag) for tag in tags)]
     notes = [f"{', '.join(left_out)} left out"] if left_out else []
     if about["broken"]:
-        notes.append(f"what is broken or not understood left out ({about['broken']})")
+        notes.append(f"broken or unknown elements left out ({about['broken']})")
     if not pieces:
         more = f" but {', '.join(left_out)}" if left_out else ""
         raise AssetError(str(path), f"places no mesh that is read{more}", _REMEDY)

@@ -15,7 +15,7 @@ from ..core.asset.archive import first_reason
 from ..core.color import srgb_to_linear
 from ..core.errors import AssetError
 from .files import MeshFile
-from .soup import join_equal
+from .triangle_soup import join_equal
 
 Array = np.ndarray
 

@@ -22,7 +22,7 @@ SHARP = frozenset(
 )
 
 
-def through(camera: Camera, lens: tuple[float, float], distance: float) -> Camera:
+def camera_on_lens(camera: Camera, lens: tuple[float, float], distance: float) -> Camera:
     """`camera` from another place of its lens, metres to the right and up; what is at `distance` stays in its pixel."""
     x, y = lens
     pose = np.array(camera.matrix_world)
@@ -35,7 +35,7 @@ def through(camera: Camera, lens: tuple[float, float], distance: float) -> Camer
     return replace(camera, matrix_world=pose, cx=cx, cy=cy)
 
 
-def sharp(frame: Frame) -> Frame | None:
+def sharp_frame(frame: Frame) -> Frame | None:
     """The picture with those passes of a blurred one that stay sharp; None where none is wanted."""
     names = tuple(name for name in frame.passes if name in SHARP)
     if not names:
@@ -44,13 +44,15 @@ def sharp(frame: Frame) -> Frame | None:
     return replace(frame, passes=names, settings=cheap)
 
 
-def share(frame: Frame, count: int, index: int) -> Frame:
+def sample_frame(frame: Frame, count: int, index: int) -> Frame:
     """One of the `count` pictures that are averaged, of a frame at its time and place on the lens."""
     names = tuple(name for name in frame.passes if name not in SHARP)
-    return replace(frame, passes=names, settings=shared(frame.settings, count, index), previous=None, next=None)
+    return replace(
+        frame, passes=names, settings=sample_settings(frame.settings, count, index), previous=None, next=None
+    )
 
 
-def shared(settings: RenderSettings, count: int, index: int) -> RenderSettings:
+def sample_settings(settings: RenderSettings, count: int, index: int) -> RenderSettings:
     """The settings of one of `count` pictures: its part of the samples, with noise of its own."""
     given = settings.strategy_samples
     return replace(

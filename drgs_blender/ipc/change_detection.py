@@ -1,4 +1,4 @@
-"""Change detection: what of a frame is the same as in the last one keeps its identity."""
+"""Change detection: unchanged parts of a frame keep the identity of those in the last one."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from ..core.arrays import keep, same_bits
 T = TypeVar("T")
 
 
-def renewed(value: T, known: Any) -> T:
-    """`known` itself when it equals `value`, else a copy of `value` that nobody can change.
+def reuse_equal(value: T, known: Any) -> T:
+    """`known` itself when it equals `value`, else a read-only copy of `value`.
 
-    Arrays are compared bit by bit. Wherever a part of `value` (a field, an item) equals that of `known`, the copy holds
-    the latter: whoever looks at it sees by identity what changed.
+    Arrays are compared bit by bit. Where a part of `value` (a field, an item) equals that of `known`, the copy holds
+    the latter, so that later stages recognise changes by identity.
     """
     made: Any
     if isinstance(value, np.ndarray):
@@ -25,13 +25,13 @@ def renewed(value: T, known: Any) -> T:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         before = known if type(known) is type(value) else None
         names = [f.name for f in dataclasses.fields(value)]
-        made = {name: renewed(getattr(value, name), getattr(before, name, None)) for name in names}
+        made = {name: reuse_equal(getattr(value, name), getattr(before, name, None)) for name in names}
         if before is not None and all(made[name] is getattr(before, name) for name in names):
             return before
         return type(value)(**made)
     if isinstance(value, (list, tuple)):
         old = known if type(known) is type(value) else ()
-        made = [renewed(item, old[i] if i < len(old) else None) for i, item in enumerate(value)]
+        made = [reuse_equal(item, old[i] if i < len(old) else None) for i, item in enumerate(value)]
         if len(old) == len(made) and type(known) is type(value) and all(a is b for a, b in zip(made, old)):
             return known
         return type(value)(made)

@@ -49,7 +49,7 @@ class Child:
     ----------
     inbox : queue.Queue
         (message, arrays) as they arrive; at the end one exception that says why there will be no more. None only wakes
-        whoever waits.
+        a waiting thread.
     reads : int
         Grows with every byte that arrives.
     steps : int
@@ -60,7 +60,7 @@ class Child:
     idle : threading.Event
         Set while no request is unanswered.
     greeted : bool
-        Whether hands were shaken.
+        Whether the handshake is done.
     warm : bool
         Whether it has finished a picture: everything is imported, kernels are loaded.
     """
@@ -169,7 +169,7 @@ class Child:
             "stopped answering" if code is None else f"was killed by signal {-code}" if code < 0 else f"exited ({code})"
         )
         last = next((line for line in reversed(self._log) if line.strip()), "")
-        return f"{how}; its last words: {last[:300]}" if last else how
+        return f"{how}; last log line: {last[:300]}" if last else how
 
     # --- threads ---------------------------------------------------------------------------------------------------
 

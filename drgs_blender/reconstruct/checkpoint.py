@@ -70,7 +70,7 @@ class Checkpoint:
     every : float
         Seconds between two states.
     now : callable
-        Seconds since whenever.
+        Monotonic clock, seconds.
     """
 
     def __init__(self, path: Path | None, key: str, every: float, now: Callable[[], float] = time.monotonic) -> None:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _SIZE, _AWAY, _STEPS, _STEPS_OF_MATERIALS = 32, 4.0, 24, 4
 
 
-def rehearse(settings: Settings, masked: bool, backend: LearningBackend, cancelled: Callable[[], bool]) -> None:
+def warm_up(settings: Settings, masked: bool, backend: LearningBackend, cancelled: Callable[[], bool]) -> None:
     """Take some steps of every phase that `settings` have.
 
     Parameters
@@ -77,7 +77,7 @@ def _photographs() -> Capture:
         matrix[:3] = np.column_stack([side, np.cross(back, side), back, _AWAY * back])
         camera = Camera(matrix, _SIZE, _SIZE, focal, focal, _SIZE / 2, _SIZE / 2)
         views.append(View(str(k), camera, rng.random((_SIZE, _SIZE, 3), np.float32), mask))
-    return Capture(Path("rehearsal"), views)
+    return Capture(Path("warm-up"), views)
 
 
 def _octahedron() -> Mesh:

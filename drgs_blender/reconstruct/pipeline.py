@@ -27,7 +27,7 @@ from .capture.training_views import background_of, composed
 from .gpu.select_backend import select_backend
 from .inverse_rendering.run import Decoupled, decouple
 from .inverse_rendering.settings import Settings as Decoupling
-from .jit_warmup import rehearse
+from .jit_warmup import warm_up
 from .losses.photometric import Photograph, structural_similarity
 from .meshing.depth_fusion import fuse, grid
 from .meshing.normal_integration import follow_normals, shaded_by, shaded_by_own
@@ -45,9 +45,9 @@ log = logging.getLogger(__name__)
 SAVE_EVERY, SHOW_EVERY = 20.0, 5.0
 #: Steps on the mesh, as a part of those before.
 ON_MESH = 0.4
-#: Parts of the minutes that the surfels get, and their second round on the mesh.
+#: Parts of the time budget for the surfels, and for their second round on the mesh.
 SURFEL_TIME_FRACTION, MESH_SURFEL_TIME_FRACTION = 0.45, 0.15
-#: Part of the minutes for materials and light.
+#: Part of the time budget for materials and light.
 MATERIAL_TIME_FRACTION = 0.35
 #: Fewer steps of materials than this separate them poorly from the light.
 FEW_STEPS = 300
@@ -73,7 +73,7 @@ class Settings:
     mesh_resolution : int
         Most voxels along the mesh's longest side.
     minutes : float, optional
-        All stages together, once kernels are compiled; None: the steps of the schedule decide.
+        The time budget of all stages together, once kernels are compiled; None: the steps of the schedule decide.
     materials : bool
         Inverse rendering: materials apart from the light; else albedo is the photographed colour.
     decoupling : Settings
@@ -148,7 +148,7 @@ def reconstruct(
     Raises
     ------
     UsageError, AssetError: what cannot be reconstructed, see `visual_hull.find_region`, `training_views.targets` and
-        `tsdf.fuse`.
+        `depth_fusion.fuse`.
     """
     settings = settings or Settings()
     work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)
@@ -157,7 +157,7 @@ def reconstruct(
     prepare_kernels(("reconstruct",), lambda phase, part: work.on_progress(Progress(phase, part)), work.cancelled)
     if settings.minutes is not None:
         work.on_progress(Progress(PHASE, 0.0))
-        rehearse(settings, have_silhouettes(capture), work.backend, work.cancelled)
+        warm_up(settings, have_silhouettes(capture), work.backend, work.cancelled)
     training = Training(
         capture, region, settings.schedule, seconds=work.seconds(SURFEL_TIME_FRACTION), backend=work.backend
     )
@@ -169,7 +169,7 @@ def reconstruct(
     binding: Binding | None = None
     if settings.variant == "m":
         final, binding = _on_mesh(work, mesh, free, region, report)
-    report |= judge(final, capture)
+    report |= held_out_metrics(final, capture)
     visible = final.opacities().detach().numpy() >= UNSEEN
     surfels = _visible_surfels(final, visible)
     found, thin, smooth = None, False, VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
@@ -201,7 +201,7 @@ def reconstruct(
 
 
 def mesh_of(gaussians: Gaussians, capture: Capture, region: Region, resolution: int = 256) -> tuple[Mesh, dict]:
-    """The surface of surfels as the training views see it, with the outlines of their masks; see `tsdf.fuse`."""
+    """Mesh of surfels as the training views see them (`depth_fusion.fuse`), with the outlines of their masks."""
     cameras = [view.camera for view in capture.training]
     mesh, report = fuse(gaussians, cameras, region, resolution)
     if (masks := silhouettes(capture)) is not None:
@@ -233,7 +233,7 @@ class _Work:
                 ) from error
 
     def seconds(self, share: float) -> float | None:
-        """Time of a phase."""
+        """Time budget of a phase, seconds."""
         return None if self.settings.minutes is None else 60 * share * self.settings.minutes
 
     def file(self, phase: str) -> Path | None:
@@ -351,7 +351,7 @@ def preview(gaussians: Gaussians, capture: Capture) -> Array:
     return np.concatenate([_drawn(gaussians, view, capture), composed(view, capture)], axis=1)
 
 
-def judge(gaussians: Gaussians, capture: Capture) -> dict[str, float]:
+def held_out_metrics(gaussians: Gaussians, capture: Capture) -> dict[str, float]:
     """Figures of the views left out, whole pictures.
 
     "psnr" is the mean of that of each, as in published tables and in `drgs evaluate`; "psnr_pooled" that of the mean

@@ -12,7 +12,7 @@ from ..core.asset.model import PosedSurfels
 from ..core.frame import Camera, RenderSettings
 from .denoise.demodulation import Signal
 from .denoise.svgf_spatial import denoise
-from .denoise.svgf_temporal import Shot, denoise_next
+from .denoise.svgf_temporal import NoisyPicture, denoise_next
 from .film.guides import Guides
 from .gbuffer.camera_hits import MeshHits, shade_mesh, trace_camera
 from .gbuffer.gbuffer import GBuffer
@@ -20,8 +20,8 @@ from .gbuffer.surfels import tie_to_mesh
 from .integrator.integrate import integrate
 from .lights.environment import EnvironmentLight
 from .lights.light_sampler import Lights
-from .points import Radiance, ShadingPoints
 from .scene.trace_scene import TraceScene
+from .shading_points import Radiance, ShadingPoints
 from .surfels.raster import SurfelSamples, rasterise
 from .surfels.splats import Splats, prepare
 from .surfels.surfel_bvh import SurfelBVH
@@ -109,10 +109,10 @@ class RenderBackend:
         return denoise(components, variance, guides, split, check)
 
     def denoise_next(
-        self, shot: Shot, history: Signal | None, split: bool, still: bool, check: Callable[[], None]
+        self, picture: NoisyPicture, history: Signal | None, split: bool, still: bool, check: Callable[[], None]
     ) -> tuple[Array, Signal]:
         """`denoise.svgf_temporal.denoise_next`."""
-        return denoise_next(shot, history, split, still, check)
+        return denoise_next(picture, history, split, still, check)
 
 
 CPU = RenderBackend()

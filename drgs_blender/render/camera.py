@@ -63,7 +63,7 @@ def check_camera(camera: Camera) -> None:
 def lean(camera: Camera) -> Array:
     """(2,) float64: how far rays go to the left and down per metre along the view axis.
 
-    They leave it where an orthographic camera looks through one place of its lens (`ipc.blur.through`).
+    They leave it where an orthographic camera looks through one place of its lens (`ipc.blur.camera_on_lens`).
     """
     matrix = np.asarray(camera.matrix_world, dtype=np.float64)
     return matrix[:3, :2].T @ matrix[:3, 2] if camera.orthographic else np.zeros(2)

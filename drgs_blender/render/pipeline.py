@@ -19,7 +19,7 @@ from ..core.passes import BY_NAME
 from .backend import CPU, RenderBackend
 from .camera import camera_parameters
 from .denoise.oidn import denoise_oidn, require
-from .denoise.svgf_temporal import History, Shot
+from .denoise.svgf_temporal import History, NoisyPicture
 from .film.cryptomatte import CryptoFilm
 from .film.film import COMPONENTS, Film
 from .film.motion_vectors import Instant, MotionFilm, vector_pass
@@ -28,8 +28,8 @@ from .gbuffer.mesh import primary_mesh
 from .gbuffer.surfels import Stages, primary_surfels, snap_windows
 from .gbuffer.visible_lights import visible_lights
 from .integrator.adaptive import part_count, sample_adaptively
-from .points import Radiance, ShadingPoints
 from .prepared_scene import PreparedScene
+from .shading_points import Radiance, ShadingPoints
 from .surfels.splats import Splats
 from .surfels.surfel_bvh import SurfelBVH
 
@@ -136,8 +136,8 @@ def render(
     if history is None:
         components = denoised(film, frame, check, backend)
     else:
-        shot = Shot(seen.components, seen.variance, film.guides(), motions[2])
-        components, signal = backend.denoise_next(shot, history.signal, split_light(frame), history.still, check)
+        picture = NoisyPicture(seen.components, seen.variance, film.guides(), motions[2])
+        components, signal = backend.denoise_next(picture, history.signal, split_light(frame), history.still, check)
     report(1.0, "Done")
     if history is not None:
         history.signal = signal
@@ -195,7 +195,7 @@ def strip_height(width: int, subpixels: int) -> int:
 
 
 def _own_surfels(buffer: GBuffer, tree: SurfelBVH, objects: int) -> None:
-    """Tell the points on meshes of DR-GS objects which surfels are their own: those about as large as usual there."""
+    """Set ``own`` and ``size`` of points on meshes of DR-GS objects: the object, and its surfels' mean size."""
     points, owner = buffer.points, buffer.object_index
     points.own = np.where(owner < objects, owner, -1).astype(np.int32)
     points.size = np.append(tree.sizes(objects), np.float32(0.0))[points.own]

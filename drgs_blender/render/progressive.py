@@ -27,8 +27,8 @@ from .gbuffer.visible_lights import visible_lights
 from .integrator.adaptive import Sampling, part_count
 from .integrator.variance import variances
 from .pipeline import Batches, VisibleSurfaces, check_frame, denoised, strip_height
-from .points import Radiance, ShadingPoints
 from .prepared_scene import PreparedScene
+from .shading_points import Radiance, ShadingPoints
 
 Array = np.ndarray
 

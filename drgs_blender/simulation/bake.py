@@ -9,7 +9,7 @@ from dataclasses import asdict
 
 from ..core.errors import UsageError
 from ..core.particle_cache import Header, ParticleCache
-from .digest import same_until
+from .input_digest import same_until
 from .job import Job
 
 log = logging.getLogger(__name__)

@@ -11,7 +11,7 @@ import numpy as np
 from ..compute.jit import inlined, njit
 from ..compute.threads import ELEMENTS, over_range
 from ..core.errors import UsageError
-from .blocks import SLOTS, Nodes
+from .grid_blocks import SLOTS, Nodes
 
 Array = np.ndarray
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..compute.jit import inlined, njit
 from ..compute.threads import over_range
-from .blocks import Nodes
+from .grid_blocks import Nodes
 
 Array = np.ndarray
 

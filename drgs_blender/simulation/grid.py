@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..compute.warp.kernels import Launcher
-from .blocks import Arrangement, Domain, Nodes, arrange
 from .colliders import MovingCollider
 from .contact import bound, collide
 from .fields import FieldRows, ForceField, blow_nodes
+from .grid_blocks import Arrangement, Domain, Nodes, arrange
 from .p2g_g2p import SCRATCH, advance_nodes, g2p, hold_pins, p2g
 from .particles import Particles, Properties, taken
 

@@ -13,16 +13,16 @@ from scipy.spatial import cKDTree
 from ..core.asset.model import Mesh
 from ..core.errors import AssetError, DeviceError, UsageError
 from ..core.particle_cache import ParticleFrame
-from ..core.sim_materials import matter_of
+from ..core.sim_materials import particle_materials
 from ..deform.gmls import Weights, bind_points, carry
 from ..deform.gpu.gmls import Carrier
 from ..deform.sources import MeshSource
 from ..formats.registry import read_mesh
-from .blocks import Domain
 from .colliders import Collider, lift_surface
 from .contact import Plane
-from .digest import digest_of, moves_of
 from .fill import Filling, fill
+from .grid_blocks import Domain
+from .input_digest import digest_of, moves_of
 from .rigid import Rigid
 from .settings import Region, Settings
 from .solver import Body, Forces, Solver
@@ -207,7 +207,12 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
     velocity = np.asarray(settings.velocity) + np.cross(np.asarray(settings.spin), points - centre)
     rides = any(loose[i] for i in np.unique(which))
     body = Body(
-        points, filling.volume, matter_of(materials, which), vertices if rides else np.empty((0, 3)), pinned, velocity
+        points,
+        filling.volume,
+        particle_materials(materials, which),
+        vertices if rides else np.empty((0, 3)),
+        pinned,
+        velocity,
     )
     carried = None
     if not rides:

@@ -13,8 +13,8 @@ from ..compute.jit import inlined, njit
 from ..compute.simd import fold, load, quads, repeat, spread, store
 from ..compute.threads import over_range
 from ..core.sim_materials import ELASTIC, LAMBDA, MU
-from .blocks import SLOTS, Arrangement, Nodes
 from .constitutive import neo_hookean, respond
+from .grid_blocks import SLOTS, Arrangement, Nodes
 from .particles import Particles, Properties
 
 Array = np.ndarray

@@ -51,9 +51,9 @@ class Properties(NamedTuple):
     volume : (n,) float32 array
         Cubic metres at rest.
     model : (n,) uint8 array
-        See `core.sim_materials.Matter`.
+        See `core.sim_materials.ParticleMaterials`.
     parameters : (n, k) float32 array
-        See `core.sim_materials.Matter`.
+        See `core.sim_materials.ParticleMaterials`.
     solid : (n,) bool array
         Matter that keeps its shape.
     """

@@ -16,12 +16,12 @@ from scipy.spatial import cKDTree
 from ..compute.warp.kernels import Launcher
 from ..compute.warp.runtime import DEVICES, name_of
 from ..core.errors import Cancelled, DeviceError, UsageError
-from ..core.sim_materials import FLUID, SNOW, Matter
-from .blocks import Domain, outside
+from ..core.sim_materials import FLUID, SNOW, ParticleMaterials
 from .colliders import Collider, MovingCollider, check_apart
 from .contact import Plane, plane_rows
 from .fields import FieldRows
 from .grid import Forces, Grid, HostGrid, Limits, Scene
+from .grid_blocks import Domain, outside
 from .particles import Particles, Properties
 from .stepper import Stepper
 
@@ -46,7 +46,7 @@ class Body:
         Metres, world.
     volume : (n,) array
         Cubic metres.
-    matter : Matter
+    matter : ParticleMaterials
         Of the points.
     riders : (k, 3) float64 array
         Points without mass that move along.
@@ -58,7 +58,7 @@ class Body:
 
     points: Array
     volume: Array
-    matter: Matter
+    matter: ParticleMaterials
     riders: Array = field(default_factory=lambda: np.empty((0, 3)))
     pinned: Array | None = None
     velocity: Array | Sequence[float] = (0.0, 0.0, 0.0)

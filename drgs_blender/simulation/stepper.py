@@ -30,10 +30,9 @@ class Stepper(ABC):
     launcher : Launcher or None
         Of the device that computes frames, if that is not this processor.
     colliders : list of MovingCollider
-        Obstacles.
+        Meshes that particles cannot enter.
     planes : array
-        The same, as rows of `contact.plane_rows`.
-        What matter cannot enter, the latter as rows of `contact.plane_rows`.
+        Planes that particles cannot pass: rows of `contact.plane_rows`.
     """
 
     frame = 0

@@ -99,7 +99,7 @@ def test_what_is_in_focus_stays_where_it_is(white, kind):
     far = 1 if kind == "ORTHO" else 4
     point = np.array(white.camera.matrix_world) @ (0.3, -0.2, -4.0, 1)
     for lens in ((0, 0), (0.2, 0), (-0.1, 0.3)):
-        moved = blur.through(camera, lens, 4.0)
+        moved = blur.camera_on_lens(camera, lens, 4.0)
         x, y, z = (np.linalg.inv(moved.matrix_world) @ point)[:3]
         x, y = (x, y) if kind == "ORTHO" else (x / -z, y / -z)
         pixel = moved.cx + moved.fx * x, moved.cy - moved.fy * y

@@ -14,7 +14,7 @@ from drgs_blender.core.asset.model import Asset, Mesh, Surfels
 from drgs_blender.core.errors import AssetError, Cancelled, UsageError
 from drgs_blender.core.frame import Adjustment, Light, Material, MeshState, ObjectState, Visibility, World
 from drgs_blender.engine.scene_objects import traced_object
-from drgs_blender.ipc.change_detection import renewed
+from drgs_blender.ipc.change_detection import reuse_equal
 
 
 def turned(degrees):
@@ -113,16 +113,16 @@ def test_unusable_instances_are_named(session, make_frame):
 
 def test_renewed_shares_what_is_equal():
     frame = with_meshes_state()
-    known = renewed(frame, None)
+    known = reuse_equal(frame, None)
     assert known is not frame and not known.vertices.flags.writeable
-    assert renewed(frame, known) is known
+    assert reuse_equal(frame, known) is known
     frame.materials[0].roughness = 0.25
-    changed = renewed(frame, known)
+    changed = reuse_equal(frame, known)
     assert changed is not known and changed.vertices is known.vertices and changed.visibility is known.visibility
     assert known.materials[0].roughness == 0.5 and changed.materials[0].roughness == 0.25
     frame.vertices[0, 0] = np.nan
-    again = renewed(frame, changed)
-    assert again.vertices is not changed.vertices and renewed(frame, again) is again
+    again = reuse_equal(frame, changed)
+    assert again.vertices is not changed.vertices and reuse_equal(frame, again) is again
 
 
 def with_meshes_state():

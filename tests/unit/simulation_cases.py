@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from drgs_blender.core.sim_materials import make_material, matter_of
-from drgs_blender.simulation.blocks import Domain
+from drgs_blender.core.sim_materials import make_material, particle_materials
+from drgs_blender.simulation.grid_blocks import Domain
 from drgs_blender.simulation.solver import Body, Forces, Solver
 
 
@@ -42,7 +42,7 @@ def solver_of(
     **numbers: float,
 ) -> Solver:
     """A body of two particles a cell and axis."""
-    matter = matter_of([make_material(material, numbers)], np.zeros(len(points), int))
+    matter = particle_materials([make_material(material, numbers)], np.zeros(len(points), int))
     low = points.min(axis=0) - 8 * h if low is None else low
     high = points.max(axis=0) + 8 * h if high is None else high
     volume = np.full(len(points), (h / 2) ** 3, np.float32)

@@ -11,8 +11,8 @@ from drgs_blender.core.frame import RenderSettings, World
 from drgs_blender.render.integrator.adaptive import part_count, sample_adaptively
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.points import Radiance, ShadingPoints
 from drgs_blender.render.scene.trace_scene import TraceScene
+from drgs_blender.render.shading_points import Radiance, ShadingPoints
 
 WIDTH = 40
 

@@ -11,8 +11,8 @@ import pytest
 from drgs_blender.core.frame import RenderSettings
 from drgs_blender.render import pipeline
 from drgs_blender.render.backend import RenderBackend
-from drgs_blender.render.points import Radiance, ShadingPoints
 from drgs_blender.render.prepared_scene import PreparedScene
+from drgs_blender.render.shading_points import Radiance, ShadingPoints
 
 
 class Timed(RenderBackend):

@@ -130,7 +130,7 @@ def test_one_frame_alone_is_what_the_engine_denoises_alone(denoise, rendered, tm
     denoise("4", "--window", "1")
     found, metadata = read_frame(tmp_path / "out" / "0004.exr")
     noisy = read_noisy(rendered / "noisy" / "0004.exr")
-    light = spatial(noisy.shot.components, noisy.shot.variance, noisy.shot.guides)
+    light = spatial(noisy.picture.components, noisy.picture.variance, noisy.picture.guides)
     assert (found["DiffDir"] == light[:, :, 0]).all() and (found["GlossInd"] == light[:, :, 3]).all()
     total = found["DiffDir"] + found["DiffInd"] + found["GlossDir"] + found["GlossInd"] + found["Env"] + found["Emit"]
     assert (found["Combined"][..., :3] == total).all()

@@ -299,7 +299,7 @@ def test_frames_with_the_passes_for_it_are_denoised_over_time(render, tmp_path, 
 
     frames = [read_noisy(tmp_path / f"000{n}.exr") for n in (1, 2, 3)]
     assert frames[1].follows(frames[0]) and frames[2].follows(frames[1])
-    vector = frames[1].passes["Vector"][frames[1].shot.guides.coverage > 0.99]
+    vector = frames[1].passes["Vector"][frames[1].picture.guides.coverage > 0.99]
     step = column(tmp_path / "0002.exr") - column(tmp_path / "0001.exr")
     assert step > 1 and abs(np.median(vector[:, 0]) + step) < 0.1 and abs(np.median(vector[:, 1])) < 0.01
     clean = read_frame(tmp_path / "clean" / "0002.exr")[0]

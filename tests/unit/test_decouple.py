@@ -31,13 +31,13 @@ from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa
 from drgs_blender.render.integrator.integrate import integrate as kernel_integrate  # noqa: E402
 from drgs_blender.render.lights.environment import EnvironmentLight  # noqa: E402
 from drgs_blender.render.pipeline import render  # noqa: E402
-from drgs_blender.render.points import ShadingPoints  # noqa: E402
 from drgs_blender.render.prepared_scene import PreparedScene  # noqa: E402
 from drgs_blender.render.reference.integrate import EmptyTracer, SurfacePoints, integrate_quadrature  # noqa: E402
 from drgs_blender.render.reference.light import Light  # noqa: E402
 from drgs_blender.render.reference.raster import camera_rays, pixel_centres  # noqa: E402
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene  # noqa: E402
 from drgs_blender.render.scene.triangle_bvh import TriangleBVH  # noqa: E402
+from drgs_blender.render.shading_points import ShadingPoints  # noqa: E402
 
 torch.set_num_threads(1)
 

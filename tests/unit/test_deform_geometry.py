@@ -6,8 +6,8 @@ import numpy as np
 import trimesh
 
 from drgs_blender.deform.face_frames import product
+from drgs_blender.geometry.distinct_rows import distinct_row_indices
 from drgs_blender.geometry.normals import VertexNormals, corner_table, lengths, unit
-from drgs_blender.geometry.rows import number_rows
 
 
 def test_cube_corners_point_along_the_diagonal_however_it_is_triangulated():
@@ -52,4 +52,6 @@ def test_fast_forms_have_the_bits_of_the_plain_ones():
     np.testing.assert_array_equal(product(vectors, flat), np.einsum("nij,njk->nik", vectors, flat))
     assert product(vectors[:0], flat[:0]).shape == (0, 3, 2)
     for rows in (rng.integers(-3, 4, (5000, 3)), np.round(rng.normal(size=(5000, 3)), 1), np.zeros((0, 2), int)):
-        np.testing.assert_array_equal(number_rows(*rows.T), np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1))
+        np.testing.assert_array_equal(
+            distinct_row_indices(*rows.T), np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
+        )

@@ -13,7 +13,7 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 from test_deform_mesh_driven import blob, matrix, shell_surfels
 
 from drgs_blender.compute.warp.kernels import Launcher
-from drgs_blender.compute.warp.posed_surfels import FIELDS, PosedThere, arrays_of, joined, with_fields
+from drgs_blender.compute.warp.posed_surfels import FIELDS, DevicePosedSurfels, arrays_of, joined, with_fields
 from drgs_blender.compute.warp.runtime import is_there
 from drgs_blender.core.asset.model import Mesh
 from drgs_blender.core.errors import DeviceError
@@ -67,7 +67,7 @@ def test_a_device_poses_surfels_as_the_processor_does(deformer: Deformer, name: 
     assert (asset.degenerate_faces > 0) == collapsed
     vertices, options = bent(asset.mesh), POSES[name](asset.mesh)
     here, there = asset.pose(vertices, **options), deformer.pose(asset, vertices, **options)
-    assert isinstance(there, PosedThere) and len(there) == len(here)
+    assert isinstance(there, DevicePosedSurfels) and len(there) == len(here)
     found = arrays_of(there, deformer.launcher)
     for field in FIELDS:
         expected = getattr(here, field)
@@ -113,7 +113,7 @@ def test_surfels_of_several_objects_lie_on_the_device_as_one(deformer: Deformer)
     nothing = type(third)(*(getattr(third, field)[:0] for field in FIELDS))
     parts = first, second, nothing, third
 
-    def never() -> PosedThere:
+    def never() -> DevicePosedSurfels:
         raise AssertionError
 
     whole = joined(deformer.launcher, parts, never)

@@ -13,7 +13,7 @@ from drgs_blender.core.errors import Cancelled, DeviceError
 from drgs_blender.render.backend import CPU
 from drgs_blender.render.denoise.demodulation import Signal
 from drgs_blender.render.denoise.svgf_spatial import denoise
-from drgs_blender.render.denoise.svgf_temporal import Shot, denoise_next
+from drgs_blender.render.denoise.svgf_temporal import NoisyPicture, denoise_next
 from drgs_blender.render.film.motion_vectors import Motion
 from drgs_blender.render.gpu.denoise import DeviceSignal
 from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
@@ -41,7 +41,7 @@ def nothing() -> None:
     """A caller who lets it go on."""
 
 
-def shots(count: int) -> list[Shot]:
+def pictures(count: int) -> list[NoisyPicture]:
     """The same surfaces under light that changes, seen by a camera that moves; some light is no number."""
     components, variance, guides = picture()
     found = []
@@ -52,7 +52,7 @@ def shots(count: int) -> list[Shot]:
         vector = np.full((H, W, 2), (1.3, -0.6), np.float32)
         vector[10, :5] = np.nan
         previous = (guides.position + np.array([1.3e-3, 0, -0.6e-3])).astype(np.float32)
-        found.append(Shot(light, variance, guides, Motion(vector, previous)))
+        found.append(NoisyPicture(light, variance, guides, Motion(vector, previous)))
     return found
 
 
@@ -70,11 +70,11 @@ def test_pictures_are_gathered_over_time_as_the_processor_does(
     device: WarpRenderBackend, split: bool, still: bool
 ) -> None:
     here = there = None
-    for k, shot in enumerate(shots(3)):
-        expected, here = denoise_next(shot, here, split, still)
-        found, there = device.denoise_next(shot, there, split, still, nothing)
+    for k, picture in enumerate(pictures(3)):
+        expected, here = denoise_next(picture, here, split, still)
+        found, there = device.denoise_next(picture, there, split, still, nothing)
         np.testing.assert_allclose(found, expected, rtol=2e-4, atol=1e-6)
-        alone = denoise(shot.components, shot.variance, shot.guides, split)
+        alone = denoise(picture.components, picture.variance, picture.guides, split)
         assert (np.abs(expected - alone).max() > 0.05) == (k > 0)
     assert isinstance(there, DeviceSignal)
     np.testing.assert_allclose(there.light.numpy(), here.light, rtol=2e-4, atol=1e-6)
@@ -84,10 +84,10 @@ def test_pictures_are_gathered_over_time_as_the_processor_does(
 def test_a_sequence_goes_on_where_the_device_fails_and_where_it_is_back(
     device: WarpRenderBackend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first, second, third = shots(3)
+    first, second, third = pictures(3)
     expected = None
-    for shot in (first, second, third):
-        picture, expected = denoise_next(shot, expected)
+    for picture in (first, second, third):
+        picture, expected = denoise_next(picture, expected)
     _, history = device.denoise_next(first, None, True, False, nothing)
     with monkeypatch.context() as broken:
         broken.setattr(device.launcher, "launch", failing)
@@ -99,7 +99,7 @@ def test_a_sequence_goes_on_where_the_device_fails_and_where_it_is_back(
 
 
 def test_a_history_that_is_lost_with_its_device_starts_anew(device: WarpRenderBackend) -> None:
-    first, second, _ = shots(3)
+    first, second, _ = pictures(3)
     _, history = device.denoise_next(first, None, True, False, nothing)
     history.guide = None
     found, _ = CPU.denoise_next(second, history, True, False, nothing)

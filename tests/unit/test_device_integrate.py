@@ -19,8 +19,8 @@ from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.lights.light_sampler import Lights
 from drgs_blender.render.lights.mesh_lights import Emitters
-from drgs_blender.render.points import CATCHER, Radiance, ShadingPoints
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
+from drgs_blender.render.shading_points import CATCHER, Radiance, ShadingPoints
 
 BALL = trimesh.creation.icosphere(subdivisions=3)
 SETTINGS = RenderSettings(samples=16, bounces=3, subpixel_samples=2)

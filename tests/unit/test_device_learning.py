@@ -167,7 +167,7 @@ def test_a_device_learns_as_well_as_the_processor(
 ) -> None:
     """All of the schedule: surfels cut, mirrors, shape. What begins as last digits grows, but leads no other way."""
     here, other = (learned(capture, region, by, SCHEDULE.iterations) for by in (CPU, on_device))
-    assert here.growth.rounds == other.growth.rounds == SCHEDULE.rounds
+    assert here.densification.rounds == other.densification.rounds == SCHEDULE.rounds
     assert here.psnr > 20
     assert abs(here.psnr - other.psnr) < 0.1
     assert not other.fallback.failed
@@ -312,8 +312,8 @@ def test_a_device_that_fails_between_two_starts_loses_neither(monkeypatch: pytes
     monkeypatch.setattr(Gaussians, "on", broken_there)
     training.step()
     assert training.fallback.failed and training.fallback.backend is CPU
-    assert training.trying and training.iteration == training.growth.rounds == 0
-    assert len(training.gaussians) == training.growth.start == len(rival)
+    assert training.trying and training.iteration == training.densification.rounds == 0
+    assert len(training.gaussians) == training.densification.start == len(rival)
     while training.trying:
         training.step()
     assert training.iteration == 12
@@ -331,8 +331,8 @@ def test_surfels_half_cut_are_of_no_use(capture: Capture, region: Region, monkey
     training.densify_when_due()
     here.densify_when_due()
     assert training.fallback.backend is CPU
-    assert len(training.gaussians) > 1.2 * training.growth.start
-    assert training.growth.rounds == here.growth.rounds > 0
+    assert len(training.gaussians) > 1.2 * training.densification.start
+    assert training.densification.rounds == here.densification.rounds > 0
     assert alike(here, training) == 0
 
 

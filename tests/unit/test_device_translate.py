@@ -18,7 +18,7 @@ from drgs_blender.compute.warp.translate import Native, Translation
 from drgs_blender.compute.warp.types import Array, Struct, TranslationError
 from drgs_blender.core.frame import World
 from drgs_blender.render import sampling
-from drgs_blender.render.gpu.natives import NATIVES
+from drgs_blender.render.gpu.native_functions import NATIVES
 from drgs_blender.render.integrator import brdf, wavefront
 from drgs_blender.render.lights import environment
 

@@ -13,7 +13,7 @@ from test_device_integrate import ball, floor, placed
 
 from drgs_blender.compute.warp.kernels import Work
 from drgs_blender.core.frame import Visibility
-from drgs_blender.render.gpu.natives import NATIVES
+from drgs_blender.render.gpu.native_functions import NATIVES
 from drgs_blender.render.gpu.scene_mirror import Mirror
 from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 from drgs_blender.render.scene.interaction import nearest

@@ -17,12 +17,12 @@ from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.lights.light_sampler import Lights, emission_along
 from drgs_blender.render.lights.mesh_lights import MOST, Emitters
-from drgs_blender.render.points import CATCHER
 from drgs_blender.render.sampling import F, sobol
 from drgs_blender.render.scene import ray_masks
 from drgs_blender.render.scene.interaction import nearest
 from drgs_blender.render.scene.ray import Ray
 from drgs_blender.render.scene.trace_scene import TraceScene
+from drgs_blender.render.shading_points import CATCHER
 
 GLOW = Material("glow", (0.0, 0.0, 0.0), 1.0, 1.0, (3.0, 2.0, 1.0))
 SQUARE = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])

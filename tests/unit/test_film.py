@@ -11,7 +11,7 @@ from drgs_blender.render.camera import camera_parameters, sample_ray
 from drgs_blender.render.film.film import EMPTY_DEPTH, Film
 from drgs_blender.render.gbuffer.gbuffer import GBuffer, compact
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.points import Radiance
+from drgs_blender.render.shading_points import Radiance
 
 ALL = tuple(name for name in BY_NAME if not name.startswith("Crypto"))  # these have a film of their own
 AA = 4

@@ -163,7 +163,7 @@ def test_floats_are_light_and_integers_what_a_screen_shows(tmp_path: Path) -> No
 
 
 def test_photographs_and_masks_of_floats(tmp_path: Path) -> None:
-    from drgs_blender.reconstruct.readers.develop import _shown
+    from drgs_blender.reconstruct.readers.photograph_loading import _shown
 
     (tmp_path / "a.tif").write_bytes(tiff(FLOATS, extrasamples=["unassalpha"]))
     assert image_size(tmp_path / "a.tif") == (14, 9) and not turned_by_exif(tmp_path / "a.tif")

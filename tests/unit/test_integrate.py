@@ -17,8 +17,8 @@ from drgs_blender.render.integrator.records import Sampler
 from drgs_blender.render.integrator.sample_allocation import ALPHA, COUNTS, POINT_STATE, _allocate
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.lights.light_sampler import Lights
-from drgs_blender.render.points import DIFFUSE_DIRECT, DIFFUSE_INDIRECT, GLOSSY_DIRECT, Radiance, ShadingPoints
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
+from drgs_blender.render.shading_points import DIFFUSE_DIRECT, DIFFUSE_INDIRECT, GLOSSY_DIRECT, Radiance, ShadingPoints
 
 WHITE = EnvironmentLight(World())
 

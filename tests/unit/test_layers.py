@@ -19,9 +19,9 @@ from drgs_blender.render.gbuffer.gbuffer import GBuffer
 from drgs_blender.render.gbuffer.mesh import primary_mesh
 from drgs_blender.render.gbuffer.surfels import primary_surfels, snap_windows
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.points import CATCHER, SECOND, Radiance
 from drgs_blender.render.prepared_scene import PreparedScene
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
+from drgs_blender.render.shading_points import CATCHER, SECOND, Radiance
 from drgs_blender.render.surfels.splats import prepare
 
 AA = 2

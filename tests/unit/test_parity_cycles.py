@@ -20,10 +20,10 @@ torch = pytest.importorskip("torch")
 from drgs_blender.core.frame import RenderSettings, World  # noqa: E402
 from drgs_blender.render.integrator.integrate import integrate as kernel_integrate  # noqa: E402
 from drgs_blender.render.lights.environment import EnvironmentLight  # noqa: E402
-from drgs_blender.render.points import ShadingPoints  # noqa: E402
 from drgs_blender.render.reference.integrate import EmptyTracer, SurfacePoints, integrate_quadrature  # noqa: E402
 from drgs_blender.render.reference.light import Light  # noqa: E402
 from drgs_blender.render.scene.trace_scene import TraceScene  # noqa: E402
+from drgs_blender.render.shading_points import ShadingPoints  # noqa: E402
 
 torch.set_num_threads(1)
 

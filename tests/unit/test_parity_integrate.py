@@ -15,7 +15,6 @@ trimesh = pytest.importorskip("trimesh")
 from drgs_blender.core.frame import RenderSettings, World  # noqa: E402
 from drgs_blender.render.integrator.integrate import integrate as kernel_integrate  # noqa: E402
 from drgs_blender.render.lights.environment import EnvironmentLight  # noqa: E402
-from drgs_blender.render.points import ShadingPoints  # noqa: E402
 from drgs_blender.render.reference.integrate import (  # noqa: E402
     Counts,
     SurfacePoints,
@@ -25,6 +24,7 @@ from drgs_blender.render.reference.integrate import (  # noqa: E402
 )
 from drgs_blender.render.reference.light import Light  # noqa: E402
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene  # noqa: E402
+from drgs_blender.render.shading_points import ShadingPoints  # noqa: E402
 
 torch.set_num_threads(1)
 F64 = torch.float64

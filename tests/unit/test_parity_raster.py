@@ -13,7 +13,7 @@ torch = pytest.importorskip("torch")
 from drgs_blender.core.asset.model import PosedSurfels  # noqa: E402
 from drgs_blender.core.errors import UsageError  # noqa: E402
 from drgs_blender.core.frame import Camera, RenderSettings  # noqa: E402
-from drgs_blender.ipc.blur import through  # noqa: E402
+from drgs_blender.ipc.blur import camera_on_lens  # noqa: E402
 from drgs_blender.render.camera import camera_parameters, camera_ray, check_camera, lattice, pixel_shift  # noqa: E402
 from drgs_blender.render.reference import raster as reference  # noqa: E402
 from drgs_blender.render.surfels import raster as kernel  # noqa: E402
@@ -106,7 +106,7 @@ def test_g_buffer(scene: str, orthographic: bool):
 
 
 def test_points_are_where_the_rays_of_a_place_on_the_lens_meet_them():
-    view = through(camera(True), (0.3, -0.2), 2.0)
+    view = camera_on_lens(camera(True), (0.3, -0.2), 2.0)
     parameters, matrix = camera_parameters(view, RenderSettings(), 1), np.asarray(view.matrix_world)
     for direction in np.random.default_rng(5).normal(size=(20, 3)):
         right, down, forward = to_camera(parameters, *direction)

@@ -16,8 +16,8 @@ from drgs_blender.render.gbuffer.mesh import primary_mesh
 from drgs_blender.render.gbuffer.surfels import primary_surfels, snap_windows
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.points import ShadingPoints
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
+from drgs_blender.render.shading_points import ShadingPoints
 from drgs_blender.render.surfels.splats import prepare
 
 SETTINGS = RenderSettings(subpixel_samples=2, bounces=0, samples=64, shading_model="paper")

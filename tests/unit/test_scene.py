@@ -10,8 +10,8 @@ import trimesh
 
 from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.errors import AssetError, UsageError
-from drgs_blender.render.columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
+from drgs_blender.render.surfel_columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS
 
 
 def trace_object(vertices: np.ndarray, faces: np.ndarray, name: str = "thing", **changes: object) -> TraceObject:

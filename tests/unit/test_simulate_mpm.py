@@ -13,10 +13,10 @@ from simulation_cases import cantilever, energy, lattice, masses, momenta, solve
 
 from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.errors import Cancelled, UsageError
-from drgs_blender.simulation import blocks, p2g_g2p
-from drgs_blender.simulation.blocks import arrange
+from drgs_blender.simulation import grid_blocks, p2g_g2p
 from drgs_blender.simulation.colliders import Collider
 from drgs_blender.simulation.contact import Plane
+from drgs_blender.simulation.grid_blocks import arrange
 
 FRAME = 1 / 24
 
@@ -433,7 +433,7 @@ def test_turning_everything_turns_the_result():
 @pytest.mark.alone
 def test_any_number_of_threads_gives_the_same_bits(monkeypatch):
     """Also where work is cut into the smallest pieces, into which so small a body would not be."""
-    monkeypatch.setattr(blocks, "_SHARE", 1)
+    monkeypatch.setattr(grid_blocks, "_SHARE", 1)
     monkeypatch.setattr(p2g_g2p, "SLOTS", 1)
     threads = get_num_threads()
     results = []
@@ -470,14 +470,14 @@ def test_riders_are_not_lost_when_sand_falls_apart():
 
 
 def test_riders_move_with_the_matter():
-    from drgs_blender.core.sim_materials import make_material, matter_of
-    from drgs_blender.simulation.blocks import Domain
+    from drgs_blender.core.sim_materials import make_material, particle_materials
+    from drgs_blender.simulation.grid_blocks import Domain
     from drgs_blender.simulation.solver import Body, Forces, Solver
 
     h = 0.1
     points = lattice((0.5, 0.5, 0.5), h / 2)
     corners = np.array([[x, y, z] for x in (0, 0.5) for y in (0, 0.5) for z in (0, 0.5)])
-    matter = matter_of([make_material("sand")], np.zeros(len(points), int))
+    matter = particle_materials([make_material("sand")], np.zeros(len(points), int))
     body = Body(points, np.full(len(points), (h / 2) ** 3), matter, corners, velocity=(0.5, 0.2, 1.0))
     solver = Solver(body, Domain.around([-1] * 3, [2] * 3, h), Forces(gravity=(0, 0, 0)))
     mass = momenta(solver_of(points, h, "sand", velocity=(0.5, 0.2, 1.0)))[0]

@@ -11,7 +11,7 @@ from drgs_blender.core.frame import RenderSettings
 from drgs_blender.render.integrator.adaptive import part_count, sample_adaptively
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.integrator.variance import variances
-from drgs_blender.render.points import Radiance, ShadingPoints
+from drgs_blender.render.shading_points import Radiance, ShadingPoints
 
 
 def pixels(count: int, subpixels: int) -> ShadingPoints:

@@ -20,9 +20,8 @@ F = np.float32
 
 
 @njit
-def _meet(  # type: ignore[no-untyped-def]
-    tracer, geometry, vertices, faces, places, o, d, mask, t, numbers, out
-):
+def _meet(tracer, geometry, mesh, o, d, mask, t, numbers, out):  # type: ignore[no-untyped-def]
+    vertices, faces, places = mesh
     for i in range(len(o)):
         dx, dy, dz = d[i, 0], d[i, 1], d[i, 2]
         ray = Ray((o[i, 0], o[i, 1], o[i, 2]), (dx, dy, dz), F(0.0), F(np.inf), mask)
@@ -48,7 +47,7 @@ def meet(scene: TraceScene, origins: np.ndarray, directions: np.ndarray, mask: i
     o, d = (np.ascontiguousarray(a, np.float32) for a in (origins, directions))
     t, numbers, out = np.empty(len(o), np.float32), np.empty((len(o), 4), np.int32), np.zeros((len(o), 17), np.float32)
     arrays = scene.vertices, scene.faces, scene.instances
-    _meet(scene.tracer, scene.geometry, *arrays, o, d, np.int32(mask), t, numbers, out)
+    _meet(scene.tracer, scene.geometry, arrays, o, d, np.int32(mask), t, numbers, out)
     return t, numbers, out
 
 

@@ -17,7 +17,7 @@ from drgs_blender.core.asset.model import PosedSurfels
 from drgs_blender.core.errors import UsageError
 from drgs_blender.render.surfels.surfel_bvh import SurfelBVH
 from drgs_blender.render.surfels.surfel_query import CAPACITY
-from drgs_blender.render.surfels.surfel_tracer import Starts, SurfelHits, trace, transmittance_many
+from drgs_blender.render.surfels.surfel_tracer import RayStarts, SurfelHits, trace, transmittance_many
 
 Array = np.ndarray
 
@@ -198,7 +198,7 @@ def light(bvh: SurfelBVH, hits: SurfelHits, points: Array, rays_each: int = 256)
     """Irradiance / pi of a white sky at seen points, each with its own start."""
     origins, directions = cosine_rays(points, hits.geometric_normal, rays_each)
     each = np.repeat(np.arange(len(points)), rays_each)
-    starts = Starts(hits.object_index[each], hits.geometric_normal[each], hits.size[each])
+    starts = RayStarts(hits.object_index[each], hits.geometric_normal[each], hits.size[each])
     return transmittance_many(bvh, origins, directions, starts=starts).reshape(-1, rays_each).mean(axis=1)
 
 

@@ -10,7 +10,7 @@ from drgs_blender.core.frame import Camera, RenderSettings
 from drgs_blender.render.camera import camera_parameters, camera_ray
 from drgs_blender.render.denoise.demodulation import LIGHT, PAD, Signal
 from drgs_blender.render.denoise.svgf_spatial import prepare
-from drgs_blender.render.denoise.svgf_temporal import Shot, denoise_next
+from drgs_blender.render.denoise.svgf_temporal import NoisyPicture, denoise_next
 from drgs_blender.render.denoise.svgf_window import window
 from drgs_blender.render.film.guides import Guides
 from drgs_blender.render.film.motion_vectors import Instant, Motion, MotionFilm, previous_positions, project
@@ -67,7 +67,9 @@ def moved(guides: Guides, pixels: float, where: object = True) -> Motion:
     return motion
 
 
-def shot(guides: Guides, value: float | np.ndarray, noise: float, seed: int, motion: Motion | None = None) -> Shot:
+def picture(
+    guides: Guides, value: float | np.ndarray, noise: float, seed: int, motion: Motion | None = None
+) -> NoisyPicture:
     """Irradiance `value` on the guides' surfaces with noise of the given deviation, and its variance."""
     rng = np.random.default_rng(seed)
     light = np.broadcast_to(value, (H, W)) + noise * rng.normal(size=(H, W))
@@ -77,13 +79,13 @@ def shot(guides: Guides, value: float | np.ndarray, noise: float, seed: int, mot
     variance = np.zeros((H, W, 2), np.float32)
     variance[..., 0] = (noise * guides.albedo[..., 0]) ** 2
     variance[..., 1] = (noise * 0.04) ** 2
-    return Shot(components, variance, guides, motion)
+    return NoisyPicture(components, variance, guides, motion)
 
 
-def gathered(shots: list[Shot], still: bool = False) -> Signal:
-    """What is known after all `shots`, before any filter over the picture."""
+def gathered(pictures: list[NoisyPicture], still: bool = False) -> Signal:
+    """What is known after all `pictures`, before any filter over the picture."""
     signal: Signal | None = None
-    for s in shots:
+    for s in pictures:
         _, signal = denoise_next(s, signal, split=False, still=still)
     assert signal is not None
     return signal
@@ -177,7 +179,7 @@ def test_vectors_lead_to_the_place_in_the_picture_before() -> None:
 def test_samples_make_up_a_pixels_motion_as_they_make_up_its_position() -> None:
     """Two samples near, one far behind, one of a shadow catcher in front: the near ones count, by weight."""
     from drgs_blender.render.gbuffer.gbuffer import compact
-    from drgs_blender.render.points import CATCHER
+    from drgs_blender.render.shading_points import CATCHER
 
     alpha = np.zeros((H, W, 4), np.float32)
     alpha[7, 9] = 1.0
@@ -203,9 +205,9 @@ def test_samples_make_up_a_pixels_motion_as_they_make_up_its_position() -> None:
 
 
 def test_a_constant_stays_one() -> None:
-    shots = [shot(wall(1.3 * k), 2.0, 0.0, k, moved(wall(1.3 * k), 1.3)) for k in range(4)]
+    pictures = [picture(wall(1.3 * k), 2.0, 0.0, k, moved(wall(1.3 * k), 1.3)) for k in range(4)]
     history = None
-    for s in shots:
+    for s in pictures:
         out, history = denoise_next(s, history)
         assert np.allclose(out, s.components, rtol=2e-5, atol=1e-7)
 
@@ -213,14 +215,14 @@ def test_a_constant_stays_one() -> None:
 def test_noise_falls_as_the_root_of_the_frames() -> None:
     guides = wall()
     for n in (2, 4, 16):
-        left = diffuse(gathered([shot(guides, 2.0, 0.5, k, still(guides)) for k in range(n)], still=True)) - 2.0
+        left = diffuse(gathered([picture(guides, 2.0, 0.5, k, still(guides)) for k in range(n)], still=True)) - 2.0
         assert abs(left.std() * np.sqrt(n) / 0.5 - 1) < 0.08, n
         assert abs(left.mean()) < 4 * 0.5 / np.sqrt(n * H * W)
 
 
 def test_the_variance_it_reports_is_the_one_it_has() -> None:
     guides = wall()
-    signal = gathered([shot(guides, 2.0, 0.5, k, still(guides)) for k in range(6)])
+    signal = gathered([picture(guides, 2.0, 0.5, k, still(guides)) for k in range(6)])
     reported = signal.light[:, 2, PAD : PAD + W].mean()
     assert abs(reported / diffuse(signal).var() - 1) < 0.15
 
@@ -229,8 +231,8 @@ def test_the_variance_it_reports_is_the_one_it_has() -> None:
 def test_texture_moves_without_a_ghost(pixels: float) -> None:
     """Stripes of contrast one to four move a few pixels a frame; their light does not."""
     guides = [wall(pixels * k) for k in range(6)]
-    shots = [shot(g, 2.0, 0.3, k, moved(g, pixels)) for k, g in enumerate(guides)]
-    found = diffuse(gathered(shots)) - 2.0
+    pictures = [picture(g, 2.0, 0.3, k, moved(g, pixels)) for k, g in enumerate(guides)]
+    found = diffuse(gathered(pictures)) - 2.0
     seen = slice(int(pixels * 5) + 2, W)  # the rest came in from the left
     assert found[:, seen].std() < 0.3 / np.sqrt(6) * 1.15
     stripes = [found[:, seen][guides[-1].albedo[:, seen, 0] < 0.5], found[:, seen][guides[-1].albedo[:, seen, 0] > 0.5]]
@@ -240,18 +242,18 @@ def test_texture_moves_without_a_ghost(pixels: float) -> None:
 def test_what_comes_into_view_starts_anew() -> None:
     """A box moves before a wall of other light: what it uncovers is the present alone, the rest is gathered."""
     step = 4.0
-    shots = []
+    pictures = []
     for k in range(5):
         g = wall(step * k - 8, box=True)
         on_box = g.pass_index == 1
-        shots.append(shot(g, np.where(on_box, 0.5, 3.0), 0.2, k, moved(g, step, on_box)))
-    last = shots[-1].guides
-    found = diffuse(gathered(shots))
+        pictures.append(picture(g, np.where(on_box, 0.5, 3.0), 0.2, k, moved(g, step, on_box)))
+    last = pictures[-1].guides
+    found = diffuse(gathered(pictures))
     x = np.arange(W) + 0.5
     box = np.abs(x - (W / 2 + 8)) < 5
     fresh = (np.abs(x - (W / 2 + 4)) < 5) & ~box
     assert (last.pass_index[0] == box).all() and fresh.sum() == 4
-    present = prepare(shots[-1].components, shots[-1].variance, last, split=False)
+    present = prepare(pictures[-1].components, pictures[-1].variance, last, split=False)
     assert (found[:, fresh] == diffuse(present)[:, fresh]).all()
     old = np.abs(x - W / 2) > 20
     assert found[:, old].std() < 0.2 / np.sqrt(5) * 1.15
@@ -264,8 +266,8 @@ def test_surfaces_that_turn_away_or_change_places_are_not_mixed() -> None:
     now.normal[:, : W // 2] = [0.9, -np.sqrt(1 - 0.81), 0]
     now.pass_index[: H // 2] = 7
     now.position[:, -6:, 1] += 0.05  # something else of the same object, behind
-    found = diffuse(gathered([shot(before, 5.0, 0.1, 0), shot(now, 1.0, 0.1, 1, still(now))]))
-    present = diffuse(gathered([shot(now, 1.0, 0.1, 1)]))
+    found = diffuse(gathered([picture(before, 5.0, 0.1, 0), picture(now, 1.0, 0.1, 1, still(now))]))
+    present = diffuse(gathered([picture(now, 1.0, 0.1, 1)]))
     alone = np.ones((H, W), bool)
     alone[H // 2 :, W // 2 : -6] = False
     assert not (found[~alone] == present[~alone]).any()
@@ -275,49 +277,49 @@ def test_surfaces_that_turn_away_or_change_places_are_not_mixed() -> None:
 def test_light_that_changes_is_followed() -> None:
     """A steady light is gathered; one that jumps is taken up at once, not over ten frames."""
     guides = wall()
-    shots = [shot(guides, 2.0, 0.2, k, still(guides)) for k in range(8)]
-    jump = gathered([*shots, shot(guides, 4.0, 0.2, 9, still(guides))])
+    pictures = [picture(guides, 2.0, 0.2, k, still(guides)) for k in range(8)]
+    jump = gathered([*pictures, picture(guides, 4.0, 0.2, 9, still(guides))])
     assert abs(diffuse(jump).mean() - 4.0) < 0.05
-    slow = [shot(guides, 2.0 + 0.04 * k, 0.2, k, still(guides)) for k in range(20)]
+    slow = [picture(guides, 2.0 + 0.04 * k, 0.2, k, still(guides)) for k in range(20)]
     found = diffuse(gathered(slow))
     assert abs(found.mean() - (2 + 0.04 * 19)) < 0.1 and found.std() < 0.15
 
 
 def test_numbers_that_are_none_take_the_past() -> None:
     guides = wall()
-    shots = [shot(guides, 2.0, 0.1, k, still(guides)) for k in range(3)]
-    shots[1].components[5, 6, 0, 1] = np.nan
-    shots[2].components[9, 30, 2] = np.inf
-    shots[2].variance[30, 9, 1] = np.nan
-    signal = gathered(shots)
+    pictures = [picture(guides, 2.0, 0.1, k, still(guides)) for k in range(3)]
+    pictures[1].components[5, 6, 0, 1] = np.nan
+    pictures[2].components[9, 30, 2] = np.inf
+    pictures[2].variance[30, 9, 1] = np.nan
+    signal = gathered(pictures)
     assert np.isfinite(signal.light).all()
     for y, x in ((5, 6), (9, 30), (30, 9)):
         assert abs(diffuse(signal)[y, x] - 2.0) < 0.4
     broken = still(guides)
     broken.vector[3] = np.nan
     broken.previous[4] = np.nan
-    again = gathered([shots[0], shot(guides, 2.0, 0.1, 8, broken)])
+    again = gathered([pictures[0], picture(guides, 2.0, 0.1, 8, broken)])
     assert np.isfinite(again.light).all()
-    assert np.isfinite(window([None, shots[0], shots[1], shots[2], None])).all()
+    assert np.isfinite(window([None, pictures[0], pictures[1], pictures[2], None])).all()
 
 
 def test_a_picture_of_another_size_is_no_history() -> None:
     guides = wall()
-    _, history = denoise_next(shot(guides, 2.0, 0.1, 0), None, split=True)
-    fresh, _ = denoise_next(shot(guides, 2.0, 0.1, 1, still(guides)), None, split=False)
-    found, _ = denoise_next(shot(guides, 2.0, 0.1, 1, still(guides)), history, split=False)
+    _, history = denoise_next(picture(guides, 2.0, 0.1, 0), None, split=True)
+    fresh, _ = denoise_next(picture(guides, 2.0, 0.1, 1, still(guides)), None, split=False)
+    found, _ = denoise_next(picture(guides, 2.0, 0.1, 1, still(guides)), history, split=False)
     assert (found == fresh).all()
 
 
 @pytest.mark.alone
 def test_results_do_not_depend_on_threads() -> None:
-    shots = [shot(wall(1.7 * k), 2.0, 0.3, k, moved(wall(1.7 * k), 1.7)) for k in range(5)]
+    pictures = [picture(wall(1.7 * k), 2.0, 0.3, k, moved(wall(1.7 * k), 1.7)) for k in range(5)]
     results = []
     before = get_num_threads()
     try:
         for threads in (1, 2):
             use_threads(threads)
-            results.append((gathered(shots).light, window(shots)))
+            results.append((gathered(pictures).light, window(pictures)))
     finally:
         use_threads(before)
     for one, two in zip(*results):
@@ -329,9 +331,9 @@ def test_results_do_not_depend_on_threads() -> None:
 
 def test_window_gathers_five_frames_of_what_moves() -> None:
     guides = [wall(2.4 * k) for k in range(5)]
-    shots = [shot(g, 2.0, 0.3, k, moved(g, 2.4)) for k, g in enumerate(guides)]
-    alone = [window([None, None, s, None, None])[:, 16:-16, 0, 0] for s in shots[2:3]]
-    both = window(shots)[:, 16:-16, 0, 0]
+    pictures = [picture(g, 2.0, 0.3, k, moved(g, 2.4)) for k, g in enumerate(guides)]
+    alone = [window([None, None, s, None, None])[:, 16:-16, 0, 0] for s in pictures[2:3]]
+    both = window(pictures)[:, 16:-16, 0, 0]
     truth = 2.0 * guides[2].albedo[:, 16:-16, 0]
     assert np.abs(both - truth).mean() < 0.62 * np.abs(alone[0] - truth).mean()
     assert abs((both / truth).mean() - 1) < 0.01
@@ -340,27 +342,27 @@ def test_window_gathers_five_frames_of_what_moves() -> None:
 def test_window_does_not_lag() -> None:
     """Light that grows steadily: the frames before and after cancel."""
     guides = wall()
-    shots = [shot(guides, 2.0 + 0.02 * k, 0.2, k, still(guides)) for k in range(5)]
-    found = window(shots)[:, :, 0, 0] / guides.albedo[..., 0]
+    pictures = [picture(guides, 2.0 + 0.02 * k, 0.2, k, still(guides)) for k in range(5)]
+    found = window(pictures)[:, :, 0, 0] / guides.albedo[..., 0]
     assert abs(found.mean() - 2.04) < 0.005
 
 
 def test_window_does_not_mix_what_is_hidden_in_other_frames() -> None:
-    shots = []
+    pictures = []
     for k in range(5):
         g = wall(5.0 * k - 10, box=True)
         on_box = g.pass_index == 1
-        shots.append(shot(g, np.where(on_box, 0.5, 3.0), 0.05, k, moved(g, 5.0, on_box)))
-    found = window(shots)[:, :, 0, 0]
-    on_box = shots[2].guides.pass_index == 1
-    albedo = shots[2].guides.albedo[..., 0]
+        pictures.append(picture(g, np.where(on_box, 0.5, 3.0), 0.05, k, moved(g, 5.0, on_box)))
+    found = window(pictures)[:, :, 0, 0]
+    on_box = pictures[2].guides.pass_index == 1
+    albedo = pictures[2].guides.albedo[..., 0]
     assert np.abs(found / albedo - np.where(on_box, 0.5, 3.0)).max() < 0.15
 
 
 def test_window_depends_on_its_frames_alone() -> None:
     """Whoever renders a frame, and in which run, gets the same bits; the frames' order of creation is irrelevant."""
-    shots = [shot(wall(k), 2.0, 0.3, k, moved(wall(k), 1.0)) for k in range(7)]
-    padded: list[Shot | None] = [None, None, *shots, None, None]
+    pictures = [picture(wall(k), 2.0, 0.3, k, moved(wall(k), 1.0)) for k in range(7)]
+    padded: list[NoisyPicture | None] = [None, None, *pictures, None, None]
     whole = [window(padded[k : k + 5]) for k in range(7)]
     for k in (6, 0, 3):
         assert (window(padded[k : k + 5]) == whole[k]).all()
@@ -370,13 +372,13 @@ def test_window_depends_on_its_frames_alone() -> None:
 
 def test_light_passes_stay_a_sum_and_gather_alike() -> None:
     guides = wall()
-    shots = [shot(guides, 2.0, 0.3, k, still(guides)) for k in range(3)]
-    for s in shots:
+    pictures = [picture(guides, 2.0, 0.3, k, still(guides)) for k in range(3)]
+    for s in pictures:
         s.components[:, :, 1] = 0.25 * s.components[:, :, 0]
         s.components[:, :, 3] = 0.25 * s.components[:, :, 2]
     history: dict[bool, Signal | None] = {True: None, False: None}
     out: dict[bool, np.ndarray] = {}
-    for s in shots:
+    for s in pictures:
         for split in (True, False):
             out[split], history[split] = denoise_next(s, history[split], split)
     assert np.allclose(out[True][:, :, 0] + out[True][:, :, 1], out[False][:, :, 0], rtol=1e-4)

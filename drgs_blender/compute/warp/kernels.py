@@ -21,8 +21,8 @@ from .types import Record, Type, given, like, spelled
 
 Array = np.ndarray
 
-#: Lanes at most.
-LANES = 1 << 17
+#: Threads (lanes) of one launch at most.
+MAX_THREADS = 1 << 17
 
 
 class Room(NamedTuple):
@@ -156,7 +156,7 @@ class Launcher:
         self, work: Work, pieces: int, arguments: Sequence[Any], out: tuple[Any, ...], found: list[Any], **how: bool
     ) -> Any:
         module = self._ready(work, tuple(type_for(a) for a in (*arguments, out)))
-        lanes = min(pieces, LANES)
+        lanes = min(pieces, MAX_THREADS)
         inputs = [self._argument(module, part) for part in parts_of(tuple(arguments))]
         given = [lanes, *self._room(work, lanes), *inputs, *found]
         return warp().launch(module.run, lanes, given, device=self.device, **how)

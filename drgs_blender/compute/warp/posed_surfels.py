@@ -17,7 +17,7 @@ Array = np.ndarray
 FIELDS = tuple(field.name for field in dataclasses.fields(PosedSurfels))
 
 
-class PosedThere(PosedSurfels):
+class DevicePosedSurfels(PosedSurfels):
     """`PosedSurfels` that lie on a device.
 
     Parameters
@@ -59,23 +59,23 @@ class PosedThere(PosedSurfels):
 
 def arrays_of(posed: PosedSurfels, launcher: Launcher) -> dict[str, Any]:
     """All fields of posed surfels on a device."""
-    if isinstance(posed, PosedThere):
+    if isinstance(posed, DevicePosedSurfels):
         return posed.on(launcher)
     return {name: launcher.array(getattr(posed, name)) for name in FIELDS}
 
 
 def with_fields(posed: PosedSurfels, fields: dict[str, Array]) -> PosedSurfels:
     """The surfels with other arrays (of this processor) for some fields."""
-    if not isinstance(posed, PosedThere):
+    if not isinstance(posed, DevicePosedSurfels):
         return dataclasses.replace(posed, **fields)
 
     def here() -> PosedSurfels:
         return PosedSurfels(**{name: getattr(posed, name) for name in FIELDS} | fields)
 
-    return PosedThere(posed._there | fields, here, fields)
+    return DevicePosedSurfels(posed._there | fields, here, fields)
 
 
-def joined(launcher: Launcher, parts: Sequence[PosedSurfels], here: Callable[[], PosedSurfels]) -> PosedThere:
+def joined(launcher: Launcher, parts: Sequence[PosedSurfels], here: Callable[[], PosedSurfels]) -> DevicePosedSurfels:
     """The surfels of some parts as one, on a device; `here` joins them on this processor."""
     wp = warp()
     with launcher.failures("joining surfels"):
@@ -89,4 +89,4 @@ def joined(launcher: Launcher, parts: Sequence[PosedSurfels], here: Callable[[],
                 if len(array):
                     wp.copy(whole[first : first + len(array)], array)
                 first += len(array)
-    return PosedThere(there, here)
+    return DevicePosedSurfels(there, here)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...compute.warp.kernels import Launcher, Work
-from ...compute.warp.posed_surfels import PosedThere
+from ...compute.warp.posed_surfels import DevicePosedSurfels
 from ...compute.warp.runtime import warp
 from ...core.asset.model import MATERIAL_CHANNELS, PosedSurfels
 from ...geometry.normals import face_normal, vertex_normal
@@ -143,7 +143,7 @@ class Deformer:
         names = "centre", "tangent_u", "tangent_v", "normal"
         channels = {name: self._own(tables, driven, name, posing.channels[name]) for name in MATERIAL_CHANNELS}
         there = dict(zip(names, made)) | channels | {"opacity": opacity, "object_index": owner}
-        return PosedThere(there, here, posing.channels)
+        return DevicePosedSurfels(there, here, posing.channels)
 
     def _smooth(self, tables: _Tables, driven: MeshDriven, posing: Posing, vertices: Any) -> Any:
         """(n, 3) normals of the vertices."""

@@ -22,7 +22,7 @@ class View:
     colour : (height, width, 3) float32 array
         sRGB-encoded in 0..1 as photographed, top row first.
     mask : (height, width) float32 array, optional
-        In 0..1, how much of the pixel is the object; None where nobody drew one.
+        In 0..1, the object's coverage of the pixel; None without a mask.
     test : bool
         Left out of training.
     """

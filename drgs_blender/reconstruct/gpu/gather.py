@@ -12,7 +12,7 @@ from ...compute.warp.runtime import warp
 from ...compute.warp.translate import Native
 from ...core.asset.model import Mesh
 from ...core.errors import DeviceError
-from ...render.gpu.natives import NATIVES
+from ...render.gpu.native_functions import NATIVES
 from ...render.gpu.scene_mirror import Mirror
 from ...render.lights.environment import EnvironmentLight
 from ...render.scene.embree import trace
@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 
 Array = np.ndarray
 
+#: The parameters are those of `embree.trace`, which kernels call: Warp takes its place by name and position.
 _TRACE = """
 @wp.func
 def trace_mesh(

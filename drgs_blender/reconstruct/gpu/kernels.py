@@ -16,9 +16,10 @@ import numpy as np
 
 from ...compute.warp.kernels import Room, Work
 from ...render.sampling import ONE, ZERO, F
-from ...render.surfels.raster import MAX_ALPHA, gaussian
-from ...render.surfels.splats import TILE
-from ..model.blend import MIN_TRANSMITTANCE, strength
+from ...render.surfels.blending import MIN_TRANSMITTANCE
+from ...render.surfels.raster import gaussian
+from ...render.surfels.splats import MAX_ALPHA, TILE
+from ..model.blend import strength
 from ..model.blend_backward import BEFORE, TRAVEL, slopes
 from ..model.projection import (
     CUT,

@@ -17,7 +17,7 @@ from torch import Tensor
 from ...core.asset.model import Mesh
 from ...core.color import linear_to_srgb
 from ...core.errors import AssetError, Cancelled, UsageError
-from ...render.reference.brdf import MIN_ALPHA, dot
+from ...render.reference.brdf import MIN_GGX_ALPHA, dot
 from ...render.scene.triangle_bvh import TriangleBVH
 from .. import checkpoint as states
 from ..backend import CPU, LearningBackend
@@ -112,7 +112,7 @@ def decouple(
         Gives the normals behind pixels in place of the mesh. They count where they are within 60 degrees of the
         face, as for surfels that are rendered; what is learned of normals is added to them.
     now : callable
-        Seconds since whenever.
+        Monotonic clock, seconds.
 
     Raises
     ------
@@ -262,7 +262,7 @@ class Job:
         """Loss between predicted and photographed colours."""
         s, materials = self._settings, self.surface.materials
         roughness = materials.roughness(samples.materials)
-        alpha2 = (roughness**2).clamp(min=MIN_ALPHA) ** 2
+        alpha2 = (roughness**2).clamp(min=MIN_GGX_ALPHA) ** 2
         sums = self.lighting.gather(pixels, key, samples.normal, alpha2, radiance)
         nv = dot(samples.normal, torch.from_numpy(pixels.towards)).clamp(1e-3, 1)
         predicted = materials.reflect(samples.materials, sums, nv, s.shading_model)

@@ -23,7 +23,7 @@ class Schedule:
     ----------
     settings : Settings
     now : callable
-        Seconds since whenever.
+        Monotonic clock, seconds.
 
     Attributes
     ----------

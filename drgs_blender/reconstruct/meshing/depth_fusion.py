@@ -1,6 +1,6 @@
 """The surfels' depth maps, as the training views see them, fused into one closed mesh.
 
-What no view sees is inside: the mesh is closed where nobody photographed.
+Space that no view sees counts as inside, so that the mesh is closed there.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from ..capture.capture import Capture, View
 
 log = logging.getLogger(__name__)
 
-#: Colours farther than this from the background are the object, where nobody drew masks.
+#: Distance of colours from the background beyond which pixels show the object, in captures without masks.
 DISTINCT = 0.03
 #: Part of the views of a point of the hull that may call it background: masks are not perfect.
 DISSENT = 0.03

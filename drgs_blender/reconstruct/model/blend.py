@@ -11,13 +11,13 @@ import numpy as np
 
 from ...compute.jit import inlined, njit
 from ...compute.threads import over_lanes
-from ...render.surfels.raster import MAX_ALPHA, gaussian
-from ...render.surfels.splats import TILE
+from ...render.surfels.blending import MIN_TRANSMITTANCE
+from ...render.surfels.raster import gaussian
+from ...render.surfels.splats import MAX_ALPHA, TILE
 from .projection import LOW_PASS, splat_of
 
 Array = np.ndarray
 
-MIN_TRANSMITTANCE = 1e-4
 #: Side of a block of pixels, pixels of it, that vector code works on at a time, and blocks along a side of a tile.
 SIDE, LANES = 4, 16
 BLOCKS = TILE // SIDE

@@ -6,14 +6,14 @@ import numpy as np
 
 from ...compute.jit import inlined, njit
 from ...compute.threads import over_lanes
-from ...render.surfels.raster import MAX_ALPHA, gaussian
-from ...render.surfels.splats import TILE
+from ...render.surfels.blending import MIN_TRANSMITTANCE
+from ...render.surfels.raster import gaussian
+from ...render.surfels.splats import MAX_ALPHA, TILE
 from .blend import (
     BLOCKS,
     DISTORTION,
     FEATURES,
     LANES,
-    MIN_TRANSMITTANCE,
     SIDE,
     ZZ,
     Splats,

@@ -28,7 +28,7 @@ PER_PIXEL = 1.5
 INSIDE, FAINTLY, WIDE = 1 / 3, 0.1, 0.6
 
 
-def enough(views: list[Target]) -> int:
+def surfel_limit(views: list[Target]) -> int:
     """Number of surfels that suits pictures of this size: with more, the photographs are overfitted."""
     shown = [v.camera.width * v.camera.height if v.mask is None else float(v.mask.sum()) for v in views]
     return max(int(PER_PIXEL * np.mean(shown)), 1)

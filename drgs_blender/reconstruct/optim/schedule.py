@@ -24,7 +24,7 @@ class Schedule:
     iterations : int
         Steps, one view each.
     surfels : int
-        How many there are at the end of densification, at most: see `enough`.
+        How many there are at the end of densification, at most: see `initialisation.surfel_limit`.
     coarse : float
         Part of the steps that is done at half size.
     densify : tuple of float

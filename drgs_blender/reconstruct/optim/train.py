@@ -20,13 +20,13 @@ from ..capture.capture import Capture
 from ..capture.training_views import background_of, targets
 from ..meshing.visual_hull import Region
 from ..model.gaussians import Gaussians
-from ..model.initialisation import enough, inside_hull, on_hull
-from .clock import Clock
-from .fallback import SAVE_EVERY, Fallback
-from .growth import Growth
+from ..model.initialisation import inside_hull, on_hull, surfel_limit
+from .cpu_fallback import SAVE_EVERY, Fallback
+from .densification_schedule import DensificationSchedule
+from .initialisation_trial import MIN_VIEWS, Trial
 from .learner import Learner
 from .schedule import Schedule
-from .starts import MIN_VIEWS, Trial
+from .time_budget import TimeBudget
 from .views import Views
 
 _T = TypeVar("_T")
@@ -45,11 +45,11 @@ class Training:
     gaussians : Gaussians, optional
         To go on with; without, both of `initialisation` are tried.
     seconds : float, optional
-        Where the steps would take longer, the schedule runs by the clock.
+        Time budget; where the steps would take longer, the schedule runs by the time spent.
     backend : LearningBackend
         Backend of the steps; where it fails, they go on on the CPU.
     now : callable
-        Seconds since whenever.
+        Monotonic clock, seconds.
 
     Attributes
     ----------
@@ -58,12 +58,12 @@ class Training:
         With as many surfels as the photographs show.
     targets : list of list of Target
         Training views in full and in half size.
-    clock : Clock
+    time_budget : TimeBudget
     trial : Trial
         Of the starts.
     fallback : Fallback
         Backend of the steps, with its fallback to the CPU.
-    growth : Growth
+    densification : DensificationSchedule
     views : Views
     learner : Learner
         Of the present start.
@@ -80,19 +80,19 @@ class Training:
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.region, self.targets, self._background = region, targets(capture), background_of(capture)
-        self.schedule = schedule = replace(schedule, surfels=min(schedule.surfels, enough(self.targets[0])))
+        self.schedule = schedule = replace(schedule, surfels=min(schedule.surfels, surfel_limit(self.targets[0])))
         rival = None
         if gaussians is None:
             gaussians = on_hull(capture, region, schedule.surfels, schedule.bands, schedule.seed)
             if len(capture.training) >= MIN_VIEWS:
                 rival = inside_hull(gaussians, capture, region, schedule.bands, schedule.seed)
-        self.clock, self.trial, self.fallback = Clock(seconds, now), Trial(rival), Fallback(self, now)
+        self.time_budget, self.trial, self.fallback = TimeBudget(seconds, now), Trial(rival), Fallback(self, now)
         self._begin(gaussians, backend)
 
     def _begin(self, gaussians: Gaussians, backend: LearningBackend) -> None:
         """Learn these from the first step on."""
-        self._begun, self.growth = gaussians, Growth(self.schedule, len(gaussians))
-        self.clock.restart()
+        self._begun, self.densification = gaussians, DensificationSchedule(self.schedule, len(gaussians))
+        self.time_budget.restart()
         self.fallback.begin(backend)
 
     @property
@@ -113,7 +113,7 @@ class Training:
     @property
     def part(self) -> float:
         """Fraction of the schedule that is done, 0..1."""
-        return min(max(self.iteration / self.schedule.iterations, self.clock.part(self.trying)), 1.0)
+        return min(max(self.iteration / self.schedule.iterations, self.time_budget.part(self.trying)), 1.0)
 
     @property
     def finished(self) -> bool:
@@ -127,7 +127,7 @@ class Training:
 
     def step(self) -> None:
         """One view."""
-        with self.clock.running():
+        with self.time_budget.running():
             self.attempt(self._learn)
             self.densify_when_due()
             self._decide_when_due()
@@ -145,13 +145,13 @@ class Training:
     def densify_when_due(self) -> None:
         """Cut surfels where the schedule has a round of it now."""
         part = self.part
-        due = self.growth.due(part)
-        if due <= self.growth.rounds:
+        due = self.densification.due(part)
+        if due <= self.densification.rounds:
             return
-        budget = self.growth.budget(part)
+        budget = self.densification.budget(part)
         self.fallback.save_gpu_state()
         self.attempt(lambda: self.learner.densify(budget), interruptible=False)
-        self.growth.rounds = due
+        self.densification.rounds = due
 
     def _decide_when_due(self) -> None:
         """At the end of a trial's turn: the other start's, or on with the better one."""
@@ -162,11 +162,11 @@ class Training:
         if first is None:
             self._begin(self.trial.store_first(self.attempt(self.state), error), self.fallback.backend)
             return
-        spent = self.clock.spent + float(first["numbers"][1])
+        spent = self.time_budget.spent + float(first["numbers"][1])
         better = self.trial.decide(error)
         if better is not None:
             self.attempt(lambda: self.load_state(better), interruptible=False)
-        self.clock.end_trial(spent)
+        self.time_budget.end_trial(spent)
 
     def arrays(self) -> dict[str, Array]:
         """All that `restore` needs to go on, with any processor; with the same one bit for bit."""
@@ -184,17 +184,23 @@ class Training:
 
     def state(self) -> dict[str, Array]:
         """All of the present start that `load_state` needs."""
-        learner, growth = self.learner, self.growth
-        counts = [learner.iteration, learner.optimiser.steps, growth.start, growth.rounds, learner.light.steps]
-        numbers = [learner.error, self.clock.spent, self.clock.tried]
+        learner, densification = self.learner, self.densification
+        counts = [
+            learner.iteration,
+            learner.optimiser.steps,
+            densification.start,
+            densification.rounds,
+            learner.light.steps,
+        ]
+        numbers = [learner.error, self.time_budget.spent, self.time_budget.tried]
         return learner.arrays() | {"counts": np.array(counts, np.int64), "numbers": np.array(numbers)}
 
     def load_state(self, state: dict[str, Array]) -> None:
         """Go on from a `state`, with the trial as it is."""
-        learner, growth = self.learner, self.growth
+        learner, densification = self.learner, self.densification
         learner.restore(state)
-        learner.iteration, learner.optimiser.steps, growth.start, growth.rounds, learner.light.steps = map(
-            int, state["counts"]
+        learner.iteration, learner.optimiser.steps, densification.start, densification.rounds, learner.light.steps = (
+            map(int, state["counts"])
         )
-        learner.error, self.clock.spent, self.clock.tried = (float(x) for x in state["numbers"])
+        learner.error, self.time_budget.spent, self.time_budget.tried = (float(x) for x in state["numbers"])
         self.fallback.remember(state)

@@ -9,7 +9,7 @@ import torch
 
 from ..backend import LearningBackend
 from ..capture.training_views import Target
-from .starts import is_held_out
+from .initialisation_trial import is_held_out
 
 #: Pixels of all views up to which these stay on a device, 16 bytes each.
 KEPT_ON_DEVICE = 100_000_000

@@ -17,9 +17,9 @@ from ..capture.capture import Capture
 from ..memory_budget import check_fits
 from . import colmap, llff, nero, tensoir, transforms
 from .camera_overlap import check_overlap
-from .develop import cut_out, develop, find_background
 from .layout import Layout
 from .lens import Lens
+from .photograph_loading import cut_out, find_background, load_photograph
 from .usable_photographs import usable
 from .world_frame import AXES, check_positions, check_silhouettes, turn_upright
 
@@ -108,7 +108,7 @@ def read_capture(
         photograph.matrix = turn @ matrix
     _check_memory(layout, resolution, path)
     known: dict[Lens, tuple[Lens, np.ndarray]] = {}
-    views = usable([(p, develop(p, layout, resolution, known)) for p in photographs], str(path))
+    views = usable([(p, load_photograph(p, layout, resolution, known)) for p in photographs], str(path))
     if all(view.mask is None for view in views) and cut_out(views):
         logger.warning(
             "%s: has no masks; what differs from the colour of the pictures' borders is taken for the object. "

@@ -55,7 +55,7 @@ class Photograph:
     mask : Path, optional
         File.
     test : bool
-        Left out of training by whoever made the capture.
+        A test view of the capture: not used in training.
     """
 
     name: str

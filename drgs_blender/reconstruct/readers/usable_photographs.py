@@ -27,7 +27,7 @@ def usable(developed: Sequence[tuple[Photograph, View | None]], subject: str) ->
     Parameters
     ----------
     developed : list
-        Results of `develop` for each photograph.
+        Results of `load_photograph` for each photograph.
     subject : str
         The capture, for messages.
 

@@ -21,7 +21,7 @@ from ..film.film import COMPONENTS, add_light, footprints
 from ..film.frame_files import read_frame
 from ..film.guides import Guides
 from ..film.motion_vectors import Motion, motion
-from .svgf_temporal import Shot
+from .svgf_temporal import NoisyPicture
 
 Array = np.ndarray
 
@@ -36,7 +36,7 @@ class NoisyFrame:
 
     Attributes
     ----------
-    shot : Shot
+    picture : NoisyPicture
         Its light and the denoiser's guides; its motion leads one frame back.
     passes : dict of str to array
         By name, those of the light excepted.
@@ -48,7 +48,7 @@ class NoisyFrame:
         (width, height, x0, y0, x1, y1) of the full picture and of the part rendered.
     """
 
-    shot: Shot
+    picture: NoisyPicture
     passes: dict[str, Array]
     metadata: dict[str, str]
     camera: Array
@@ -103,7 +103,9 @@ def read_noisy(path: str | Path) -> NoisyFrame:
     )
     components = np.stack([passes.pop(name) for name in COMPONENTS], axis=2)
     moved: Motion = motion(position, passes.pop("Previous Position"), coverage, now, before)
-    return NoisyFrame(Shot(components, passes.pop("Variance"), guides, moved), passes, metadata, now, before, window)
+    return NoisyFrame(
+        NoisyPicture(components, passes.pop("Variance"), guides, moved), passes, metadata, now, before, window
+    )
 
 
 def _one(passes: dict[str, Array], name: str) -> Array:

@@ -50,7 +50,7 @@ def denoise_oidn(
     Parameters
     ----------
     components : (h, w, 4, 3) float32 array
-        Premultiplied light, see `points.Radiance`; non-finite values count as black.
+        Premultiplied light, see `shading_points.Radiance`; non-finite values count as black.
     guides : Guides
         Its coverage, albedo and normals; taken as free of noise.
     split : bool

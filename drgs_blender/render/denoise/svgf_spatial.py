@@ -5,8 +5,8 @@ glossy light are filtered apart, each divided by the colour of its surface first
 that texture is not blurred. Changes and their reasons:
 
 - Light is divided by coverage too, and pixels without coverage take no part: silhouettes do not bleed.
-- Depth is compared as distance from the tangent plane, in pixel widths: exact on slanted planes, no depth gradient that
-  breaks at edges.
+- Depth is compared as distance from the tangent plane, in pixel widths: exact on slanted planes. SVGF's depth gradient
+  is wrong at edges.
 - Fireflies are clamped first, to mean + `FIREFLY` deviations of their neighbours, only where the pixel's own variance
   does not vouch for them.
 - Rough surfaces reflect smoothly: the power on the normals' cosine falls from 128 to 32 with roughness; 32 for diffuse.
@@ -66,7 +66,7 @@ def denoise(
     Parameters
     ----------
     components : (h, w, 4, 3) float32 array
-        Premultiplied light, see `points.Radiance`; non-finite values are replaced.
+        Premultiplied light, see `shading_points.Radiance`; non-finite values are replaced.
     variance : (h, w, 2) float32 array
         Of the luminance of the diffuse and the glossy sum.
     guides : Guides

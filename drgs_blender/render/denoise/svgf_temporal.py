@@ -57,7 +57,7 @@ NOW, PAST, BIAS, CHANGES = 0, 2, 4, 6
 
 
 @dataclass(slots=True)
-class Shot:
+class NoisyPicture:
     """One noisy picture as a frame file holds it; see `svgf_spatial.denoise` for the arrays.
 
     ``motion`` leads to the frame before; None where there is none.
@@ -89,7 +89,7 @@ class History:
 
 
 def denoise_next(
-    shot: Shot,
+    picture: NoisyPicture,
     history: Signal | None,
     split: bool = True,
     still: bool = False,
@@ -99,7 +99,7 @@ def denoise_next(
 
     Parameters
     ----------
-    shot : Shot
+    picture : NoisyPicture
     history : Signal or None
         Result of this function for the frame before; None starts over.
     still : bool
@@ -115,12 +115,12 @@ def denoise_next(
     (h, w, 4, 3) float32 array
         Light, and the history for the next frame.
     """
-    signal = prepare(shot.components, shot.variance, shot.guides, split)
+    signal = prepare(picture.components, picture.variance, picture.guides, split)
     check()
     past = None if history is None else history.to_cpu()
-    if past is not None and shot.motion is not None and past.light.shape == signal.light.shape:
-        signal = accumulate(past, signal, shot.motion, still)
-    return modulate(smooth(signal, check), shot.guides), signal
+    if past is not None and picture.motion is not None and past.light.shape == signal.light.shape:
+        signal = accumulate(past, signal, picture.motion, still)
+    return modulate(smooth(signal, check), picture.guides), signal
 
 
 def least_gain(still: bool) -> Array:

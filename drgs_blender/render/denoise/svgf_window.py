@@ -14,7 +14,7 @@ from ...compute.jit import inlined, njit
 from ...compute.threads import ROWS, over_range
 from .demodulation import LIGHT, LUMINANCE, PAD, SOURCE, SURFACE, VARIANCE, Signal, modulate
 from .svgf_spatial import prepare, smooth
-from .svgf_temporal import BIAS, CHANGES, NOW, SAME_PLANE, Shot, find_change, warp
+from .svgf_temporal import BIAS, CHANGES, NOW, SAME_PLANE, NoisyPicture, find_change, warp
 
 Array = np.ndarray
 
@@ -26,12 +26,14 @@ REACH = 2
 SEARCHES = 4
 
 
-def window(shots: Sequence[Shot | None], split: bool = True, check: Callable[[], None] = lambda: None) -> Array:
+def window(
+    pictures: Sequence[NoisyPicture | None], split: bool = True, check: Callable[[], None] = lambda: None
+) -> Array:
     """Denoise the middle one of 2 `REACH` + 1 pictures.
 
     Parameters
     ----------
-    shots : sequence of (Shot or None)
+    pictures : sequence of (NoisyPicture or None)
         Frames k - 2 .. k + 2, of one size; None where the sequence has ended. Nothing else enters the result.
     split : bool
         See `svgf_spatial.denoise`.
@@ -46,10 +48,10 @@ def window(shots: Sequence[Shot | None], split: bool = True, check: Callable[[],
     ------
     ValueError: the middle picture is None.
     """
-    shot = shots[len(shots) // 2]
-    if shot is None:
+    picture = pictures[len(pictures) // 2]
+    if picture is None:
         raise ValueError("the middle picture is missing")
-    signal = prepare(shot.components, shot.variance, shot.guides, split)
+    signal = prepare(picture.components, picture.variance, picture.guides, split)
     total, weights = np.zeros_like(signal.light), np.zeros((len(signal.light), 2, signal.light.shape[2]), np.float32)
     still = np.zeros((len(signal.light), CHANGES, signal.light.shape[2]), np.float32)
     over_range(
@@ -64,7 +66,7 @@ def window(shots: Sequence[Shot | None], split: bool = True, check: Callable[[],
         weights,
         fewest=ROWS,
     )
-    for distance, neighbour, vector, expected in _neighbours(shots):
+    for distance, neighbour, vector, expected in _neighbours(pictures):
         check()
         most = np.array(MOST_WEIGHT, np.float32) ** np.float32(distance)
         other = prepare(neighbour.components, neighbour.variance, neighbour.guides, split)
@@ -83,21 +85,21 @@ def window(shots: Sequence[Shot | None], split: bool = True, check: Callable[[],
         )
     guide = signal.guide.copy()
     over_range(_divide, len(total), signal.spans, weights, guide, total, fewest=ROWS)
-    return modulate(smooth(Signal(guide, total, signal.spans), check), shot.guides)
+    return modulate(smooth(Signal(guide, total, signal.spans), check), picture.guides)
 
 
-def _neighbours(shots: Sequence[Shot | None]) -> Iterator[tuple[int, Shot, Array, Array]]:
+def _neighbours(pictures: Sequence[NoisyPicture | None]) -> Iterator[tuple[int, NoisyPicture, Array, Array]]:
     """The other pictures that can be reached from the middle one.
 
     Each with how many frames away it is, and for each pixel of the middle one (h, w) the vector to its place there
     (pixels) and the world position it has there.
     """
-    middle = len(shots) // 2
-    centre = shots[middle]
+    middle = len(pictures) // 2
+    centre = pictures[middle]
     for direction in (-1, 1):
         here = centre
         for k in range(middle + direction, middle + direction * (middle + 1), direction):
-            there = shots[k]
+            there = pictures[k]
             if here is None or there is None or centre is None:
                 break
             if here is centre:

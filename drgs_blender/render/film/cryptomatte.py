@@ -13,13 +13,13 @@ from ...compute.threads import ROWS, over_range
 from ...core.cryptomatte import DRGS_MATERIAL, KINDS, identities
 from ...core.frame import Frame
 from ..gbuffer.gbuffer import GBuffer
-from ..points import CATCHER
 from ..scene.trace_scene import TraceScene
+from ..shading_points import CATCHER
 
 Array = np.ndarray
 
 #: Passes of each kind.
-PASSES = 3
+PASSES_PER_KIND = 3
 #: IDs kept per pixel before those of the least coverage are left out.
 _SLOTS = 24
 
@@ -32,7 +32,7 @@ class CryptoFilm:
         self._kind, self._scene, self._origin, self._width = kind, scene, (x0, y0), frame.camera.width
         objects = [item.name for item in frame.objects] + [mesh.name for mesh in frame.meshes]
         self._identities = identities(objects if kind == "object" else [*scene.mesh_materials.names, DRGS_MATERIAL])
-        self.pixels = np.zeros((y1 - y0, x1 - x0, 2 * PASSES, 2), np.float32)
+        self.pixels = np.zeros((y1 - y0, x1 - x0, 2 * PASSES_PER_KIND, 2), np.float32)
 
     def add(self, buffer: GBuffer) -> None:
         """Take the samples of a strip."""
@@ -49,8 +49,8 @@ class CryptoFilm:
     def passes(self) -> dict[str, Array]:
         """Name -> (h, w, 4) float32."""
         height, width = self.pixels.shape[:2]
-        both = self.pixels.reshape(height, width, PASSES, 4)
-        return {f"{KINDS[self._kind]}{i:02}": np.ascontiguousarray(both[:, :, i]) for i in range(PASSES)}
+        both = self.pixels.reshape(height, width, PASSES_PER_KIND, 4)
+        return {f"{KINDS[self._kind]}{i:02}": np.ascontiguousarray(both[:, :, i]) for i in range(PASSES_PER_KIND)}
 
 
 @njit

@@ -27,8 +27,8 @@ from ...core.frame import Camera, RenderSettings
 from ..camera import FX, FY, ORTHOGRAPHIC, WIDTH, sample_ray
 from ..gbuffer.gbuffer import GBuffer
 from ..lights.environment import EnvironmentLight, envmap_radiance, map_at
-from ..points import CATCHER, Radiance
 from ..sampling import luminance
+from ..shading_points import CATCHER, Radiance
 from .guides import Guides
 
 Array = np.ndarray
@@ -59,7 +59,7 @@ class Pixels(NamedTuple):
     albedo : (h, w, 3) array
         Linear Rec.709, not premultiplied.
     components : (h, w, 4, 3) array
-        In the order of `points.Radiance.components`, premultiplied, linear Rec.709.
+        In the order of `shading_points.Radiance.components`, premultiplied, linear Rec.709.
     variance : (h, w, 2) array
         Of the luminance of the premultiplied diffuse and glossy sums.
     emission : (h, w, 3) array

@@ -15,9 +15,9 @@ from ...compute.jit import inlined, njit
 from ...compute.threads import ELEMENTS, ROWS, over_range
 from ..camera import CX, CY, FX, FY, ORTHOGRAPHIC, POSITION, WIDTH
 from ..gbuffer.gbuffer import GBuffer
-from ..points import CATCHER
 from ..scene.interaction import position_at
 from ..scene.trace_scene import TraceScene
+from ..shading_points import CATCHER
 from .film import SAME_SURFACE
 
 Array = np.ndarray

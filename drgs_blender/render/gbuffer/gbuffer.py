@@ -9,8 +9,8 @@ import numpy as np
 
 from ...compute.jit import inlined, njit
 from ..camera import SUBPIXELS, WIDTH
-from ..points import CATCHER, SECOND, ShadingPoints
 from ..scene.ray_masks import CATCHER as CATCHER_OBJECT
+from ..shading_points import CATCHER, SECOND, ShadingPoints
 
 Array = np.ndarray
 

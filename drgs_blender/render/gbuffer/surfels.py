@@ -32,13 +32,13 @@ from ...compute.jit import inlined, njit
 from ...compute.threads import get_num_threads, over_range
 from ...core.frame import Camera
 from ..camera import WIDTH, sample_ray
-from ..columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
-from ..points import SECOND
 from ..sampling import F
 from ..scene.interaction import nearest
 from ..scene.ray import Ray
 from ..scene.ray_masks import SURFELS
 from ..scene.trace_scene import TraceScene
+from ..shading_points import SECOND
+from ..surfel_columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
 from ..surfels.raster import SurfelSamples, rasterise
 from ..surfels.splats import Splats
 from .camera_hits import MeshHits, shade_mesh, trace_camera

@@ -15,8 +15,8 @@ from ...compute.threads import over_range
 from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
 from ..lights.light_sampler import Lights, lights_along, suns_along
 from ..lights.light_shapes import CAMERA
-from ..points import CATCHER
 from ..sampling import ONE, ZERO, F
+from ..shading_points import CATCHER
 from .gbuffer import GBuffer
 
 Array = np.ndarray

@@ -8,7 +8,7 @@ from typing import Any
 from ...compute.warp.kernels import Launcher, Work
 from ..gbuffer import surfels
 from ..scene.trace_scene import TraceScene
-from .natives import NATIVES
+from .native_functions import NATIVES
 from .scene_mirror import Mirror
 
 

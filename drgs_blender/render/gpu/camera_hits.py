@@ -14,7 +14,7 @@ from ..gbuffer import camera_hits
 from ..gbuffer.camera_hits import MeshHits, arrays_of
 from ..gbuffer.gbuffer import GBuffer
 from ..scene.trace_scene import TraceScene
-from .natives import NATIVES
+from .native_functions import NATIVES
 from .scene_mirror import Mirror
 
 Array = np.ndarray

@@ -50,7 +50,7 @@ from ..denoise.svgf_temporal import (
     PAST,
     RADIUS,
     SPACING,
-    Shot,
+    NoisyPicture,
     least_gain,
     look_up_pixel,
     mix_pixel,
@@ -311,42 +311,47 @@ class DeviceSignal(Signal):
 
 
 def denoise(
-    launcher: Launcher, shot: Shot, history: Signal | None, split: bool, still: bool, check: Callable[[], None]
+    launcher: Launcher,
+    picture: NoisyPicture,
+    history: Signal | None,
+    split: bool,
+    still: bool,
+    check: Callable[[], None],
 ) -> tuple[Array, Signal]:
     """`svgf_temporal.denoise_next` on a device; without a history and a motion, `svgf_spatial.denoise`."""
     with launcher.failures("copying the picture"):
-        surface = tuple(launcher.array(array) for array in shot.guides)
-        signal = _prepare(launcher, shot, surface, split)
+        surface = tuple(launcher.array(array) for array in picture.guides)
+        signal = _prepare(launcher, picture, surface, split)
     check()
-    if history is not None and shot.motion is not None and history.light.shape == signal.light.shape:
-        _accumulate(launcher, history, signal, shot, still)
-    out = np.zeros((*shot.guides.coverage.shape, 4, 3), np.float32)
+    if history is not None and picture.motion is not None and history.light.shape == signal.light.shape:
+        _accumulate(launcher, history, signal, picture, still)
+    out = np.zeros((*picture.guides.coverage.shape, 4, 3), np.float32)
     light = _smooth(launcher, signal, check)
     launcher.launch(MODULATE, out[..., 0, 0].size, (light, surface), (out,))
     return out, signal
 
 
-def _prepare(launcher: Launcher, shot: Shot, surface: tuple[Any, ...], split: bool) -> DeviceSignal:
+def _prepare(launcher: Launcher, picture: NoisyPicture, surface: tuple[Any, ...], split: bool) -> DeviceSignal:
     """`denoise.svgf_spatial.prepare`."""
-    h, w = shot.guides.coverage.shape
+    h, w = picture.guides.coverage.shape
     padded = w + 2 * PAD
     guide, spans = launcher.zeros((h, GUIDES, padded)), launcher.zeros((h, 2), "int32")
     light, clamped = (launcher.zeros((h, planes_of(split), padded)) for _ in range(2))
     launcher.launch(SPAN, h, (surface[0],), (spans,))
-    launcher.launch(DEMODULATE, h * padded, (shot.components, shot.variance, surface), (guide, light))
+    launcher.launch(DEMODULATE, h * padded, (picture.components, picture.variance, surface), (guide, light))
     launcher.launch(CLAMP, h * w, (guide, spans, light), (clamped,))
     return DeviceSignal(guide, clamped, spans)
 
 
-def _accumulate(launcher: Launcher, history: Signal, signal: DeviceSignal, shot: Shot, still: bool) -> None:
+def _accumulate(launcher: Launcher, history: Signal, signal: DeviceSignal, picture: NoisyPicture, still: bool) -> None:
     """`svgf_temporal.accumulate`; changes `signal`."""
-    assert shot.motion is not None
+    assert picture.motion is not None
     h, planes, padded = signal.light.shape
     pixels = h * (padded - 2 * PAD)
     with launcher.failures("denoising"):
         past, mixed = (launcher.zeros((h, planes, padded)) for _ in range(2))
         source, change = launcher.zeros((h, padded)), launcher.zeros((h, CHANGES, padded))
-    moved = shot.motion.vector, shot.motion.previous, history.guide, history.light
+    moved = picture.motion.vector, picture.motion.previous, history.guide, history.light
     launcher.launch(LOOK_UP, h * padded, (signal.guide, signal.spans, *moved), (past, source))
     now = signal.guide, signal.spans, signal.light
     launcher.launch(COMPARE, pixels, (still, *now, past, source), (change,))

@@ -12,9 +12,9 @@ from ..integrator import direct, indirect, integrate, sample_allocation, wavefro
 from ..integrator.records import Sampler, Scene, Settings
 from ..lights.environment import EnvironmentLight
 from ..lights.light_sampler import Lights
-from ..points import PointArrays
 from ..scene.trace_scene import TraceScene
-from .natives import NATIVES
+from ..shading_points import PointArrays
+from .native_functions import NATIVES
 from .scene_mirror import Mirror
 
 Array = np.ndarray

@@ -14,11 +14,11 @@ import numpy as np
 
 from ...compute.warp.kernels import Launcher, Room, Work
 from ..camera import CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, lattice, pixel_shift
-from ..columns import ALBEDO, METALLIC, NORMAL, OPACITY, ROUGHNESS, SAMPLE, SIZE
 from ..sampling import ONE, ZERO, F
+from ..surfel_columns import ALBEDO, METALLIC, NORMAL, OPACITY, ROUGHNESS, SAMPLE, SIZE
 from ..surfels.blending import GAP, MIN_TRANSMITTANCE
-from ..surfels.raster import MAX_ALPHA, SurfelSamples, gaussian
-from ..surfels.splats import CUT, DIM, LOW, RX, RY, TILE, ZC, A, B, D, N, Splats
+from ..surfels.raster import SurfelSamples, gaussian
+from ..surfels.splats import CUT, DIM, LOW, MAX_ALPHA, RX, RY, TILE, ZC, A, B, D, N, Splats
 
 #: Contributions that a lane gathers at once.
 MOST = 64

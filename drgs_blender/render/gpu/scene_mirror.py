@@ -15,7 +15,7 @@ from ..scene.interaction import Geometry
 from ..scene.ray_masks import CAMERA, DIFFUSE, GLOSSY, ORDINARY, SHADOW, SURFELS, WITHOUT
 from ..scene.trace_scene import TraceScene
 from .bvhs import Trees
-from .natives import MeshTracer
+from .native_functions import MeshTracer
 
 Array = np.ndarray
 
@@ -77,7 +77,7 @@ class Mirror:
     def tracer(self, scene: TraceScene) -> MeshTracer:
         """The tracer of rays into the scene; until its next update."""
         found: MeshTracer = self._table(
-            "rays_see", (scene, scene.version), lambda address_of: self._tracer(scene, address_of)
+            "tracer", (scene, scene.version), lambda address_of: self._tracer(scene, address_of)
         )
         return found
 

@@ -17,7 +17,7 @@ from ...compute.warp.runtime import warp
 from ...compute.warp.search import first_of
 from ...core.asset.model import PosedSurfels
 from ...core.frame import Camera
-from ..columns import SPLAT
+from ..surfel_columns import SPLAT
 from ..surfels.splats import (
     RECORD,
     TILE,

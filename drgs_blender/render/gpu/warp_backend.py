@@ -14,12 +14,12 @@ from ...core.errors import DeviceError
 from ...core.frame import Camera
 from ..backend import RenderBackend, T
 from ..denoise.demodulation import Signal
-from ..denoise.svgf_temporal import Shot
+from ..denoise.svgf_temporal import NoisyPicture
 from ..film.guides import Guides
 from ..gbuffer.camera_hits import MeshHits, shade_mesh
 from ..integrator.integrate import integrate
-from ..points import Radiance
 from ..scene.trace_scene import TraceScene
+from ..shading_points import Radiance
 from ..surfels.raster import SurfelSamples
 from ..surfels.raster import rasterise as rasterise_on_cpu
 from ..surfels.splats import Splats
@@ -103,16 +103,16 @@ class WarpRenderBackend(RenderBackend):
     def denoise(
         self, components: Array, variance: Array, guides: Guides, split: bool, check: Callable[[], None]
     ) -> Array:  # fmt: skip
-        on_cpu, shot = super().denoise, Shot(components, variance, guides)
+        on_cpu, picture = super().denoise, NoisyPicture(components, variance, guides)
         return self.with_fallback(
-            lambda: denoise(self.launcher, shot, None, split, False, check)[0],
+            lambda: denoise(self.launcher, picture, None, split, False, check)[0],
             lambda: on_cpu(components, variance, guides, split, check),
         )
 
     def denoise_next(
-        self, shot: Shot, history: Signal | None, split: bool, still: bool, check: Callable[[], None]
+        self, picture: NoisyPicture, history: Signal | None, split: bool, still: bool, check: Callable[[], None]
     ) -> tuple[Array, Signal]:
-        on_cpu, given = super().denoise_next, (shot, history, split, still, check)
+        on_cpu, given = super().denoise_next, (picture, history, split, still, check)
         return self.with_fallback(lambda: denoise(self.launcher, *given), lambda: on_cpu(*given))
 
     def with_fallback(self, on_device: Callable[[], T], on_cpu: Callable[[], T]) -> T:

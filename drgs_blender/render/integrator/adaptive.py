@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ...core.frame import RenderSettings
-from ..points import Radiance, ShadingPoints
+from ..shading_points import Radiance, ShadingPoints
 
 Array = np.ndarray
 #: Light of some points from the i-th of n parts of their samples.

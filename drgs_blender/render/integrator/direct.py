@@ -91,7 +91,9 @@ def deliver(count, found, limit, sums):  # type: ignore[no-untyped-def]
 
 @njit
 def _see_lights(rays, slot, reach, hit, taking_part, scene, sums):  # type: ignore[no-untyped-def]
-    """What lights between a point and what its ray hit shine, and what that emits; the BRDF is not yet weighed.
+    """Add reflected light of the lights between a point and its ray's hit, and of the hit's emission, with MIS weights.
+
+    Called before `wavefront.weigh_one`, while the BRDF of the slot is not yet divided by densities.
 
     `taking_part` says (1 or 0) whether cosine and GGX sampling do, as in `mis.balance_heuristic`.
     """

@@ -57,7 +57,7 @@ def lifted(px, py, pz, gx, gy, gz, extent):  # type: ignore[no-untyped-def]
 
 @njit
 def _surfaces(rays, count, scene, settings):  # type: ignore[no-untyped-def]
-    """Normals and materials where the rays hit. What the surfaces emit was taken where the rays left (`_onwards`)."""
+    """Normals and materials where the rays hit. Emission was already added (`direct`, `_onwards`)."""
     s, ints = rays
     tracer, geometry, envmap, extent = scene.tracer, scene.geometry, scene.envmap, scene.traits.extent
     shading_model, layers = settings.shading_model, settings.layers

@@ -19,10 +19,10 @@ from ...core.frame import RenderSettings
 from .. import sampling
 from ..lights.environment import EnvironmentLight
 from ..lights.light_sampler import Lights
-from ..points import CATCHER, SECOND, PointArrays, Radiance, ShadingPoints
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
 from ..scene.trace_scene import TraceScene
+from ..shading_points import CATCHER, SECOND, PointArrays, Radiance, ShadingPoints
 from ..surfels.surfel_bvh import SurfelBVH
 from ..surfels.surfel_tracer import tracer_of
 from . import brdf
@@ -112,7 +112,7 @@ def integrate(
         raise UsageError("render settings", problem, "Use counts of zero or more")
     if not (0.0 <= settings.clamp_indirect < np.inf and 0.0 <= settings.noise_threshold < np.inf):
         raise UsageError("render settings", "the clamp or the threshold is no number of at least 0", "Use 0 for none")
-    if settings.shading_model not in brdf.SHADING_MODELS:
+    if settings.shading_model not in brdf.SHADING_DATABLOCKS:
         problem = f"shading model {settings.shading_model!r} is unknown"
         raise UsageError("render settings", problem, "Use principled or paper")
     n = len(points)
@@ -133,7 +133,7 @@ def integrate(
     traits = Traits(extent, not environment.black, lights.count > 0, emissive, lights.rays_differ, apart)
     given = Scene(tracer, geometry, envmap, light_tables, traits)
     clamp = F(settings.clamp_indirect * settings.subpixel_count * part[1] / sum(counts))
-    how = Settings(settings.bounces, brdf.SHADING_MODELS[settings.shading_model], brdf.layer_table(), clamp, 0)
+    how = Settings(settings.bounces, brdf.SHADING_DATABLOCKS[settings.shading_model], brdf.layer_table(), clamp, 0)
     seed, sequence = U(hash_seed(settings.seed, noise_index)), sampling.point_set(sum(counts) + 1)
     shares = F(environment_part), F(lights_part), _MAX_LIGHT_SHARE if scene.rays_differ else ONE
     sampler = Sampler._make([seed, sequence, settings.subpixel_count, *part, auto, *map(F, counts), *shares])

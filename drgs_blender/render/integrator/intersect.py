@@ -22,7 +22,7 @@ from ..scene import ray_masks
 from ..scene.interaction import Tracer, nearest, shadowed, surface_at
 from ..scene.ray import Hit, Ray
 from ..surfels.raster import GAP
-from ..surfels.surfel_query import Start
+from ..surfels.surfel_query import RayStart
 from ..surfels.surfel_tracer import trace_surfels, transmittance
 from . import wavefront as w
 
@@ -118,7 +118,7 @@ def _start_of(rays, slot):  # type: ignore[no-untyped-def]
     """The surface that a slot's ray starts on."""
     s, ints = rays
     i, c = w.at(slot)
-    return Start(np.int32(ints[c + w.OWN]), s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE])
+    return RayStart(np.int32(ints[c + w.OWN]), s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE])
 
 
 @njit

@@ -68,7 +68,7 @@ class Settings(NamedTuple):
     bounces : int
         Vertices of a path behind the shading point.
     shading_model : int
-        One of ``brdf.SHADING_MODELS``.
+        One of ``brdf.SHADING_DATABLOCKS``.
     layers : (16, 16) float32 array
         ``brdf.layer_table()``.
     clamp : np.float32

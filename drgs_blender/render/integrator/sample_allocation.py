@@ -46,7 +46,7 @@ def _allocate(state, h, share, sampler):  # type: ignore[no-untyped-def]
         light = light if envmap + lights > ZERO else ZERO
         ggx = (total - light) * (ONE - share)
         if total >= F(3.0):
-            # Each lobe keeps a ray: what its own rays alone find (`apart`) must not be lost.
+            # At least one ray per lobe: light that only its rays find (`apart`) has no other strategy.
             step = max(ONE, F(np.int32(total / F(8.0))))
             light = step * _rounded(light / step)
             if lights > ZERO:

@@ -29,7 +29,7 @@ SPREAD_TAN, SPREAD_SCALE, CONE_COS, CONE_SCALE = 19, 20, 21, 22
 FLAGS, INTENSITY, BOUND, REACH_COS, FLUX = 23, 24, 25, 26, 27
 WIDTH = 28
 
-#: Kinds. A soft point is a disk that faces whoever looks; the two bare ones are met by no ray.
+#: Kinds. A soft point is a disk that faces the shading point; rays do not hit the two without size.
 BARE_POINT, BARE_SUN, SOFT_POINT, SPHERE, SUN, RECTANGLE, ELLIPSE = range(7)
 
 #: Bits of FLAGS: rays that see the light, and whether things block it.

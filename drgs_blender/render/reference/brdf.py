@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-SHADING_MODELS = ("principled", "paper")
-MIN_ALPHA = 1e-3
+SHADING_DATABLOCKS = ("principled", "paper")
+MIN_GGX_ALPHA = 1e-3
 IOR = 1.5
 #: Reflectance of the dielectric at normal incidence.
 F0 = ((IOR - 1) / (IOR + 1)) ** 2
@@ -38,8 +38,8 @@ def normalise(a: Tensor) -> Tensor:
 
 
 def alpha_of(roughness: Tensor) -> Tensor:
-    """GGX width of a perceptual roughness: its square, at least `MIN_ALPHA`."""
-    return (roughness**2).clamp(min=MIN_ALPHA)
+    """GGX width of a perceptual roughness: its square, at least `MIN_GGX_ALPHA`."""
+    return (roughness**2).clamp(min=MIN_GGX_ALPHA)
 
 
 def ggx_distribution(normal: Tensor, half: Tensor, alpha: Tensor) -> Tensor:
@@ -154,8 +154,8 @@ def evaluate(
         Zero where the light is below the surface, glossy also where the view is (an interpolated normal may turn away
         from the viewer at a silhouette; diffuse light does not ask for the view).
     """
-    if shading_model not in SHADING_MODELS:
-        raise ValueError(f"shading model {shading_model!r} is not one of {SHADING_MODELS}")
+    if shading_model not in SHADING_DATABLOCKS:
+        raise ValueError(f"shading model {shading_model!r} is not one of {SHADING_DATABLOCKS}")
     normal, view, light = torch.broadcast_tensors(normal, view, light)
     lit = (dot(normal, light) > 0).unsqueeze(-1)
     seen = lit & (dot(normal, view) > 0).unsqueeze(-1)

@@ -20,7 +20,7 @@ from .brdf import dot, normalise
 
 #: Variance of the screen-space filter, square pixels.
 FILTER_VARIANCE = 0.5
-#: Fainter contributions are skipped; none is stronger than the second.
+#: Alpha of a contribution: fainter ones are skipped, stronger ones clamped.
 MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.99
 #: Blending stops once no more than this part of the background is left.
 MIN_TRANSMITTANCE = 1e-4

@@ -86,7 +86,7 @@ class Hit(NamedTuple):
     face : np.int32
         Of the scene; -1 when nothing is hit.
     instance : np.int32
-        Row of the scene's places; -1 outside shapes in places.
+        Instance index; -1 for geometry that is not instanced.
     u, v : np.float32
         Barycentric coordinates of the second and of the third corner.
     gx, gy, gz : np.float32

@@ -16,7 +16,7 @@ from ...core.asset.model import as_float
 from ...core.errors import UsageError
 from ...core.frame import MeshState, Visibility
 from ...geometry.normals import VertexNormals
-from ..columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS
+from ..surfel_columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS
 from .instances import Instances, flattens, normal_matrices
 from .ray_masks import group_mask
 

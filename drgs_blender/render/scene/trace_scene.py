@@ -13,9 +13,9 @@ from itertools import groupby
 import numpy as np
 
 from ...core.frame import Image, MeshState, Pose
-from ..columns import VERTEX
 from ..memory import AddressOf, address
 from ..sampling import F
+from ..surfel_columns import VERTEX
 from .instances import Instances, normal_matrices, other_matrices, usable_instances
 from .interaction import Geometry, Tracer
 from .mesh_materials import EmissiveMesh, MeshMaterials

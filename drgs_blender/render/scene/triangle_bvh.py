@@ -152,7 +152,7 @@ def neighbours(vertices: Array, faces: Array) -> Array:
 
 
 class _Part:
-    """What Embree holds of one group: its triangles and, when it stands in places, those."""
+    """Embree geometry of one group: its triangles and instances."""
 
     def __init__(self, top: int, index: int, group: Group, vertices: Array, faces: Array) -> None:
         self._lib, self._device = embree.library(), embree.device()

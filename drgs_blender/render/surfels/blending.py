@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compute.jit import njit
-from ..columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
+from ..surfel_columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
 
 #: Samples that vector code works on at a time; a tile's side and the room for contributions are multiples of it.
 LANES = 16
@@ -18,6 +18,7 @@ LANES = 16
 MANY = 128
 #: Depth jump that separates two surfaces, in units of the mean of the two surfels' sizes.
 GAP = 3.0
+#: Blending stops once no more than this part of the background is left.
 MIN_TRANSMITTANCE = 1e-4
 
 Array = np.ndarray

@@ -31,12 +31,13 @@ import numpy as np
 from ...compute.jit import inlined, njit
 from ...compute.threads import over_lanes
 from ..camera import CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, lattice, pixel_shift
-from ..columns import OPACITY, SAMPLE, SPLAT
+from ..surfel_columns import OPACITY, SAMPLE, SPLAT
 from .blending import GAP, LANES, MIN_TRANSMITTANCE, contributions, mean, prune, scratch_for, sort, weigh, widen
 from .splats import (
     CUT,
     DIM,
     LOW,
+    MAX_ALPHA,
     RECORD,
     RX,
     RY,
@@ -62,7 +63,6 @@ _STRENGTH, _NEAREST = RECORD - 2, RECORD - 1
 ROOM = 64
 #: Splats between two looks at which blocks are opaque.
 _CHECK = 32
-MAX_ALPHA = 0.99
 
 
 class SurfelSamples(NamedTuple):

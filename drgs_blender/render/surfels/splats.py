@@ -19,8 +19,8 @@ from ...compute.threads import ELEMENTS, over_range
 from ...core.asset.model import PosedSurfels
 from ...core.frame import Camera
 from ..camera import CLIP_END, CLIP_START, CX, CY, FILTER, FX, FY, LEAN, ORTHOGRAPHIC, POSITION, SUBPIXELS
-from ..columns import ALBEDO, METALLIC, NORMAL, OPACITY, ROUGHNESS, SIZE, SPLAT
 from ..pixel_filter import filter_reach
+from ..surfel_columns import ALBEDO, METALLIC, NORMAL, OPACITY, ROUGHNESS, SIZE, SPLAT
 
 Array = np.ndarray
 
@@ -28,8 +28,8 @@ Array = np.ndarray
 TILE = 16
 #: Surfels that one thread projects at least: each costs as much as several elements elsewhere.
 _FEW = ELEMENTS // 8
-#: Fainter contributions are skipped.
-MIN_ALPHA = 1.0 / 255.0
+#: Alpha of a contribution: fainter ones are skipped, stronger ones clamped.
+MIN_ALPHA, MAX_ALPHA = 1.0 / 255.0, 0.99
 
 # Columns of a splat's screen record. A_, B_, N_, D_: constant, x and y coefficients of u, v, denominator and depth; ZC:
 # depth of the centre; CUT: square radius at which a splat ends. The screen-space filter has the square radius

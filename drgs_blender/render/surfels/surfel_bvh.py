@@ -10,11 +10,11 @@ import numpy as np
 from ...compute.jit import njit, plain
 from ...core.asset.model import PosedSurfels
 from ...core.errors import DeviceError, UsageError
-from ..columns import ALBEDO, METALLIC, NORMAL, PLANE, ROUGHNESS, SIZE, SURFEL
 from ..scene.embree import QUALITY_LOW, QUALITY_REFIT, SCENE_DYNAMIC, address, device, library
 from ..scene.triangle_bvh import aligned, box_of, looseness, neighbours
-from .splats import Posed
-from .surfel_query import CUT, MASK, MIN_ALPHA, OBJECT, OPACITY, RECORD, TANGENT_U, TANGENT_V, WIDTH, callbacks
+from ..surfel_columns import ALBEDO, METALLIC, NORMAL, PLANE, ROUGHNESS, SIZE, SURFEL
+from .splats import MIN_ALPHA, Posed
+from .surfel_query import CUT, MASK, OBJECT, OPACITY, RECORD, TANGENT_U, TANGENT_V, WIDTH, callbacks
 
 Array = np.ndarray
 

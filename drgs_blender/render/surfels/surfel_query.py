@@ -30,11 +30,11 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-#: Fainter contributions are skipped and stronger ones clamped, as in `raster`.
-MIN_ALPHA, MAX_ALPHA = 1.0 / 255.0, 0.99
+from .splats import MAX_ALPHA
+
 #: Light that is fainter than this is gone. Less than the rasteriser's 1e-4, so that what lies behind moves not even the
 #: mean depth of a hit by more than 1e-4 of the distance to it.
-MIN_TRANSMITTANCE = 2e-5
+MIN_RAY_TRANSMITTANCE = 2e-5
 #: Contributions that one walk through the tree finds. With 32 rays are a tenth slower, with 16 a fifth.
 CAPACITY = 64
 
@@ -58,7 +58,7 @@ ALPHAS, INDICES = DEPTHS + CAPACITY, DEPTHS + 2 * CAPACITY
 _WORDS = _CONTEXT + DEPTHS + 3 * CAPACITY
 
 
-class Start(NamedTuple):
+class RayStart(NamedTuple):
     """The surface that a ray starts on, so that it does not stop the ray.
 
     Attributes
@@ -150,7 +150,7 @@ def begin_query(query, ray, start):  # type: ignore[no-untyped-def]
         Address, `query_memory`.
     ray : Ray
         World; direction unit; mask as of ``SurfelBVH.update``.
-    start : Start
+    start : RayStart
 
     Returns
     -------
@@ -259,7 +259,7 @@ def _gather(call):  # type: ignore[no-untyped-def]
         return  # blended after an earlier walk
     count = np.int64(load_word(context, COUNT))
     product = load_double(context + 4 * PRODUCT, 0)
-    if count == CAPACITY or product < MIN_TRANSMITTANCE:
+    if count == CAPACITY or product < MIN_RAY_TRANSMITTANCE:
         end = load_single(context, DEPTHS + count - 1)
         if depth > end or (depth == end and index > load_word(context, INDICES + count - 1)):
             return
@@ -284,13 +284,13 @@ def _gather(call):  # type: ignore[no-untyped-def]
     # What lies behind opaque surfels is forgotten; the margin keeps rounding of the quotient from showing.
     while count > 1:
         without = product / (1.0 - load_single(context, ALPHAS + count - 1))
-        if without >= 0.999999 * MIN_TRANSMITTANCE:
+        if without >= 0.999999 * MIN_RAY_TRANSMITTANCE:
             break
         product = without
         count -= 1
     store_word(context, COUNT, np.int32(count))
     store_double(context + 4 * PRODUCT, 0, product)
-    if count == CAPACITY or product < MIN_TRANSMITTANCE:
+    if count == CAPACITY or product < MIN_RAY_TRANSMITTANCE:
         # A little beyond the last one: those at an equal depth are distinguished above, not by Embree's boxes.
         store_single(ray, _TFAR, beyond(load_single(context, DEPTHS + count - 1)))
 
@@ -322,7 +322,7 @@ def _shade(call):  # type: ignore[no-untyped-def]
         return
     product = load_double(context + 4 * PRODUCT, 0) * (1.0 - alpha)
     store_double(context + 4 * PRODUCT, 0, product)
-    if product < MIN_TRANSMITTANCE:
+    if product < MIN_RAY_TRANSMITTANCE:
         store_single(ray, _TFAR, np.float32(-np.inf))
 
 

@@ -26,10 +26,10 @@ from ...compute.jit import inlined, njit
 from ...compute.threads import over_range
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
-from ..columns import ALBEDO, METALLIC, NORMAL, PLANE, ROUGHNESS, SIZE, SURFEL
 from ..memory import address, load_float, load_int32
 from ..sampling import ONE, ZERO, F
 from ..scene.ray import Rays, ray_at
+from ..surfel_columns import ALBEDO, METALLIC, NORMAL, PLANE, ROUGHNESS, SIZE, SURFEL
 from .raster import GAP
 from .surfel_bvh import SurfelBVH
 from .surfel_query import (
@@ -40,9 +40,9 @@ from .surfel_query import (
     INDICES,
     LAST_INDEX,
     LAST_T,
-    MIN_TRANSMITTANCE,
+    MIN_RAY_TRANSMITTANCE,
     PRODUCT,
-    Start,
+    RayStart,
     begin_query,
     cast,
     load_double,
@@ -92,7 +92,7 @@ def tracer_of(bvh: SurfelBVH) -> SurfelTracer:
 
 @njit
 def transmittance(tracer, ray, start):  # type: ignore[no-untyped-def]
-    """Share of light that passes the surfels on a ray, 0 where that is below MIN_TRANSMITTANCE.
+    """Share of light that passes the surfels on a ray, 0 where that is below MIN_RAY_TRANSMITTANCE.
 
     Parameters
     ----------
@@ -100,13 +100,13 @@ def transmittance(tracer, ray, start):  # type: ignore[no-untyped-def]
         Or anything that has its fields.
     ray : Ray
         Its direction is a unit vector; for its mask see ``SurfelBVH.update``, -1 meets all.
-    start : Start
+    start : RayStart
     """
     query = query_memory()
     context = begin_query(query, ray, start)
     cast(tracer.surfel_occluded, tracer.surfel_scene, query, ray.tnear, ray.tfar)
     product = load_double(context + 4 * PRODUCT, 0)
-    return F(product) if product >= MIN_TRANSMITTANCE else ZERO
+    return F(product) if product >= MIN_RAY_TRANSMITTANCE else ZERO
 
 
 @njit
@@ -115,7 +115,7 @@ def trace_surfels(tracer, ray, start, gap, number):  # type: ignore[no-untyped-d
 
     Parameters
     ----------
-    tracer, ray, start : SurfelTracer, Ray or Start
+    tracer, ray, start : SurfelTracer, Ray or RayStart
         As of `transmittance`.
     gap : float32
         Jump of depth that separates surfaces, in sizes; infinite: none does.
@@ -141,8 +141,8 @@ def trace_surfels(tracer, ray, start, gap, number):  # type: ignore[no-untyped-d
     object : int32
         Of the heaviest surfel; -1 where nothing is met.
     stop : float32
-        Depth at which the transmittance falls to `number`, else `tfar`: as often as light passes to some depth, it lies
-        beyond.
+        Depth at which the transmittance falls to `number`, else `tfar`: P(stop > t) equals the transmittance
+        to depth t.
     """
     query = query_memory()
     context = begin_query(query, ray, start)
@@ -172,9 +172,9 @@ def trace_surfels(tracer, ray, start, gap, number):  # type: ignore[no-untyped-d
             before, through = through, through * (1.0 - alpha)
             if before > number >= through:
                 stop = t
-            if through < MIN_TRANSMITTANCE:
+            if through < MIN_RAY_TRANSMITTANCE:
                 break
-        if count < CAPACITY or through < MIN_TRANSMITTANCE:
+        if count < CAPACITY or through < MIN_RAY_TRANSMITTANCE:
             break
         # The list was full: go on behind its last entry.
         near = max(tnear, last * _BEFORE)
@@ -189,7 +189,7 @@ def trace_surfels(tracer, ray, start, gap, number):  # type: ignore[no-untyped-d
         return (
             ONE, F(tfar), ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, np.int32(-1), stop,
         )  # fmt: skip
-    left = F(through) if through >= MIN_TRANSMITTANCE else ZERO
+    left = F(through) if through >= MIN_RAY_TRANSMITTANCE else ZERO
     inverse = ONE / weight
     scale = ONE / math.sqrt(max(px * px + py * py + pz * pz, _TINY))
     px, py, pz = px * scale, py * scale, pz * scale
@@ -207,7 +207,7 @@ def trace_surfels(tracer, ray, start, gap, number):  # type: ignore[no-untyped-d
 
 @inlined
 def _prefer(weight, best, pick, total):  # type: ignore[no-untyped-def]
-    """Whether a surface takes the place of the one chosen so far; the random number, renewed; all weight so far.
+    """Whether a surface takes the place of the one chosen so far; the random number, reuse_equal; all weight so far.
 
     Of a row of surfaces each is chosen in proportion to its weight; the heaviest when `pick` is negative.
     """
@@ -272,7 +272,7 @@ class SurfelHits:
 
 
 @dataclass(slots=True)
-class Starts:
+class RayStarts:
     """The surfaces that rays start on, so that these do not stop them.
 
     Attributes
@@ -308,7 +308,7 @@ def trace(
     tfar: float = math.inf,
     *,
     mask: int = -1,
-    starts: Starts | None = None,
+    starts: RayStarts | None = None,
     gap: float = GAP,
 ) -> SurfelHits:
     """Blend the surfels on many rays; origins and unit directions (n, 3), world space. See `trace_surfels`."""
@@ -331,7 +331,7 @@ def transmittance_many(
     tfar: float = math.inf,
     *,
     mask: int = -1,
-    starts: Starts | None = None,
+    starts: RayStarts | None = None,
 ) -> Array:
     """(n,) float32: the share of light that passes along many rays. See `transmittance`."""
     origins, directions, starts = _checked(origins, directions, starts)
@@ -341,11 +341,11 @@ def transmittance_many(
     return out
 
 
-def _checked(origins: Array, directions: Array, starts: Starts | None) -> tuple[Array, Array, Starts]:
+def _checked(origins: Array, directions: Array, starts: RayStarts | None) -> tuple[Array, Array, RayStarts]:
     origins = as_float(origins, (-1, 3), "ray origins")
     n = len(origins)
     if starts is None:
-        starts = Starts(np.full(n, -1), np.zeros((n, 3)), np.zeros(n))
+        starts = RayStarts(np.full(n, -1), np.zeros((n, 3)), np.zeros(n))
     if len(starts.object_index) != n:
         raise UsageError("ray starts", f"are {len(starts.object_index)} for {n} rays", "Give one start a ray")
     return origins, as_float(directions, (n, 3), "ray directions"), starts
@@ -354,7 +354,7 @@ def _checked(origins: Array, directions: Array, starts: Starts | None) -> tuple[
 @njit
 def _start(starts, i):  # type: ignore[no-untyped-def]
     own, normal, size = starts
-    return Start(own[i], normal[i, 0], normal[i, 1], normal[i, 2], size[i])
+    return RayStart(own[i], normal[i, 0], normal[i, 1], normal[i, 2], size[i])
 
 
 @njit

@@ -13,7 +13,7 @@ import numpy as np
 from ...compute.warp.kernels import Work
 from ...compute.warp.search import first_of
 from ...compute.warp.translate import Native
-from ..blocks import block_of
+from ..grid_blocks import block_of
 
 #: Where cells of a block begin: 64, and where the last one ends.
 STARTS = 65
@@ -121,7 +121,7 @@ def index_blocks(lane, lanes, room, n, keys, numbers, sizes, out):  # type: igno
             active[s, 0], active[s, 1], active[s, 2] = number // (by * bz), number // bz % by, number % bz
 
 
-def house_particles(lane, lanes, room, n, keys, numbers, sizes, out):  # type: ignore[no-untyped-def]
+def find_home_blocks(lane, lanes, room, n, keys, numbers, sizes, out):  # type: ignore[no-untyped-def]
     """Active block of each particle, sorted.
 
     Parameters
@@ -140,7 +140,7 @@ def house_particles(lane, lanes, room, n, keys, numbers, sizes, out):  # type: i
 NUMBER = Work(number_particles, (), _NATIVES)
 LIST = Work(list_blocks, (), _NATIVES)
 INDEX = Work(index_blocks, (), {})
-HOUSE = Work(house_particles, (), {})
+FIND_HOMES = Work(find_home_blocks, (), {})
 
 
 def around(occupied: np.ndarray, blocks: tuple[int, int, int]) -> np.ndarray:

@@ -13,10 +13,11 @@ from ..contact import Field
 from ..fields import COLUMNS
 from ..grid import Grid, Limits, Scene
 from ..particles import Particles
-from .cells import BLOCKS, HOUSE, INDEX, LIST, LOST, NUMBER, OCCUPIED, STARTS, around
+from .cells import BLOCKS, FIND_HOMES, INDEX, LIST, LOST, NUMBER, OCCUPIED, STARTS, around
 from .steps import (
     CELL,
     DISTANCE,
+    END_STEP,
     LINEAR,
     MOST_DRIFT,
     MOST_SPEED,
@@ -33,7 +34,6 @@ from .steps import (
     SPIN,
     STEP,
     SURFACE,
-    TICK,
     TOPS,
     VECTORS,
     VELOCITY,
@@ -143,7 +143,7 @@ class DeviceGrid(Grid):
         self._nodes = zeros((count * 64, 4))
         known = n, self._keys, self._numbers, self._sizes
         self._index = recorded(INDEX, count * (27 + STARTS), known, (self._active, self._neighbour, self._first))
-        self._house = recorded(HOUSE, n, known, (self._home,))
+        self._house = recorded(FIND_HOMES, n, known, (self._home,))
 
     def _recorded(self) -> list[Callable[[], None]]:
         """The launches of a step, which are the same for all steps."""
@@ -167,7 +167,7 @@ class DeviceGrid(Grid):
             launcher.recorded(
                 MOVE, n, (homes, self._nodes, matter, (self._pin, *pins), grid, time), (*s.values(), self._fastest)
             ),
-            launcher.recorded(TICK, 1, (scene.domain.spacing, times), (clock, self._fastest)),
+            launcher.recorded(END_STEP, 1, (scene.domain.spacing, times), (clock, self._fastest)),
         ]
 
     def step(self, times: Sequence[tuple[float, float]], limits: Limits) -> list[float]:

@@ -386,7 +386,7 @@ def move_particles(lane, lanes, room, blocks, nodes, properties, pins, grid, tim
     raise_to(fastest, lane % SLOTS, top)
 
 
-def tick(lane, lanes, room, spacing, times, out):  # type: ignore[no-untyped-def]
+def end_step(lane, lanes, room, spacing, times, out):  # type: ignore[no-untyped-def]
     """End a step: note the highest speed, and see whether the next one is still as it was planned.
 
     Parameters
@@ -419,4 +419,4 @@ def tick(lane, lanes, room, spacing, times, out):  # type: ignore[no-untyped-def
 PREPARE = Work(prepare_particles, (), NATIVES)
 SOLVE = Work(solve_nodes, (), NATIVES)
 MOVE = Work(move_particles, (), NATIVES)
-TICK = Work(tick, (), NATIVES)
+END_STEP = Work(end_step, (), NATIVES)

@@ -32,7 +32,7 @@ _PLAIN, _ENOUGH = 0.01, 0.05
 _BORDER, _MOST, _NEAR, _SPECK = 0.02, 0.7, 0.06, 0.002
 
 
-def develop(
+def load_photograph(
     photograph: Photograph, layout: Layout, resolution: int | None, known: dict[Lens, tuple[Lens, Array]]
 ) -> View | None:
     """Read one photograph; None where it is black or of one colour all over.

@@ -20,13 +20,13 @@ DEEPEST = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Paint:
+class SocketValue:
     """A colour, times a texture where there is one."""
 
     colour: Array
     texture: Hashable | None = None
 
-    def times(self, factor: Array | float) -> Paint:
+    def times(self, factor: Array | float) -> SocketValue:
         """Scaled."""
         return replace(self, colour=self.colour * factor)
 
@@ -35,9 +35,9 @@ class Paint:
         return not self.colour.any()
 
 
-def uniform(value: Array | float) -> Paint:
-    """Paint of one value everywhere, without texture."""
-    return Paint(np.broadcast_to(np.asarray(value, np.float64), (3,)).copy())
+def uniform(value: Array | float) -> SocketValue:
+    """Value that is the same everywhere, without texture."""
+    return SocketValue(np.broadcast_to(np.asarray(value, np.float64), (3,)).copy())
 
 
 def constant(socket: bpy.types.NodeSocket) -> Array:

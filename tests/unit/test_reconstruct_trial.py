@@ -16,7 +16,7 @@ from captures import ring  # noqa: E402
 from drgs_blender.core.frame import Camera  # noqa: E402
 from drgs_blender.reconstruct.capture.capture import Capture, View  # noqa: E402
 from drgs_blender.reconstruct.meshing.visual_hull import _surface, _widened, find_region  # noqa: E402
-from drgs_blender.reconstruct.optim import starts, train  # noqa: E402
+from drgs_blender.reconstruct.optim import initialisation_trial, train  # noqa: E402
 from drgs_blender.reconstruct.optim.learner import Learner  # noqa: E402
 from drgs_blender.reconstruct.optim.schedule import Schedule  # noqa: E402
 from drgs_blender.reconstruct.optim.train import Training  # noqa: E402
@@ -86,10 +86,14 @@ def test_a_hollow_that_no_outline_shows_is_found(monkeypatch, caplog):
 @pytest.mark.slow
 def test_the_start_that_loses_leaves_no_trace(monkeypatch):
     capture = balls(24, 40)
-    monkeypatch.setattr(starts, "MIN_GAIN_DB", 1000.0)
+    monkeypatch.setattr(initialisation_trial, "MIN_GAIN_DB", 1000.0)
     tried = learned(capture)
     # The winner did not see the held-out views until the trial's end: neither does this one.
-    monkeypatch.setattr(starts.Trial, "is_due", lambda self, part, _: self.end() if part >= starts.TRIAL else None)
+    monkeypatch.setattr(
+        initialisation_trial.Trial,
+        "is_due",
+        lambda self, part, _: self.end() if part >= initialisation_trial.TRIAL else None,
+    )
     alone = learned(capture)
     for name, value in tried.gaussians.arrays().items():
         assert np.array_equal(value, alone.gaussians.arrays()[name]), name
@@ -99,11 +103,11 @@ def test_the_start_that_loses_leaves_no_trace(monkeypatch):
 def test_a_start_that_predicts_nothing_is_not_taken(monkeypatch):
     capture = balls(24, 40)
     training = Training(capture, find_region(capture), replace(QUICK, iterations=10, surfels=500))
-    on_hull, errors = training.growth.start, iter([0.1, float("nan")])
+    on_hull, errors = training.densification.start, iter([0.1, float("nan")])
     monkeypatch.setattr(Learner, "error_of", lambda *_: next(errors))
     while training.trying:
         training.step()
-    assert training.growth.start == on_hull and training.iteration == 2
+    assert training.densification.start == on_hull and training.iteration == 2
 
 
 def test_starts_are_judged_by_the_views_that_neither_saw():
@@ -111,7 +115,9 @@ def test_starts_are_judged_by_the_views_that_neither_saw():
     training = Training(capture, find_region(capture), replace(QUICK, surfels=200))
     expected = training.learner.error_of(training.views.held_out())
     half = training.views.half
-    seen = [k for k in range(len(half)) if k % starts.HOLDOUT_EVERY != starts.HOLDOUT_EVERY // 2]
+    seen = [
+        k for k in range(len(half)) if k % initialisation_trial.HOLDOUT_EVERY != initialisation_trial.HOLDOUT_EVERY // 2
+    ]
     for k in seen:
         half[k] = None
     assert training.learner.error_of(training.views.held_out()) == expected and len(half) - len(seen) == 3
@@ -136,7 +142,7 @@ def test_the_clock_does_not_favour_the_start_that_came_second(monkeypatch):
     training = Training(capture, find_region(capture), schedule, seconds=50.0, now=lambda: clock[0])
     while not training.finished:
         training.step()
-    assert tried == [2, 2] and not training.trying and training.clock.spent == clock[0]
+    assert tried == [2, 2] and not training.trying and training.time_budget.spent == clock[0]
 
 
 def test_by_the_clock_a_trial_takes_its_share_and_the_schedule_goes_on_evenly(monkeypatch):
@@ -153,11 +159,11 @@ def test_by_the_clock_a_trial_takes_its_share_and_the_schedule_goes_on_evenly(mo
     while not training.finished:
         parts.append((training.trying, training.part))
         training.step()
-    assert training.clock.spent == clock[0] == pytest.approx(100, abs=1)
-    assert sum(trying for trying, _ in parts) == pytest.approx(100 * starts.TRIAL, abs=2)
+    assert training.time_budget.spent == clock[0] == pytest.approx(100, abs=1)
+    assert sum(trying for trying, _ in parts) == pytest.approx(100 * initialisation_trial.TRIAL, abs=2)
     after = [part for trying, part in parts if not trying]
     np.testing.assert_allclose(np.diff(after), 0.01, atol=1e-3)
-    assert after[0] == pytest.approx(starts.TRIAL, abs=0.02)
+    assert after[0] == pytest.approx(initialisation_trial.TRIAL, abs=0.02)
 
 
 def test_held_out_views_are_learned_from_after_the_trial(monkeypatch):
@@ -175,7 +181,11 @@ def test_held_out_views_are_learned_from_after_the_trial(monkeypatch):
     while not training.finished:
         training.step()
     full, half = training.targets
-    kept = {id(view) for k, view in enumerate(half) if k % starts.HOLDOUT_EVERY == starts.HOLDOUT_EVERY // 2}
+    kept = {
+        id(view)
+        for k, view in enumerate(half)
+        if k % initialisation_trial.HOLDOUT_EVERY == initialisation_trial.HOLDOUT_EVERY // 2
+    }
     assert kept and not kept & during and {id(view) for view in full} <= after
 
 

@@ -1,4 +1,4 @@
-"""The time that learning takes, held against a limit."""
+"""The time budget of training: seconds spent on steps, as a part of those allowed."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from .starts import TRIAL
+from .initialisation_trial import TRIAL
 
 
-class Clock:
+class TimeBudget:
     """Time spent on steps, and what part of a schedule that is.
 
     Parameters
     ----------
-    limit : float, optional
-        Seconds that the whole schedule may take; without, time does not count.
+    seconds : float, optional
+        The time budget of the whole schedule; None: time does not count.
     now : callable
-        Seconds since whenever.
+        Monotonic clock, seconds.
 
     Attributes
     ----------
@@ -28,22 +28,22 @@ class Clock:
         Seconds that the trial of starts took, 0 before its end and without one.
     """
 
-    def __init__(self, limit: float | None, now: Callable[[], float] = time.monotonic) -> None:
-        self._limit, self.now = limit, now
+    def __init__(self, seconds: float | None, now: Callable[[], float] = time.monotonic) -> None:
+        self._budget, self.now = seconds, now
         self.spent = self.tried = 0.0
 
     def part(self, trying: bool) -> float:
-        """Fraction of the time limit that is spent, 0 without a limit.
+        """Fraction of the time budget that is spent, 0 without one.
 
         Parameters
         ----------
         trying : bool
             A trial of starts goes on: each of the two has half of the time.
         """
-        if not self._limit:
+        if not self._budget:
             return 0.0
         # Both starts together get a trial's share of the time, and what comes after goes on from there.
-        begun, left = (TRIAL, (self._limit - self.tried) / (1 - TRIAL)) if self.tried else (0.0, self._limit)
+        begun, left = (TRIAL, (self._budget - self.tried) / (1 - TRIAL)) if self.tried else (0.0, self._budget)
         return begun + (self.spent - self.tried) / max(left / 2 if trying else left, 1e-3)
 
     @contextmanager

@@ -35,7 +35,7 @@ class Trial:
     Parameters
     ----------
     rival : Gaussians, optional
-        The start that is learned second; without, there is no trial.
+        The second start; None for no trial.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Trial:
 
     def is_due(self, part: float, iteration: int) -> bool:
         """Whether the turn of the present start is over, at this part of the schedule and after `iteration` steps."""
-        # No more steps than the first had: compiling falls to it, and by the clock that would be counted against it.
+        # As many steps as the first start had, at most: the first one's time contains the compilation of kernels.
         even = self.first is not None and iteration >= self.first["counts"][0]
         return self.goes_on and (part >= TRIAL or bool(even))
 

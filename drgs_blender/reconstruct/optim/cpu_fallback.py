@@ -45,7 +45,7 @@ class Fallback:
     ----------
     training : Movable
     now : callable
-        Seconds of a clock.
+        Monotonic clock, seconds.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Rows of numbers told apart."""
+"""Indices of the distinct rows of a table of numbers."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import numpy as np
 Array = np.ndarray
 
 
-def number_rows(*columns: Array) -> Array:
-    """Number (n,) of each row among the distinct ones in lexicographic order.
+def distinct_row_indices(*columns: Array) -> Array:
+    """Index (n,) of each row in the sorted distinct rows.
 
     These are the indices that ``np.unique(rows, axis=0, return_inverse=True)`` returns second. Columns are ranked one
     by one, which is several times as fast as comparing whole rows.
@@ -19,7 +19,7 @@ def number_rows(*columns: Array) -> Array:
 
     Examples
     --------
-    >>> number_rows(np.array([2, 0, 2, 0]), np.array([1, 5, 0, 5]))
+    >>> distinct_row_indices(np.array([2, 0, 2, 0]), np.array([1, 5, 0, 5]))
     array([2, 0, 1, 0])
     """
     number = np.unique(columns[0], return_inverse=True)[1]

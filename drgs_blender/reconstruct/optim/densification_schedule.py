@@ -5,7 +5,7 @@ from __future__ import annotations
 from .schedule import Schedule
 
 
-class Growth:
+class DensificationSchedule:
     """Rounds of densification, spread evenly over a part of the schedule.
 
     Parameters

@@ -32,7 +32,7 @@ from drgs_blender.reconstruct.optim.schedule import Schedule
 from drgs_blender.reconstruct.optim.train import Training
 
 variant, masked = sys.argv[2], sys.argv[3] == "masks"
-watching, rehearse = False, job.rehearse
+watching, warm_up = False, job.warm_up
 
 def kernels():
     return sum(len(found.overloads) for found in gc.get_objects() if isinstance(found, Dispatcher))
@@ -48,10 +48,10 @@ def watched(step):
 
 def then_watch(*arguments):
     global watching
-    rehearse(*arguments)
+    warm_up(*arguments)
     watching = True
 
-Training.step, run.Job.step, job.rehearse = watched(Training.step), watched(run.Job.step), then_watch
+Training.step, run.Job.step, job.warm_up = watched(Training.step), watched(run.Job.step), then_watch
 capture = balls(18, 24, masks=masked)
 if not masked:
     capture.background = None
@@ -72,11 +72,11 @@ def test_no_step_that_is_timed_compiles(variant, masks):
 
 @pytest.mark.parametrize("minutes", [None, 0.01], ids=["by steps", "by the clock"])
 def test_too_little_time_for_materials_is_said(minutes, monkeypatch, caplog):
-    rehearsed, told = [], []
-    monkeypatch.setattr("drgs_blender.reconstruct.pipeline.rehearse", lambda *_: rehearsed.append(1))
+    warmed, told = [], []
+    monkeypatch.setattr("drgs_blender.reconstruct.pipeline.warm_up", lambda *_: warmed.append(1))
     quick = Decoupling(iterations=4 if minutes is None else 10**6, pixels=64, normals=True)
     settings = Settings(schedule=Schedule(iterations=10, surfels=400), mesh_resolution=16, decoupling=quick)
     reconstruct(balls(8, 24), replace(settings, minutes=minutes), told.append)
-    assert bool(rehearsed) == any(progress.phase == PREPARING for progress in told) == (minutes is not None)
+    assert bool(warmed) == any(progress.phase == PREPARING for progress in told) == (minutes is not None)
     assert ("materials got" in caplog.text) == (minutes is not None)
     assert minutes is None or "give more minutes" in caplog.text
