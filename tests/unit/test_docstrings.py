@@ -17,8 +17,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "drgs_blender"
-#: Folders whose docstrings still have prose where a type belongs.
-NOT_YET: tuple[str, ...] = ()
 FOLDERS = sorted(path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file())
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
 SECTIONS = ("Parameters", "Attributes", "Returns", "Yields")
@@ -251,17 +249,17 @@ def found_in(folder: str, kind: str) -> list[str]:
     return [text for what, text in all_faults(folder) if what == kind]
 
 
-@pytest.mark.parametrize("folder", [name for name in FOLDERS if name not in NOT_YET])
+@pytest.mark.parametrize("folder", FOLDERS)
 def test_entries_have_types(folder: str) -> None:
     assert not found_in(folder, "type"), "\n".join(found_in(folder, "type"))
 
 
-@pytest.mark.parametrize("folder", [name for name in FOLDERS if name not in NOT_YET])
+@pytest.mark.parametrize("folder", FOLDERS)
 def test_entries_name_what_exists(folder: str) -> None:
     assert not found_in(folder, "name"), "\n".join(found_in(folder, "name"))
 
 
-@pytest.mark.parametrize("folder", [name for name in FOLDERS if name not in NOT_YET])
+@pytest.mark.parametrize("folder", FOLDERS)
 def test_sections_of_parameters_are_whole(folder: str) -> None:
     assert not found_in(folder, "missing"), "\n".join(found_in(folder, "missing"))
 
@@ -295,11 +293,6 @@ def test_parameters_without_annotation_are_described(folder: str) -> None:
     paths = [path for path in sources() if path.is_relative_to(PACKAGE / folder)]
     found = [f"{path.relative_to(ROOT)}:{text}" for path in paths for text in undescribed(tree(path))]
     assert not found, "\n".join(found)
-
-
-@pytest.mark.parametrize("folder", NOT_YET)
-def test_folders_to_do_are_not_done(folder: str) -> None:
-    assert found_in(folder, "type"), f"{folder} has types everywhere: take it out of NOT_YET"
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,9 @@
 """Multiple importance sampling (MIS): the balance heuristic, which joins strategies that sample the same integral.
 
 A sample is divided by the sum, over the strategies that might have drawn it, of number of samples times pdf (Veach
-1997; PBRT 2.2.3): that is its weight over its pdf. The strategies are cosine and GGX sampling (two lobes of a BRDF),
-the environment, and lights, of which `intersect.light_radiance` has the weight, since it is known only when the light
-is.
+1997; PBRT 2.2.3): that is its weight over its pdf. The power heuristic, which squares both, is not used. The strategies
+are cosine and GGX sampling (two lobes of a BRDF), the environment, and lights, whose weight `intersect.light_radiance`
+has, since their visibility is found there.
 """
 
 from __future__ import annotations
