@@ -69,6 +69,7 @@ def test_surfels_stay_on_a_device_from_deformation_to_picture(session, warp_sess
         assert counts[0] > 0 and counts[1] == (case == "grainy")
 
 
+@pytest.mark.slow
 def test_viewports_grow_on_a_device(session, warp_session, make_frame):
     last = []
     for which, device in ((session, "cpu"), (warp_session, "cuda")):

@@ -17,7 +17,7 @@ import test_device_integrate
 import test_device_mpm
 import test_device_raster
 import warp
-from test_device_denoise import nothing, shots
+from test_device_denoise import nothing, pictures
 
 from drgs_blender.compute.warp.kernels import Launcher
 from drgs_blender.deform.gpu import gmls
@@ -54,8 +54,8 @@ def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
     scene, view = test_device_camera_hits.unseen()[0], test_device_camera_hits.VIEWS["perspective"]
     test_device_camera_hits.seen(device, scene, view)
     history = None
-    for shot in shots(2):
-        _, history = device.denoise_next(shot, history, True, False, nothing)
+    for picture in pictures(2):
+        _, history = device.denoise_next(picture, history, True, False, nothing)
     works = raster.BLEND, attach.ATTACH, *denoise.WORKS
     works += deformation.WEIGH, deformation.SUM, deformation.POSE
     works += bvhs.PLACE, camera_hits.TRACE, camera_hits.SHADE

@@ -181,8 +181,8 @@ def test_it_ends_where_every_process_dies(small, monkeypatch, caplog) -> None:
 def test_a_damaged_kernel_is_compiled_again_ahead(small) -> None:
     """Where the power was lost a file may be empty, or end before its time."""
     kernels = [known[0] for known in small]
-    for kernel in kernels:
-        manifest.dispatcher(kernel).compile(manifest.signature(kernel))
+    with contextlib.closing(worker_pool.Pool(small, 2)) as pool:
+        finish(pool)
     paths = sorted(folders.cache_folder().path.rglob("*.kernel"))
     whole = [path.read_bytes() for path in paths]
     assert len(paths) == len(kernels) and not prepare.not_compiled(kernels)
