@@ -89,7 +89,16 @@ def test_particles_kernels_compile_for_a_card(tmp_path: Path, case: str) -> None
     launcher = Launcher("cpu")
     test_device_mpm.test_a_step_is_the_processors_to_the_last_digits(launcher, case)
     test_device_gmls.test_a_device_carries_points_as_the_processor_does(launcher, "torn", 16, np.float64)
-    works = cells.NUMBER, cells.LIST, cells.INDEX, cells.HOUSE, steps.PREPARE, steps.SOLVE, steps.MOVE, steps.TICK
+    works = (
+        cells.NUMBER,
+        cells.LIST,
+        cells.INDEX,
+        cells.FIND_HOMES,
+        steps.PREPARE,
+        steps.SOLVE,
+        steps.MOVE,
+        steps.END_STEP,
+    )
     works += (gmls.CARRY,)
     assert made(works, launcher, tmp_path) == set(works)
 
