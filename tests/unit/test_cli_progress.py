@@ -70,11 +70,11 @@ def test_programs_read_it_with_its_fraction(capsys, monkeypatch):
 
 def test_farms_read_that_nothing_of_the_frame_is_done(capsys):
     with FrameLines(interval=0, openjd=2) as lines:
-        lines.begin(7)
+        lines.begin(7, 16)
         for phase, part in COUNTED:
             lines.progress(7, phase, part)
     out = capsys.readouterr().out
-    assert f"Fra:7 | {PREPARING}, 3 of 4 | Sample 0/100" in out
+    assert f"Fra:7 | {PREPARING}, 3 of 4 | Sample 0/16" in out
     assert set(re.findall(r"openjd_progress: ([\d.]+)", out)) == {"0.0"}
     assert f"openjd_status: frame 7, {PREPARING}, 3 of 4" in out
 
