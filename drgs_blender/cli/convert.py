@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     splats.add_argument("--env", type=Path, help="environment that lights an asset (EXR, HDR); default: its own")
     splats.add_argument("--env-rotation", type=finite, default=0.0, metavar="DEG", help="as in `drgs relight`")
-    splats.add_argument("--env-strength", type=finite, default=1.0, metavar="S", help="factor on the environment")
+    splats.add_argument("--env-strength", type=finite, default=1.0, metavar="S", help="strength of the environment")
     splats.add_argument(
         "--samples", type=int_range(1, 65536), default=256, metavar="N", help="samples a surfel; default 256"
     )
