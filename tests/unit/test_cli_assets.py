@@ -275,7 +275,7 @@ def test_doctor_does_without_a_graphics_card(monkeypatch, capfd):
     monkeypatch.setattr(doctor, "CHECKS", [c for c in doctor.CHECKS if c[0] == "GPU"])
     warns = lambda: os.write(2, b"Warp CUDA warning\n")  # noqa: E731
     monkeypatch.setattr(runtime, "warp", warns)
-    monkeypatch.setattr(runtime, "cuda_devices", lambda: [])
+    monkeypatch.setattr(runtime, "cuda_devices", list)
     assert main(["doctor"]) == 0
     found = capfd.readouterr()
     assert found.out.startswith("none     GPU          no NVIDIA GPU found; the CPU renders\n") and not found.err
