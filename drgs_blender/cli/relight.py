@@ -223,7 +223,7 @@ def read_environment(args: argparse.Namespace, asset: Asset) -> np.ndarray:
             logger.warning("%s: %s", args.env, note)
         return file.environment.radiance
     if asset.environment is None:
-        raise UsageError(str(args.asset), "holds no environment", "Give one with --env")
+        raise UsageError(str(args.asset), "has no captured light", "Give an environment with --env")
     return asset.environment.radiance
 
 
