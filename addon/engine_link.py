@@ -19,7 +19,10 @@ from ..drgs_blender.ipc.client import EngineClient, Passes, locate_engine
 from ..drgs_blender.ipc.locate import VARIABLE
 from . import engine_environment, messages, preferences
 
-SET_UP = f"Press Set Up Engine in sidebar > DR-GS, or name an environment in the preferences or in {VARIABLE}"
+SET_UP = (
+    f"Press Set Up Engine (sidebar > DR-GS), or set {VARIABLE} to a Python environment that has it, such as the folder "
+    ".venv of a checkout"
+)
 UPDATE = "Press Set Up Engine in sidebar > DR-GS; nothing need be fetched for it"
 
 #: Runs ``drgs`` and ends it together with Blender, however that ends: its standard input is closed then.
@@ -66,13 +69,13 @@ def command_line() -> list[str]:
     if found == "ready":
         return locate_engine(engine_environment.interpreter(folder))
     if found == "old":
-        raise DeviceError("engine", "belongs to another version of the extension", UPDATE)
+        raise DeviceError("", "The DR-GS engine belongs to another version of the extension", UPDATE)
     if found == "partial":
-        raise DeviceError("engine", "is not completely set up", SET_UP)
+        raise DeviceError("", "The DR-GS engine is not completely set up", SET_UP)
     try:
         return locate_engine()
     except DeviceError as error:
-        raise DeviceError("engine", "is not set up", SET_UP) from error
+        raise DeviceError("", "The DR-GS engine is not set up", SET_UP) from error
 
 
 def drgs_command() -> list[str]:

@@ -29,9 +29,13 @@ class Message(NamedTuple):
 history: deque[Message] = deque(maxlen=MAX_MESSAGES)
 
 
-def note(level: str, text: str) -> None:
-    """Remember a message; a repetition of the latest one only renews its time."""
-    log.log(getattr(logging, level), text)
+def note(level: str, text: str, logged: bool = True) -> None:
+    """Remember a message; a repetition of the latest one only renews its time.
+
+    Not `logged` is one that Blender prints as well, by a report.
+    """
+    if logged:
+        log.log(getattr(logging, level), text)
     if history and history[-1][1:] == (level, text):
         history.pop()
     history.append(Message(time.time(), level, text))

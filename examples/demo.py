@@ -44,8 +44,11 @@ def steps(out: Path, frames: str) -> list[Step]:
 
     def rendered(line: str) -> tuple[str, float] | None:
         nonlocal done
-        done += line.startswith("Saved: ")
-        return (f"Rendering, {done} of {count} frames", done / count) if line.startswith("Saved: ") else None
+        saved = line.startswith("Saved: ")
+        if not (saved or (line.startswith("Fra:") and ("| Preparing" in line or "| Sample 0/" in line))):
+            return None
+        done += saved
+        return f"Rendering, {done} of {count} frames", done / count
 
     done, count = 0, _count(frames)
     building = [environments.python_of(environments.ENGINE), ROOT / "tools/extension.py", "--out", extension]
@@ -79,6 +82,7 @@ def steps(out: Path, frames: str) -> list[Step]:
             ("scene",),
             count=rendered,
             before=partial(shutil.rmtree, out / "frames", ignore_errors=True),
+            measured="rendering",
         ),
         Step("sheet", "Making the contact sheet", [engine, __file__, "--out", out, "--sheet"], 2.0, ("frames",)),
     ]

@@ -34,11 +34,17 @@ def environments(seconds: tuple[float, float] = (90.0, 30.0)) -> list[Step]:
     """
     command = [sys.executable, ROOT / "tools" / "dev.py", "env"]
     engine_there, blender_there = python_of(ENGINE).is_file(), python_of(BLENDER).is_file()
-    found = [Step(FOR_ENGINE, "Making .venv", [*command, "--engine"], 1.0 if engine_there else seconds[0])]
+    text = _doing(engine_there, "the engine's Python (.venv)")
+    found = [Step(FOR_ENGINE, text, [*command, "--engine"], 1.0 if engine_there else seconds[0])]
     if not os.environ.get("DRGS_BLENDER"):
         after = 1.0 if blender_there else seconds[1]
-        found.append(Step(FOR_BLENDER, "Making .venv-blender", [*command, "--blender"], after))
+        text = _doing(blender_there, "Blender's Python (.venv-blender)")
+        found.append(Step(FOR_BLENDER, text, [*command, "--blender"], after))
     return found
+
+
+def _doing(is_there: bool, what: str) -> str:
+    return f"{'Checking' if is_there else 'Making'} {what}"
 
 
 def kernels(name: str, *jobs: str, seconds: float, after: str = FOR_ENGINE) -> Step:

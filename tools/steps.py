@@ -50,6 +50,8 @@ class Step:
     makes, of : the file that it makes, and what that depends on; the same again is not made again
     count : of a line that it writes what is to be said instead of `text`, and the part that is done; or None
     before : what is done before it starts
+    measured : the work in a word, such as "rendering", where only what it counts tells its time: before, nothing is
+        said but the time until it begins
     """
 
     name: str
@@ -61,11 +63,14 @@ class Step:
     of: tuple[Path, ...] = ()
     count: Callable[[str], tuple[str, float] | None] = lambda line: None
     before: Callable[[], object] = lambda: None
+    measured: str = ""
     #: What is known while it runs.
     process: subprocess.Popen[bytes] | None = None
     status: str = ""
     part: float = 0.0
     began: float = 0.0
+    first: tuple[float, float] = (0.0, 0.0)  # the least part that was counted, and the last moment it was so
+    latest: float = 0.0  # moment of the newest part
     took: float = 0.0
     tail: deque[str] = field(default_factory=lambda: deque(maxlen=_LINES))
     thread: threading.Thread | None = None
@@ -206,10 +211,17 @@ class _Run:
                 if line:
                     step.tail.append(line)
                 if found := step.count(line):
-                    step.status, step.part = found
+                    self._count(step, *found)
                     self._changed.set()
         step.process.wait()
         self._changed.set()
+
+    @staticmethod
+    def _count(step: Step, status: str, part: float) -> None:
+        step.status, step.latest = status, time.monotonic()
+        if not step.first[1] or part <= step.first[0]:
+            step.first = (part, step.latest)
+        step.part = part
 
     def _write(self, step: Step, line: str) -> None:
         with self._lock:
@@ -246,6 +258,9 @@ class _Run:
         if now - self._began < _EARLY:
             return ""
         pace = self._pace()
+        unknown = [step for step in self._steps if self._is_unknown(step)]
+        if any(step.process is not None for step in unknown):
+            return ""
         known: dict[str, float] = {}
 
         def until_end(step: Step) -> float:
@@ -254,7 +269,18 @@ class _Run:
                 known[step.name] = self._remains(step, pace, now) + max(later, default=0.0)
             return known[step.name]
 
+        def until_begin(step: Step) -> float:
+            before = (other for other in self._steps if other.name in step.after)
+            return max((until_begin(other) + self._remains(other, pace, now) for other in before), default=0.0)
+
+        if unknown:
+            next_one = min(unknown, key=until_begin)
+            return f"{next_one.measured} begins in about {clock(until_begin(next_one))}"
         return f"about {clock(max(map(until_end, self._steps)))} left"
+
+    def _is_unknown(self, step: Step) -> bool:
+        """Whether nothing tells yet how long a step still takes."""
+        return bool(step.measured) and step.name not in self._done and step.part <= step.first[0]
 
     def _pace(self) -> float:
         """How many times as long as they should steps have taken."""
@@ -267,6 +293,9 @@ class _Run:
             return 0.0
         if step.process is None:
             return pace * step.seconds
+        if step.measured:
+            rate = (step.latest - step.first[1]) / max(step.part - step.first[0], 1e-6)
+            return max(rate * (1.0 - step.part) - (now - step.latest), 0.0)
         spent = now - step.began
         if step.part > _ESTIMATED:
             return spent * max(1.0 - step.part, 0.0) / step.part

@@ -105,7 +105,7 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
 
     def _fail(self, text: str, code: int) -> None:
         """Report an error. `error_set` would let Blender write a black picture and go on."""
-        messages.note("ERROR", text)
+        messages.note("ERROR", text, logged=False)
         self.report({"ERROR"}, text)
         background_render.fail(text, code)
 

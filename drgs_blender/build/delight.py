@@ -15,6 +15,7 @@ from ..core.asset.model import Array, Asset, Surfels
 from ..core.color import LUMINANCE, srgb_to_linear
 from ..core.errors import UsageError
 from ..core.frame import RenderSettings, World
+from ..formats.gaussian_ply import CAPTURED_ALBEDO
 from ..formats.harmonics import basis, whole_bands
 from ..render.lights.environment import EnvironmentLight
 from ..render.scene.trace_scene import TraceObject, TraceScene
@@ -89,7 +90,9 @@ def remove_light(
         f"{report['too_dark']} surfels too dark to estimate, {report['clipped']} as bright as white"
     ]
     asset.provenance["materials"] = "estimated from captured colours, by removing the light of the environment"
-    asset.provenance.setdefault("report", {})["remove_light"] = report
+    about = asset.provenance.setdefault("report", {})
+    about["surfel_notes"] = [note for note in about.get("surfel_notes", []) if note != CAPTURED_ALBEDO]
+    about["remove_light"] = report
 
 
 def captured_along(surfels: Surfels, directions: Array) -> Array:

@@ -26,7 +26,8 @@ def read_camera(path: str | Path) -> Camera:
     path : str or Path
         A JSON object with the keys
 
-        - ``matrix_world``: 4 rows of 4 numbers, camera to world, rigid, Blender's convention (looks down -Z, Y up)
+        - ``matrix_world``: 4 rows of 4 numbers, camera to world, rigid, metres: the world is Z up; the camera looks
+          along its own -Z, its own Y is up
         - ``width``, ``height``: pixels
         - ``fov_x``: horizontal field of view in degrees, **or** ``fx``, ``fy`` in pixels (pixels per metre when
           orthographic) and optionally ``cx``, ``cy``, the principal point, by default the centre

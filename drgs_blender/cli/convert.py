@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     splats.add_argument("--env", type=Path, help="environment that lights an asset (EXR, HDR); default: its own")
     splats.add_argument("--env-rotation", type=finite, default=0.0, metavar="DEG", help="as in `drgs relight`")
-    splats.add_argument("--env-strength", type=finite, default=1.0, metavar="S", help="factor on the environment")
+    splats.add_argument("--env-strength", type=finite, default=1.0, metavar="S", help="strength of the environment")
     splats.add_argument(
         "--samples", type=int_range(1, 65536), default=256, metavar="N", help="samples a surfel; default 256"
     )
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
 
 def convert(args: argparse.Namespace) -> None:
     """Read, convert, write, and say what was converted."""
-    from ..formats.writers import WRITERS, find_writer
+    from ..formats.writers import WRITERS, either, find_writer, names_for
     from .convert_source import open_source
 
     with clock(args, "reading"):
@@ -92,8 +92,14 @@ def convert(args: argparse.Namespace) -> None:
     suffix = args.output.suffix.lower()
     wanted: list[Held] = [args.kind] if args.kind else list({w.kind: 0 for w in WRITERS if suffix in w.extensions})
     if wanted and not set(wanted) & set(source.kinds):
-        lacking, held = " or ".join(wanted), ", ".join(source.kinds)
-        raise UsageError(str(args.input), f"holds no {lacking}, but {held}", "Choose another OUT or --as")
+        words = {"environment": "captured light", "mesh": "mesh", "splats": "splats"}
+        lacking = either([words[kind] for kind in wanted])
+        held = " and ".join("a mesh" if kind == "mesh" else words[kind] for kind in source.kinds)
+        problem = f"has no {lacking}, only {held}, and cannot be written as {suffix or args.kind}"
+        remedy = f"Name OUT {names_for(source.kinds)}"
+        if "environment" in wanted and args.input.suffix.lower() == ".drgs":
+            remedy += ", or make the asset with the light of its capture: `drgs import ... --env`"
+        raise UsageError(str(args.input), problem, remedy)
     writer = find_writer(args.output, [args.kind] if args.kind else source.kinds)
     kind = writer.kind
     if writer.fixed and args.up not in (None, writer.up):
@@ -107,12 +113,14 @@ def convert(args: argparse.Namespace) -> None:
         print(f"{args.output}: {width} x {height} environment, {writer.name}")
     elif kind == "mesh":
         from ..build.make import scale_mesh
+        from ..formats.atlas import material_loss
         from ..formats.axes import vectors_from_z_up
 
         mesh = replace(source.mesh())
         scale_mesh(mesh, args.scale, str(args.output))
         writer.write(args.output, replace(mesh, vertices=vectors_from_z_up(mesh.vertices, up)))
         print(f"{args.output}: {len(mesh.faces)} triangles, {writer.name}, {up} up")
+        print(f"  {material_loss(mesh)}")
     else:
         from ..formats.splats import scaled, splats_from_z_up
 

@@ -107,7 +107,7 @@ class AssetSource:
         }
         self.kinds: tuple[Held, ...] = tuple(kind for kind, there in held.items() if there)
         if not self.kinds:
-            raise UsageError(str(args.input), "holds neither splats nor a mesh nor an environment", "Choose another")
+            raise UsageError(str(args.input), "has neither splats nor a mesh nor light", "Choose another file")
 
     def environment(self) -> Environment:
         """The light of the file."""

@@ -102,7 +102,7 @@ def denoise(args: argparse.Namespace) -> int:
     same_noise = False
     with FrameLines(openjd=args.openjd and len(frames)) as lines, bar(args, "frames", len(frames)) as progress:
         for done, number in enumerate(frames, 1):
-            lines.begin(number)
+            lines.begin(number, phase="Denoising")
             path, settings = frame_path(args.out, number), source.settings(number, args.passes)
             whole = None if args.overwrite else frame_store.read_complete(path)
             if whole is not None and whole[1].get(frame_store.SETTINGS) == settings:

@@ -6,12 +6,13 @@ Exit code 0 when rendering works, 69 when something essential is missing; each p
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.metadata
 import json
 import os
 import platform
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -27,18 +28,38 @@ EXAMPLES = """examples:
 
 #: Earlier versions have known holes that a damaged file can use.
 OPENEXR_MINIMUM = (3, 4, 10)
+#: Jobs of `compute.manifest` in words.
+_JOBS = {
+    "frame": "rendering",
+    "denoise": "denoising",
+    "hdr": ".hdr environments",
+    "lights": "lights",
+    "mattes": "Cryptomatte",
+    "mesh": "--camera-sees mesh",
+    "motion": "motion vectors",
+    "reconstruct": "reconstruction",
+    "simulate": "simulation",
+    "surfel rays": "--rays-see surfels",
+}
 _PACKAGE = "." if (Path(__file__).parents[2] / "pyproject.toml").is_file() else "drgs-blender"
 _REINSTALL = f"Install it again: pip install --upgrade {_PACKAGE}"
 
 
 @dataclass(slots=True)
 class Finding:
-    """The outcome of one check: ``state`` is "ok", "absent" (optional, not there) or "missing" (essential)."""
+    """The outcome of one check.
+
+    ``state`` is "ok", "none" (not there and not needed), "absent" (optional, not there) or "missing" (essential).
+    """
 
     name: str
     state: str
     detail: str
     remedy: str = ""
+
+
+class NotNeeded(Exception):
+    """Something is not there that rendering does without; (detail, remedy)."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,6 +92,8 @@ def check(name: str, essential: bool, test: Callable[[argparse.Namespace], str],
     state = "missing" if essential else "absent"
     try:
         return Finding(name, "ok", test(args))
+    except NotNeeded as reason:
+        return Finding(name, "none", *reason.args)
     except DrgsError as error:
         subject = "" if error.subject.lower() == name.lower() else f"{error.subject}: "
         return Finding(name, state, f"{subject}{error.problem}", error.remedy)
@@ -109,7 +132,8 @@ def kernels(args: argparse.Namespace) -> str:
 
     wanted, own = shipped.versions(), {"numba": numba.__version__, "llvmlite": importlib.metadata.version("llvmlite")}
     counts = prepare.count_kernels()
-    missing = f", {counts.missing} are compiled when needed" if counts.missing else ""
+    purposes = f", for {', '.join(_JOBS.get(job, job) for job in counts.jobs)}" if counts.jobs else ""
+    missing = f"; {counts.missing} are compiled when first needed{purposes}" if counts.missing else ""
     text = f"{targets.current()}, {counts.shipped + counts.compiled} ready ({counts.shipped} shipped){missing}"
     if wanted and wanted != own:
         other = " and ".join(f"{name} {version}" for name, version in wanted.items())
@@ -188,14 +212,35 @@ def variables(args: argparse.Namespace) -> str:
     )
 
 
-#: name, essential?, test
-def card(args: argparse.Namespace) -> str:
+def gpu(args: argparse.Namespace) -> str:
     """The graphics card that `--device cuda` uses."""
+    from ..compute.warp.runtime import cuda_devices, warp
     from ..render.gpu.select_backend import card
 
-    return card()
+    with _no_stderr():
+        try:
+            warp()
+        except DeviceError as error:
+            raise NotNeeded(f"{error.problem}; the CPU renders", error.remedy) from None
+        if not cuda_devices():
+            raise NotNeeded("no NVIDIA GPU found; the CPU renders", "If there is one, install or update its driver")
+        return card()
 
 
+@contextlib.contextmanager
+def _no_stderr() -> Iterator[None]:
+    """Without what libraries write to stderr: Warp's own code warns there of what the finding says."""
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+#: name, essential?, test
 CHECKS: tuple[tuple[str, bool, Callable[[argparse.Namespace], str]], ...] = (
     ("Python", True, python),
     ("Numba", True, numba),
@@ -207,7 +252,7 @@ CHECKS: tuple[tuple[str, bool, Callable[[argparse.Namespace], str]], ...] = (
     ("Blender", False, blender),
     ("scikit-image", False, scikit_image),
     ("torch", False, torch),
-    ("card", False, card),
+    ("GPU", False, gpu),
     ("variables", False, variables),
 )
 

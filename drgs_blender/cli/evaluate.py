@@ -20,7 +20,7 @@ from ..core.frame import Camera, Frame, ObjectState, RenderSettings, Visibility,
 from ..formats.axes import UP_AXES
 from . import sampling
 from .output import check_writable
-from .progress import FractionBar
+from .progress import WORK_SECONDS, FractionBar
 
 if TYPE_CHECKING:
     from ..engine.session import Session
@@ -34,7 +34,7 @@ EXAMPLES = """examples:
   drgs evaluate spot.drgs scenes/spot --json
   drgs evaluate lego.drgs TensoIR/lego --relit TensoIR/lego lights/city.hdr --relit TensoIR/lego lights/night.hdr
   drgs evaluate --make-scenes scenes
-  drgs evaluate --make-scenes scenes --objects spot fern --size 128 --train 40 --test 8 --samples 24
+  drgs evaluate --make-scenes scenes --objects spot fern --size 128 --train 40 --test 8 --spp 24
 """
 
 
@@ -119,10 +119,12 @@ def make(args: argparse.Namespace) -> int:
     script = Path(__file__).resolve().parents[1] / "evaluate" / "scene_job.py"
     command = find_blender(args.blender).command(script)
     meshes = args.meshes or CHECKOUT / "examples"
-    with FractionBar(args, "rendering") as bar:
-        folders = make_scenes(
-            args.make_scenes, plan, command, meshes, lambda done, of, name: bar(name, done / of), args.threads
-        )
+    with FractionBar(args, "rendering", every=WORK_SECONDS) as bar:
+
+        def report(done: int, of: int, name: str) -> None:
+            bar(f"{done} of {of} views, {name}", done / of)
+
+        folders = make_scenes(args.make_scenes, plan, command, meshes, report, args.threads)
     for folder in folders:
         print(folder)
     return 0
@@ -133,8 +135,10 @@ def plan_of(args: argparse.Namespace) -> Plan:
     from ..evaluate.scenes import SMALL, Plan
 
     given: dict[str, Any] = {
-        name: value for name in ("size", "train", "test", "samples") if (value := getattr(args, name)) is not None
+        name: value for name in ("size", "train", "test") if (value := getattr(args, name)) is not None
     }
+    if args.spp is not None:
+        given["samples"] = args.spp
     given |= {name: tuple(value) for name in ("objects", "lights") if (value := getattr(args, name)) is not None}
     return replace(SMALL if args.small else Plan(), **given)
 

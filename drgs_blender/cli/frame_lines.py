@@ -58,6 +58,7 @@ class FrameLines:
         self._ended = threading.Event()
         self._last = self._started = time.monotonic()
         self._doing = "Fra:- | Starting Blender"
+        self._samples = 0
 
     def __enter__(self) -> FrameLines:
         self._thread = threading.Thread(target=self._beat, daemon=True)
@@ -68,18 +69,23 @@ class FrameLines:
         self._ended.set()
         self._thread.join()
 
-    def begin(self, frame: int) -> None:
-        """A frame's description arrived."""
-        self._started = time.monotonic()
-        self._emit(f"Fra:{frame} | Rendering | Sample 0/100", doing=True)
+    def begin(self, frame: int, samples: int = 0, phase: str = "Rendering") -> None:
+        """A frame's description arrived; it takes `samples` samples per pixel, which 0 leaves out of the lines."""
+        self._started, self._samples = time.monotonic(), samples
+        self._emit(self._line(frame, phase, 0.0), doing=True)
 
     def progress(self, frame: int, phase: str, fraction: float) -> None:
         """Report the progress of a picture; most calls print nothing."""
         fraction = 0.0 if is_preparing(phase) else min(max(fraction, 0.0), 1.0)  # nothing of the picture is done
-        self._doing = f"Fra:{frame} | {phase.capitalize()} | Sample {int(100 * fraction)}/100"
+        self._doing = self._line(frame, phase.capitalize(), fraction)
         if time.monotonic() - self._last >= self._interval:
             self._emit(self._doing)
             self._report_to_openjd(fraction, f"frame {frame}, {phase}")
+
+    def _line(self, frame: int, phase: str, fraction: float) -> str:
+        """The line of a frame, with the samples per pixel that are done, as Blender writes it."""
+        samples = f" | Sample {round(fraction * self._samples)}/{self._samples}" if self._samples else ""
+        return f"Fra:{frame} | {phase}{samples}"
 
     def finished(self, frames: int) -> None:
         """Note that `frames` frames of the job are there, made or found."""

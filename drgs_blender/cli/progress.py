@@ -17,6 +17,8 @@ from .interrupt import interruptible
 
 #: Between two lines while kernels are compiled: for programs, and for people without a terminal.
 PROGRAM_SECONDS, PEOPLE_SECONDS = 0.5, 5.0
+#: Between two lines of work that takes minutes, for people without a terminal.
+WORK_SECONDS = 20.0
 
 
 def bar(args: argparse.Namespace, label: str, total: float | None = None, unit: str = "it", **options: Any) -> Any:
@@ -64,14 +66,18 @@ class FractionBar:
     label : str
     programs : bool
         While kernels are compiled, lines on stdout for a program that reads them, where that is no terminal.
+    every : float
+        Seconds between two lines on stderr during the work itself, for people without a terminal; 0: none, only those
+        of the time in which kernels are compiled.
     """
 
-    def __init__(self, args: argparse.Namespace, label: str, programs: bool = False) -> None:
+    def __init__(self, args: argparse.Namespace, label: str, programs: bool = False, every: float = 0.0) -> None:
         layout = "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
         self._bar = bar(args, label, total=1.0, bar_format=layout)
         self._counted = False
         self._for_programs = programs and not args.quiet and not sys.stdout.isatty()
         self._for_people = self._bar.disable and not args.quiet and args.progress is None
+        self._every = every
         self._next = 0.0
 
     def __enter__(self) -> FractionBar:
@@ -93,6 +99,9 @@ class FractionBar:
         self._bar.refresh()  # the clock goes on where nothing else does
         if is_preparing(phase):
             self._emit(phase, fraction)
+        elif self._for_people and self._every and time.monotonic() >= self._next:
+            self._next = time.monotonic() + self._every
+            emit(f"drgs: {phase}\n", sys.stderr)
 
     def _emit(self, phase: str, fraction: float) -> None:
         """Nothing else is heard for minutes where there is no bar."""

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--variant",
         choices=("p", "m"),
         default="p",
-        help="p keeps free surfels, for particles and for meshes (default); m hangs them on the mesh's faces",
+        help="p keeps free surfels, for particles and for meshes (default); m attaches them to the mesh's faces",
     )
     parser.add_argument(
         "--resolution", type=int_range(8, 1 << 16), metavar="N", help="pixels of the longer side; default: all"
@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--materials",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="pull materials and light apart; without, the albedo is the photographed colour",
+        help="separate materials from lighting; without, the albedo is the photographed colour",
     )
     parser.add_argument(
         "--device",

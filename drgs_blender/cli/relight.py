@@ -1,7 +1,8 @@
 """Render an asset under an environment, without Blender: a picture, or those of a simulation, from a camera in a file.
 
-The camera file holds matrix_world (4 rows of 4 numbers, camera to world, Blender's convention: looks down -Z, Y up),
-width, height, and fov_x in degrees or fx, fy, cx, cy in pixels; optionally orthographic, clip_start, clip_end.
+The camera file holds matrix_world (4 rows of 4 numbers, camera to world, metres: the world is Z up; the camera looks
+along its own -Z, its own Y is up), width, height, and fov_x in degrees or fx, fy, cx, cy in pixels; optionally
+orthographic, clip_start, clip_end. docs/command-line.md has a script that writes it in Blender.
 """
 
 from __future__ import annotations
@@ -46,13 +47,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs relight``."""
     parser.add_argument("asset", type=Path, metavar="ASSET", help=".drgs file")
     parser.add_argument("--camera", type=Path, required=True, metavar="CAMERA.json", help="camera")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="EXR frame, or PNG to look at")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FILE",
+        help="EXR frame (linear), or PNG to look at (sRGB, without Blender's view transform AgX)",
+    )  # fmt: skip
     light = parser.add_argument_group("light")
     light.add_argument("--env", type=Path, help="lat-long environment (EXR, HDR); default: the asset's own")
     light.add_argument(
         "--env-rotation", type=finite, default=0.0, metavar="DEG", help="Rotation Z of a World Mapping node, degrees"
     )
-    light.add_argument("--env-strength", type=finite, default=1.0, metavar="S", help="factor on the environment")
+    light.add_argument("--env-strength", type=finite, default=1.0, metavar="S", help="strength of the environment")
     pose = parser.add_argument_group("pose").add_mutually_exclusive_group()
     pose.add_argument("--cache", type=Path, metavar="CACHE", help="folder that `drgs simulate` wrote")
     pose.add_argument(
@@ -94,11 +98,17 @@ def run(args: argparse.Namespace) -> int:
         session = Session()
     key = session.load_asset(args.asset)
     world = World(read_environment(args, session.asset(key)), rotation_z(args.env_rotation), strength=args.env_strength)
-    for number, vertices in poses:
+    warned = False
+    for number, give_pose in poses:
+        vertices = give_pose()
+        shape = session.asset(key).mesh.vertices if vertices is None else vertices
+        if not warned and (size := size_around(camera.matrix_world[:3, 3], shape)) is not None:
+            logger.warning("the camera is inside %s (a box of %s m): move it back", args.asset.stem, size)
+            warned = True
         frame = Frame(
             noise_index=number,
             camera=camera,
-            objects=[ObjectState(name=args.asset.stem, asset=key, vertices=vertices(), tear=tear, grain=grain)],
+            objects=[ObjectState(name=args.asset.stem, asset=key, vertices=vertices, tear=tear, grain=grain)],
             world=world,
             settings=settings,
             passes=args.passes,
@@ -118,7 +128,26 @@ def run(args: argparse.Namespace) -> int:
 
             about = {"asset": digest_asset(key), "seed": str(settings.seed)}
             write_frame(path, picture, about | cryptomatte.metadata(frame))
+        height, width = picture["Combined"].shape[:2]
+        print(f"{path}: {width} x {height}, {settings.sample_count} samples")
     return 0
+
+
+def size_around(position: np.ndarray, vertices: np.ndarray) -> str | None:
+    """Size of the bounding box of `vertices` where `position` lies in it, such as "0.4 x 0.4 x 0.7"; otherwise None.
+
+    Parameters
+    ----------
+    position : (3,) float array
+        World space, metres.
+    vertices : (n, 3) float array
+        The same.
+    """
+    if not len(vertices):
+        return None
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    inside = bool(((low < position) & (position < high)).all())
+    return " x ".join(f"{side:.2g}" for side in high - low) if inside else None
 
 
 def _poses(
@@ -194,7 +223,7 @@ def read_environment(args: argparse.Namespace, asset: Asset) -> np.ndarray:
             logger.warning("%s: %s", args.env, note)
         return file.environment.radiance
     if asset.environment is None:
-        raise UsageError(str(args.asset), "holds no environment", "Give one with --env")
+        raise UsageError(str(args.asset), "has no captured light", "Give an environment with --env")
     return asset.environment.radiance
 
 

@@ -135,7 +135,7 @@ def render(args: argparse.Namespace, machine: Machine) -> int:
             ):
                 lines.skipped(path)
             else:
-                lines.begin(number)
+                lines.begin(number, picture.frame.settings.sample_count)
 
                 def report(phase: str, fraction: float, number: int = number) -> None:
                     lines.progress(number, phase, fraction)

@@ -1,4 +1,4 @@
-"""Options of the solution of a frame, shared by ``relight`` and ``render``."""
+"""Options of sampling and render, shared by ``relight`` and ``render``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def add_arguments(
     have no options.
     """
     settings, hints = RenderSettings(), get_type_hints(RenderSettings)
-    group = parser.add_argument_group("solution" if defaults else "solution (default: what the scene says)")
+    group = parser.add_argument_group("sampling and render" + ("" if defaults else " (default: what the scene says)"))
 
     def add(flag: str, field: str, about: str, **options: Any) -> None:
         default = samples if field == "samples" else getattr(settings, field)
@@ -35,12 +35,17 @@ def add_arguments(
     def choices(field: str) -> tuple[str, ...]:
         return get_args(hints[field])
 
-    add("--samples", "samples", "per pixel, divided among lights and lobes by the material", type=int_range(1, 65536))
+    add(
+        "--samples",
+        "samples",
+        "per pixel; shared among light, diffuse and glossy sampling by the material",
+        type=int_range(1, 65536),
+    )
     group.add_argument(
         "--strategy-samples",
         type=strategies,
         metavar="C,G,L",
-        help="samples per pixel by cosine, by GGX and towards lights, instead of --samples (the paper has 16,8,8)",
+        help="advanced: diffuse (cosine), glossy (GGX) and light samples, instead of --samples (the paper has 16,8,8)",
     )
     add("--bounces", "bounces", "indirect bounces", type=int_range(0, 64))
     add(
@@ -58,7 +63,7 @@ def add_arguments(
     add(
         "--subpixel-samples",
         "subpixel_samples",
-        "sub-pixel positions per pixel; samples are divided among them. 0: chosen by the number of samples",
+        "anti-aliasing positions per pixel, which share its samples; 0: chosen by the number of samples",
         type=int_range(0, 1024),
     )
     add(
@@ -76,7 +81,7 @@ def add_arguments(
     )
     add("--denoise", "denoise", "denoiser", choices=choices("denoise"))
     add("--shading-model", "shading_model", "reflection model", choices=choices("shading_model"))
-    add("--seed", "seed", "seed of the noise", type=int_range(0, 2**31 - 1))
+    add("--seed", "seed", "noise seed", type=int_range(0, 2**31 - 1))
     add("--device", "device", "device of the renderer: cpu or cuda; falls back to cpu", choices=choices("device"))
     add("--threads", "threads", "threads, 0 for all cores", type=int_range(0, 1024))
     if not output:

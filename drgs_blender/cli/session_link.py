@@ -111,7 +111,7 @@ def _wait_until_ended(folder: Path, seconds: float) -> bool:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of commands that a session can run."""
     parser.add_argument(
-        "--session", type=Path, metavar="FOLDER", help="run in the warm process of `drgs session start`"
+        "--session", type=Path, metavar="FOLDER", help="run in the process that `drgs session start` keeps running"
     )
     parser.add_argument("--openjd", action="store_true", help="report progress to an Open Job Description session")
 

@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--density", type=float, metavar="KG/M3", help="density")
     group.add_argument("--resolution", type=int, metavar="N", help="grid cells along the longest side; default 48")
     group.add_argument("--solver", metavar="NAME", help="mpm, xpbd for a quick look, or rigid")
-    group.add_argument("--device", metavar="NAME", help="cpu, or cuda: an NVIDIA card; without one the processor does")
+    group.add_argument("--device", metavar="NAME", help="device: cpu or cuda (an NVIDIA GPU); without one the CPU")
     group.add_argument("--gravity", type=_vector, metavar="X,Y,Z", help="m/s^2; default 0,0,-9.81")
     group.add_argument("--velocity", type=_vector, metavar="X,Y,Z", help="m/s, at the start")
     group.add_argument("--floor", type=float, metavar="Z", help="height of a floor, metres")

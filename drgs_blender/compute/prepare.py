@@ -113,26 +113,31 @@ class KernelCounts:
         Were compiled here.
     missing : int
         Are compiled when they are needed.
+    jobs : tuple of str
+        Jobs of `manifest.jobs` that need one of those.
     """
 
     shipped: int
     compiled: int
     missing: int
+    jobs: tuple[str, ...] = ()
 
 
 def count_kernels() -> KernelCounts:
     """Count the kernels of all jobs; those of packages that are not installed do not count."""
     codegen = target_codegen()
-    brought = compiled = missing = 0
-    for _, cache, signature in _known(manifest.needed(manifest.jobs())):
+    brought = compiled = 0
+    missing: set[Kernel] = set()
+    for kernel, cache, signature in _known(manifest.needed(manifest.jobs())):
         name = cache.file_name(signature, codegen)
         if name is not None and shipped.has(name):
             brought += 1
         elif cache.is_there(signature, codegen):
             compiled += 1
         else:
-            missing += 1
-    return KernelCounts(brought, compiled, missing)
+            missing.add(kernel)
+    jobs = tuple(job for job, kernels in manifest.jobs().items() if missing.intersection(kernels))
+    return KernelCounts(brought, compiled, len(missing), jobs)
 
 
 def processes(root: Path = _ROOT) -> int:

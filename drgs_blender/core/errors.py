@@ -40,7 +40,7 @@ class DrgsError(Exception):
     Parameters
     ----------
     subject : str
-        The file, object or setting the error is about.
+        The file, object or setting the error is about; "" where the problem is a sentence that names it.
     problem : str
         The problem.
     remedy : str
@@ -53,7 +53,8 @@ class DrgsError(Exception):
     def __init__(self, subject: str, problem: str, remedy: str | None = None) -> None:
         self.subject, self.problem = subject, problem
         self.remedy = self.usual_remedy if remedy is None else remedy
-        super().__init__(f"{subject}: {problem}." + (f" {self.remedy}." if self.remedy else ""))
+        said = f"{subject}: {problem}." if subject else f"{problem}."
+        super().__init__(said + (f" {self.remedy}." if self.remedy else ""))
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
         return type(self), (self.subject, self.problem, self.remedy)

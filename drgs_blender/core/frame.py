@@ -340,7 +340,7 @@ class RenderSettings:
     bounces : int
         Indirect bounces.
     subpixel_samples : int
-        Sub-pixel samples: places in a pixel among which its samples are divided; 0 chooses by their number
+        Sub-pixel samples: anti-aliasing positions per pixel, which share its samples; 0 chooses by their number
         (`subpixel_count`).
     camera_sees, rays_see : {"surfels", "mesh"}
         Representation of DR-GS objects for camera rays, and for shadow and indirect rays: their meshes, or the

@@ -74,13 +74,34 @@ def mesh_material(mesh: Mesh, subject: str) -> UniformMaterial | TexturedMateria
     values = np.concatenate([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], axis=1).clip(0, 1)
     if not np.isfinite(values).all():
         raise AssetError(subject, "would hold materials that are NaN", "Make the asset again")
-    used = values[np.unique(mesh.faces)]
-    if np.ptp(used, axis=0).max() < _SAME:
-        red, green, blue, roughness, metallic = np.median(used, axis=0).tolist()
+    if _is_uniform(values, mesh.faces):
+        red, green, blue, roughness, metallic = np.median(values[np.unique(mesh.faces)], axis=0).tolist()
         return UniformMaterial((red, green, blue), roughness, metallic)
     texels, uvs = bake_atlas(values[mesh.faces], subject)
     surface = np.insert(texels[..., 3:], 0, 0.0, axis=2)
     return TexturedMaterial(_png(linear_to_srgb(texels[..., :3])), _png(surface), uvs)
+
+
+def material_loss(mesh: Mesh) -> str:
+    """What becomes of the materials of a mesh that `mesh_material` takes, in a sentence for the user."""
+    values = np.concatenate([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], axis=1).clip(0, 1)
+    if _is_uniform(values, mesh.faces):
+        return "one material of one colour, without UV map or textures: those of the source are lost"
+    size = _side(len(mesh.faces))
+    return (
+        f"all materials joined into one, with a new UV map and textures of {size} x {size}: materials, UV maps and "
+        "textures of the source are lost"
+    )
+
+
+def _is_uniform(values: Array, faces: Array) -> bool:
+    """Whether the materials of the vertices of `faces` are one."""
+    return bool(np.ptp(values[np.unique(faces)], axis=0).max() < _SAME)
+
+
+def _side(count: int) -> int:
+    """Texels along the side of the texture of so many triangles."""
+    return CELL * int(np.ceil(np.sqrt(-(-count // 2))))
 
 
 def bake_atlas(corner_values: Array, subject: str) -> tuple[Array, Array]:
@@ -101,9 +122,8 @@ def bake_atlas(corner_values: Array, subject: str) -> tuple[Array, Array]:
         The origin at the upper left (glTF).
     """
     m, _, channels = corner_values.shape
-    squares = -(-m // 2)
-    across = int(np.ceil(np.sqrt(squares)))
-    size = across * CELL
+    size = _side(m)
+    across = size // CELL
     if size > _LARGEST:
         raise UsageError(subject, f"would need a texture {size} texels wide for {m} triangles", "Reduce the mesh first")
     square = np.arange(m) // 2

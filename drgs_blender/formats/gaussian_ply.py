@@ -30,6 +30,11 @@ SH_C0 = 0.28209479177387814
 FLAT = 0.3
 #: Largest SH degree in use has 16 coefficients; more is damage.
 SH_LIMIT = 64
+#: Noted of a file without materials.
+CAPTURED_ALBEDO = (
+    "albedo is the captured colour, with the light of the capture in it; `drgs import ... --env E.hdr --remove-light` "
+    "estimates it without that light"
+)
 
 
 def sigmoid(x: Array) -> Array:
@@ -276,7 +281,7 @@ def _albedo(layout: Layout, take: Callable[[tuple[str, ...]], Array], sh: Array 
     if sh is None:
         take(("f_dc_0", "f_dc_1", "f_dc_2"))  # names what is missing
         raise AssertionError("unreachable: without f_dc the line above raises")
-    notes.append("albedo is the captured colour (SH DC, decoded from sRGB), with the light of the capture in it")
+    notes.append(CAPTURED_ALBEDO)
     return srgb_to_linear(np.clip(0.5 + SH_C0 * sh[:, 0], 0.0, 1.0))
 
 

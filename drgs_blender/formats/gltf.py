@@ -34,7 +34,7 @@ def read_gltf(path: Path, pose: Pose = "rest") -> MeshFile:
     """Read the default scene of a glTF 2.0 file.
 
     Vertices are in the scene's space turned to Z up as Blender's importer does. Skinned meshes are posed, see
-    `gltf_nodes`; morph targets are left at rest. Vertices that the file splits at seams stay split.
+    `gltf_nodes`; shape keys (morph targets) are left at rest. Vertices that the file splits at seams stay split.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def _primitive(
     assert vertices is not None
     faces = _triangles(document, primitive, mode, len(vertices))
     if "targets" in primitive:
-        notes.append("morph targets left at rest")
+        notes.append("shape keys (morph targets) left at rest")
     material, uv_set = materials.use(document.index(primitive, "material"))
 
     def beside(name: str, *kinds: str) -> Array | None:

@@ -125,12 +125,31 @@ def find_writer(path: Path, kinds: Sequence[Held]) -> Writer:
     Raises
     ------
     UsageError
-        There is none; lists those of `kinds`.
+        There is none; lists the extensions of `kinds`.
     """
     suffix = path.suffix.lower()
-    able = [writer for kind in kinds for writer in WRITERS if writer.kind == kind]
-    for writer in able:
-        if suffix in writer.extensions:
-            return writer
-    names = "; ".join(f"{w.name} ({' '.join(w.extensions)})" for w in able)
-    raise UsageError(str(path), f"is no name under which {' or '.join(kinds)} can be written", f"Choose from {names}")
+    for kind in kinds:
+        for writer in WRITERS:
+            if writer.kind == kind and suffix in writer.extensions:
+                return writer
+    words = [WORDS[kind] for kind in kinds]
+    what = f"as {suffix}" if suffix else "without an extension"
+    raise UsageError(str(path), f"{either(words)} cannot be written {what}", f"Use {names_for(kinds)}")
+
+
+#: The kinds of data in messages.
+WORDS: dict[Held, str] = {"splats": "splats", "mesh": "meshes", "environment": "environments"}
+
+
+def names_for(kinds: Sequence[Held]) -> str:
+    """The extensions for data of these kinds, as ".glb or .usdz for meshes, .exr for environments"."""
+    found = []
+    for kind in kinds:
+        names = list(dict.fromkeys(e for w in WRITERS if w.kind == kind for e in w.extensions))
+        found.append(either(names) + (f" for {WORDS[kind]}" if len(kinds) > 1 else ""))
+    return ", ".join(found)
+
+
+def either(words: Sequence[str]) -> str:
+    """Words as "a, b or c"."""
+    return " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

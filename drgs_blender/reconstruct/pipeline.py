@@ -194,7 +194,7 @@ def reconstruct(
         elif settings.decoupling.normals:
             binding = shaded_by(binding, mesh, found.normals)
         _copy_materials(surfels, mesh, binding)
-        environment, origin = Environment(found.environment), "pulled apart from the light"
+        environment, origin = Environment(found.environment), "separated from the lighting"
     learned = [view.name for view in capture.training]
     provenance = {"capture": capture.name, "learned_from": learned, "variant": settings.variant, "materials": origin}
     return Asset(surfels, mesh, binding, environment, provenance | {"report": report})

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import json
+import re
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -54,6 +57,20 @@ def test_projection_equals_blenders(scene, kind, fit):
         flat = np.array([world_to_camera_view(scene, scene.camera, Vector(p)) for p in POINTS])
         expected = np.stack((flat[:, 0] * camera.width, (1 - flat[:, 1]) * camera.height), axis=1)
         np.testing.assert_allclose(project(camera, POINTS), expected, atol=1e-3, err_msg=f"{width} {shift} {aspect}")
+
+
+@pytest.mark.parametrize("size", [(64, 48), (48, 64)])
+def test_the_script_of_the_manual_writes_the_camera_for_relight(scene, tmp_path, size):
+    scene.render.resolution_x, scene.render.resolution_y = size
+    scene.camera.scale = (2, 2, 2)
+    camera = exported(scene)
+    manual = Path(__file__).parents[2] / "docs" / "command-line.md"
+    (code,) = (c for c in re.findall(r"```python\n(.*?)```", manual.read_text("utf-8"), re.S) if "fx" in c)
+    path = tmp_path / "front.json"
+    exec(code.replace("/tmp/front.json", path.as_posix()), {})
+    written = json.loads(path.read_text())
+    np.testing.assert_allclose(written["matrix_world"], camera.matrix_world, atol=1e-6)
+    assert (written["width"], written["height"]) == size and written["fx"] == pytest.approx(camera.fx, rel=1e-6)
 
 
 CASES = {

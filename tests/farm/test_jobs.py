@@ -212,15 +212,15 @@ def test_lines_are_those_that_workers_look_for(capsys):
     paths = ["/p/f/0001.exr", "/p/it's here/0002.exr", "/p/f/0003.exr"]
     with FrameLines(interval=0, openjd=3) as lines:
         for number, path in enumerate(paths, 1):
-            lines.begin(number)
-            lines.progress(number, "tracing", 0.5)
+            lines.begin(number, 16)
+            lines.progress(number, "rendering", 0.5)
             lines.skipped(path) if number == 3 else lines.saved(path)
             lines.finished(number)
     text = capsys.readouterr().out
     saved = [match[1] for line in text.splitlines() if (match := re.search("Saved: '(.*)'", line))]
     assert saved == paths[:2]
     assert "skipping existing frame '/p/f/0003.exr'" in text
-    assert re.findall(r"^Fra:.*Sample\s(\d+)\/(\d+)$", text, re.M) == [("0", "100"), ("50", "100")] * 3
+    assert re.findall(r"^Fra:.*Sample\s(\d+)\/(\d+)$", text, re.M) == [("0", "16"), ("8", "16")] * 3
     done = [float(number) for number in re.findall(r"^openjd_progress: (\d+\.\d)$", text, re.M)]
     assert done == [16.7, 33.3, 50.0, 66.7, 83.3, 100.0]
     assert not re.search("Error:|Exception:|Warning", text)

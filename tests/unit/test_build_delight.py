@@ -143,7 +143,9 @@ def test_what_is_lacking_is_said(capture: tuple[Asset, np.ndarray, np.ndarray]) 
         remove_light(Asset(asset.surfels, Mesh.empty()))
 
 
-def test_the_command_removes_the_light(capture: tuple[Asset, np.ndarray, np.ndarray], tmp_path: Path) -> None:
+def test_the_command_removes_the_light(
+    capture: tuple[Asset, np.ndarray, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     asset, truth, _ = capture
     write_splat_ply(tmp_path / "s.ply", splats_of(asset.surfels))
     write_exr_environment(tmp_path / "sky.exr", Environment(sky()))
@@ -158,3 +160,6 @@ def test_the_command_removes_the_light(capture: tuple[Asset, np.ndarray, np.ndar
     found = read_asset(out)
     assert np.median(np.abs(found.surfels.albedo - truth)) < 0.03
     assert found.provenance["materials"].startswith("estimated")
+    assert "--remove-light" not in capsys.readouterr().out  # it is done
+    assert main([*files, "--out", str(out)]) == 0
+    assert "albedo is the captured colour, with the light of the capture in it" in capsys.readouterr().out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from drgs_blender.cli import doctor
 from drgs_blender.cli.find_blender import find_blender
 from drgs_blender.cli.inspect_file import as_lines
 from drgs_blender.cli.main import main
+from drgs_blender.compute.warp import runtime
 from drgs_blender.core.asset.container import read_asset
 from drgs_blender.core.errors import DeviceError
 from drgs_blender.formats.gltf import read_gltf
@@ -267,6 +269,23 @@ def test_doctor_says_a_name_once(monkeypatch, capsys):
     monkeypatch.setattr(doctor, "CHECKS", [c for c in doctor.CHECKS if c[0] == "torch"])
     assert main(["doctor"]) == 0
     assert "absent   torch        is not installed\n" in capsys.readouterr().out
+
+
+def test_doctor_does_without_a_graphics_card(monkeypatch, capfd):
+    monkeypatch.setattr(doctor, "CHECKS", [c for c in doctor.CHECKS if c[0] == "GPU"])
+    warns = lambda: os.write(2, b"Warp CUDA warning\n")  # noqa: E731
+    monkeypatch.setattr(runtime, "warp", warns)
+    monkeypatch.setattr(runtime, "cuda_devices", list)
+    assert main(["doctor"]) == 0
+    found = capfd.readouterr()
+    assert found.out.startswith("none     GPU          no NVIDIA GPU found; the CPU renders\n") and not found.err
+
+    def absent():
+        raise DeviceError("device cuda", "the package warp-lang cannot be imported", "Install it")
+
+    monkeypatch.setattr(runtime, "warp", absent)
+    assert main(["doctor"]) == 0
+    assert "warp-lang cannot be imported; the CPU renders\n" in capfd.readouterr().out
 
 
 def test_doctor_looks_for_what_builds_meshes(capsys):

@@ -227,13 +227,13 @@ def test_unwritable_output_is_found_before_the_work(tmp_path):
 
 def test_farm_lines_parse_and_stay_benign(capsys):
     with FrameLines(interval=0) as lines:
-        lines.begin(12)
-        lines.progress(12, "tracing", 0.4)
+        lines.begin(12, 16)
+        lines.progress(12, "rendering", 0.63)
         lines.saved("out/0012.exr")
         lines.skipped("out/0013.exr")
     text = capsys.readouterr().out
     # What Deadline and Flamenco look for.
-    assert re.findall(r"^Fra:.*Sample\s(\d+)/(\d+)$", text, re.M) == [("0", "100"), ("40", "100")]
+    assert re.findall(r"^Fra:.*Sample\s(\d+)/(\d+)$", text, re.M) == [("0", "16"), ("10", "16")]
     assert re.search(r"^Saved: '(.+)'$", text, re.M)[1] == "out/0012.exr"
     assert re.search(r"Time: \d\d:\d\d\.\d\d$", text, re.M)
     assert "skipping existing frame" in text
@@ -245,11 +245,11 @@ def test_heartbeat_while_nothing_is_said(monkeypatch):
     monkeypatch.setattr(sys, "stdout", stream)
     monkeypatch.setattr(time, "time", lambda: 1 / 0)  # the clock of a node may be set back
     with FrameLines(heartbeat=0.05) as lines:
-        lines.begin(3)
+        lines.begin(3, 16)
         deadline = time.monotonic() + 10
         while stream.getvalue().count("Fra:3") < 3 and time.monotonic() < deadline:
             time.sleep(0.01)
-    assert stream.getvalue().count("Fra:3 | Rendering | Sample 0/100") >= 3
+    assert stream.getvalue().count("Fra:3 | Rendering | Sample 0/16") >= 3
 
 
 @pytest.mark.parametrize("length", [250, 300])

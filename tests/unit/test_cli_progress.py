@@ -55,6 +55,14 @@ def test_without_a_terminal_a_line_says_it_now_and_then(capsys, monkeypatch):
     assert capsys.readouterr().err.splitlines() == [f"drgs: {phase}" for phase, _ in COUNTED]
 
 
+def test_without_a_terminal_long_work_says_how_far_it_is(capsys):
+    for every, said in ((0.0, []), (60.0, ["drgs: 1 of 3 views"])):
+        with FractionBar(options(), "rendering", every=every) as bar:
+            for k in (1, 2, 3):
+                bar(f"{k} of 3 views", k / 3)
+        assert capsys.readouterr().err.splitlines() == said
+
+
 def test_programs_read_it_with_its_fraction(capsys, monkeypatch):
     monkeypatch.setattr(progress, "PROGRAM_SECONDS", 0.0)
     with FractionBar(options(progress=False), "preparing", programs=True) as bar:
@@ -70,11 +78,11 @@ def test_programs_read_it_with_its_fraction(capsys, monkeypatch):
 
 def test_farms_read_that_nothing_of_the_frame_is_done(capsys):
     with FrameLines(interval=0, openjd=2) as lines:
-        lines.begin(7)
+        lines.begin(7, 16)
         for phase, part in COUNTED:
             lines.progress(7, phase, part)
     out = capsys.readouterr().out
-    assert f"Fra:7 | {PREPARING}, 3 of 4 | Sample 0/100" in out
+    assert f"Fra:7 | {PREPARING}, 3 of 4 | Sample 0/16" in out
     assert set(re.findall(r"openjd_progress: ([\d.]+)", out)) == {"0.0"}
     assert f"openjd_status: frame 7, {PREPARING}, 3 of 4" in out
 

@@ -156,13 +156,24 @@ def test_mesh_and_surfels_show_the_same_object(relight):
     np.testing.assert_allclose(surfels, mesh, atol=0.02)
 
 
-def test_png_preview(folder, tmp_path):
+def test_png_preview(folder, tmp_path, capsys):
     out = tmp_path / "o.png"
     arguments = ["relight", str(folder / "lit.drgs"), "--camera", str(folder / "front.json"), "--out", str(out)]
     assert main([*arguments, "--samples", "4", "--transparent", "--camera-sees", "mesh"]) == 0
     with Image.open(out) as picture:
         assert (picture.size, picture.mode) == ((40, 30), "RGBA")
         assert picture.getpixel((0, 0)) == (0, 0, 0, 0) and picture.getpixel((20, 15))[3] == 255
+    assert capsys.readouterr() == (f"{out}: 40 x 30, 4 samples\n", "")
+
+
+def test_a_camera_inside_the_object_is_said_once(folder, relight, tmp_path, capsys):
+    matrix = [[1, 0, 0, 0], [0, 0, -1, -0.5], [0, 1, 0, 0], [0, 0, 0, 1]]
+    (tmp_path / "inside.json").write_text(json.dumps(FRONT | {"fov_x": 30, "matrix_world": matrix}))
+    relight("--camera", str(tmp_path / "inside.json"))
+    assert capsys.readouterr().err.count("the camera is inside lit (a box of 2 x 2 x 2 m): move it back") == 1
+    np.save(tmp_path / "far.npy", read_asset(folder / "lit.drgs").mesh.vertices + np.float32([0, 9, 0]))
+    relight("--camera", str(tmp_path / "inside.json"), "--vertices", str(tmp_path / "far.npy"))
+    assert "inside" not in capsys.readouterr().err.replace("inside.json", "")
 
 
 def write_exr(path: Path, pixels: np.ndarray) -> None:

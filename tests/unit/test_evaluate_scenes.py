@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import re
@@ -15,13 +16,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from drgs_blender.cli import evaluate
 from drgs_blender.cli.main import main
 from drgs_blender.core.asset import Asset, Environment, Mesh
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.color import srgb_to_linear
 from drgs_blender.core.errors import EXIT_USAGE, AssetError, DeviceError, EngineError, UsageError
 from drgs_blender.evaluate.compare import compare, posed_vertices, table
-from drgs_blender.evaluate.scenes import Plan, cameras, make_scenes
+from drgs_blender.evaluate.scenes import SMALL, Plan, cameras, make_scenes
 from drgs_blender.evaluate.subjects import OBJECTS, make_subject
 from drgs_blender.evaluate.truth import Truth, read_relit, read_truth, true_asset
 from drgs_blender.formats.exr import write_exr_environment
@@ -54,6 +56,14 @@ def test_help_says_what_scenes_are_made(capsys):
     assert f"which of {', '.join(OBJECTS)}; default all" in said and plan.objects == OBJECTS
     for option, value in (("size", plan.size), ("train", plan.train), ("test", plan.test), ("spp", plan.samples)):
         assert re.search(rf"--{option} N [^-]*; default {value}\b", said), option
+
+
+def test_samples_of_cycles_are_those_of_spp():
+    parser = argparse.ArgumentParser()
+    evaluate.add_arguments(parser)
+    plans = [evaluate.plan_of(parser.parse_args(["--make-scenes", "x", *more])) for more in ([], ["--spp", "24"])]
+    assert [plan.samples for plan in plans] == [Plan().samples, 24]
+    assert evaluate.plan_of(parser.parse_args(["--make-scenes", "x", "--small"])) == SMALL
 
 
 def test_cameras_stand_level_around_the_object_and_test_views_are_others():

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import struct
 import tracemalloc
+import zipfile
 import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from splat_files import covariance, old_spz, random_splats, refusals
@@ -392,7 +394,7 @@ def test_splats_that_are_y_up_stand_upright_in_an_asset(tmp_path: Path) -> None:
 def test_convert_names_what_it_cannot_write(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_splat_ply(tmp_path / "a.ply", random_splats(5))
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "a.xyz")]) == 64
-    assert "3DGS PLY (.ply); SPZ (.spz)" in capsys.readouterr().err
+    assert "a.xyz: splats cannot be written as .xyz. Use .ply, .spz, .sog, .glb," in capsys.readouterr().err
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "a.spz"), "--up", "z"]) == 64
     assert "SPZ is y up" in capsys.readouterr().err
     assert not (tmp_path / "a.spz").exists()
@@ -401,12 +403,34 @@ def test_convert_names_what_it_cannot_write(tmp_path: Path, capsys: pytest.Captu
 def test_convert_names_what_a_file_does_not_hold(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_asset(tmp_path / "a.drgs", asset_on_a_square())
     assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.exr")]) == 64
-    assert "a.drgs: holds no environment, but mesh, splats." in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "a.drgs: has no captured light, only a mesh and splats, and cannot be written as .exr. Name OUT .glb" in said
+    assert "`drgs import ... --env`" in said
     assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.xyz")]) == 64
-    assert "glTF mesh (.glb); USD mesh (.usdz); 3DGS PLY (.ply)" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "meshes or splats cannot be written as .xyz. Use .glb or .usdz for meshes, .ply, .spz, .sog" in said
     assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.glb")]) == 0
+    capsys.readouterr()
+    assert main(["convert", str(tmp_path / "a.glb"), str(tmp_path / "a.obj")]) == 64
+    assert "a.obj: meshes cannot be written as .obj. Use .glb or .usdz." in capsys.readouterr().err
     assert main(["convert", str(tmp_path / "a.glb"), str(tmp_path / "b.ply")]) == 64
-    assert "a.glb: holds no splats, but mesh." in capsys.readouterr().err
+    assert "a.glb: has no splats, only a mesh, and cannot be written as .ply." in capsys.readouterr().err
+
+
+def test_convert_says_what_becomes_of_materials(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asset = asset_on_a_square()
+    asset.mesh.albedo[:], asset.mesh.roughness[:], asset.mesh.metallic[:] = 0.5, 0.5, 0.0
+    write_asset(tmp_path / "a.drgs", asset)
+    assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.glb")]) == 0
+    assert "one material of one colour, without UV map" in capsys.readouterr().out
+    asset.mesh.albedo[0] = 0.1
+    write_asset(tmp_path / "a.drgs", asset)
+    assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.usdz")]) == 0
+    said = capsys.readouterr().out
+    assert "all materials joined into one, with a new UV map and textures of" in said
+    with zipfile.ZipFile(tmp_path / "a.usdz") as archive, archive.open("textures/color.png") as file:
+        width, height = Image.open(file).size
+    assert f"textures of {width} x {height}:" in said
 
 
 @pytest.mark.parametrize("suffix", ["ply", "spz", "sog", "glb"])

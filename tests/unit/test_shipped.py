@@ -148,8 +148,11 @@ def test_kernels_of_other_versions_or_targets_are_left_alone(release, compiled, 
     ("stock", "line"),
     [
         ((99, 0, 0), "99 ready (99 shipped)"),
-        ((90, 4, 5), "94 ready (90 shipped), 5 are compiled when needed"),
-        ((0, 0, 99), "0 ready (0 shipped), 99 are compiled when needed"),
+        (
+            (90, 4, 5, ("simulate", "new")),
+            "94 ready (90 shipped); 5 are compiled when first needed, for simulation, new",
+        ),
+        ((0, 0, 99), "0 ready (0 shipped); 99 are compiled when first needed"),
     ],
 )
 def test_doctor_counts_kernels(monkeypatch, tmp_path, stock, line):

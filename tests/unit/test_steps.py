@@ -17,6 +17,7 @@ from processes import all_gone
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
 
+import steps  # noqa: E402
 from steps import Line, Step, StepFailed, clock, counted, run_steps  # noqa: E402
 
 
@@ -28,9 +29,9 @@ def step(name: str, program: str, **options) -> Step:
 def run(tmp_path):
     """Function that runs steps; returns what was said, and the log."""
 
-    def together(*steps: Step) -> tuple[str, str]:
+    def together(*chosen: Step) -> tuple[str, str]:
         stream = io.StringIO()
-        run_steps(steps, tmp_path / "log.txt", tmp_path, {"DRGS_STEP": "here"}, stream)
+        run_steps(chosen, tmp_path / "log.txt", tmp_path, {"DRGS_STEP": "here"}, stream)
         return stream.getvalue(), (tmp_path / "log.txt").read_text()
 
     return together
@@ -142,13 +143,39 @@ def test_time_left_is_said_roughly():
     assert [clock(seconds) for seconds in (1, 12, 44, 95, 300)] == ["5 s", "10 s", "45 s", "2 min", "5 min"]
 
 
+def test_time_left_of_what_is_measured_is_not_said_before(monkeypatch):
+    """Until it begins, the time until then; of its first part nothing; then what the parts that are left take."""
+    now = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    first = step("first", "")
+    frames = step("frames", "", after=("first",), measured="rendering", count=counted)
+    last = step("last", "", after=("frames",))
+    job = steps._Run([first, frames, last], Path("log"), Path("."), {}, io.StringIO(), Line(io.StringIO()))
+    first.seconds, last.seconds = 60.0, 30.0
+    first.process, first.began = object(), now
+    now += 10.0
+    assert job._left() == "rendering begins in about 50 s"
+    job._done.add("first")
+    first.took, frames.process, frames.began = 60.0, object(), now
+    now += 40.0
+    assert job._left() == ""  # the program starts
+    job._count(frames, "0 of 4", 0.0)
+    now += 9.0
+    job._count(frames, "kernels", 0.0)  # it is still not at the first
+    now += 20.0
+    assert job._left() == ""
+    job._count(frames, "1 of 4", 0.25)
+    now += 5.0
+    assert job._left() == "about 85 s left"  # three of 20 s, less 5, and the last step
+
+
 @pytest.mark.slow
 def test_time_left_is_that_of_the_longest_row_of_steps(run):
     """Of steps side by side only the longer one counts, and what those before took tells the pace."""
     nothing = "import time; time.sleep(4)"
-    steps = [Step(name, name, [sys.executable, "-c", nothing], 2.0) for name in ("a", "b")]
-    steps += [Step("c", "c", [sys.executable, "-c", nothing], 20.0, after=("a",))]
-    steps += [Step("d", "d", [sys.executable, "-c", ""], 20.0, after=("c",))]
-    said, _ = run(*steps)
+    row = [Step(name, name, [sys.executable, "-c", nothing], 2.0) for name in ("a", "b")]
+    row += [Step("c", "c", [sys.executable, "-c", nothing], 20.0, after=("a",))]
+    row += [Step("d", "d", [sys.executable, "-c", ""], 20.0, after=("c",))]
+    said, _ = run(*row)
     left = re.search(r"2 of 4 done\. c; about (\d+) s left", said)
     assert left and 70 <= int(left[1]) <= 85  # twice as slow as they should be
