@@ -153,6 +153,8 @@ _RANGES = {
     "stretch": (1e-5, 1.0),
 }
 _NUMBERS = tuple(f.name for f in fields(Material) if f.name not in ("name", "model", "about"))
+#: Former name of a setting -> its name.
+RENAMED = {"young": "youngs_modulus"}
 
 
 def make_material(name: str, changes: Mapping[str, Any] | None = None, subject: str = "material") -> Material:
@@ -174,6 +176,8 @@ def make_material(name: str, changes: Mapping[str, Any] | None = None, subject: 
     checked: dict[str, float] = {}
     for key, value in (changes or {}).items():
         where = f"{subject}, {key}"
+        if key in RENAMED:
+            raise UsageError(where, f"is now {RENAMED[key]}", f"Write {RENAMED[key]}")
         if key not in _NUMBERS:
             raise UsageError(where, "is not a setting of a material", f"There are {', '.join(_NUMBERS)}")
         if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):

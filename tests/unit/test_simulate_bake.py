@@ -24,6 +24,7 @@ from drgs_blender.core.errors import AssetError, Cancelled, UsageError, WriteErr
 from drgs_blender.core.particle_cache import ParticleCache
 from drgs_blender.deform.attach import attach
 from drgs_blender.formats.usd_points import write_usd_points
+from drgs_blender.simulation import input_digest
 from drgs_blender.simulation.bake import bake
 from drgs_blender.simulation.job import prepare
 from drgs_blender.simulation.settings import parse_settings
@@ -215,6 +216,17 @@ def test_a_longer_bake_goes_on_also_where_things_move(tmp_path):
     swapped.groups = {"left": mesh.groups["another"], "another": mesh.groups["left"]}
     pins = parse_settings(DROP | {"pins": [{"group": "left"}]})
     assert prepare(swapped, pins).digest != prepare(mesh, pins).digest
+
+
+def test_the_digest_is_that_of_before_settings_were_renamed(monkeypatch):
+    """A bake that began when Young's modulus was called `young` goes on."""
+    monkeypatch.setattr(input_digest, "__version__", "0.1.0")
+    mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], np.ones((3, 3)), np.ones(3), np.ones(3))
+    mesh.groups["left"] = np.arange(2, dtype=np.int32)
+    metal = {"group": "left", "material": {"name": "metal", "youngs_modulus": 1e7}}
+    settings = parse_settings({"material": {"name": "jelly", "youngs_modulus": 2e4}, "regions": [metal]})
+    digest = input_digest.digest_of(mesh, settings, [], None)
+    assert digest == "534207947bffd29dba4777418cae7a0d01096cdc89d0938f9dfc9bb2e5fa43ec"
 
 
 @pytest.mark.parametrize(

@@ -216,6 +216,7 @@ def test_wild_deformation_stays_finite(name):
         ({"material": {"name": "jelly", "poisson": 0.5}}, "poisson: is 0.5.*0.49"),
         ({"material": {"name": "jelly", "youngs_modulus": 0}}, "youngs_modulus: is 0.*from 1 to"),
         ({"material": {"name": "jelly", "colour": 1}}, "colour: is not a setting"),
+        ({"material": {"name": "jelly", "young": 1e5}}, "material, young: is now youngs_modulus. Write youngs_modulus"),
         ({"resolution": 3}, "resolution: is 3.*from 4 to 400"),
         ({"gravity": [0, 1]}, "gravity.*three numbers"),
         ({"gravity": [0, 1, "nan"]}, "gravity.*three numbers"),
