@@ -127,7 +127,7 @@ def test_another_encoding_is_named(tmp_path, encoding, said):
 def test_latin_1_is_no_utf_8(tmp_path):
     path = tmp_path / "camera.json"
     path.write_text('{"Höhe": 1}', encoding="latin-1")
-    with pytest.raises(UsageError, match="is not UTF-8 text. Save it as UTF-8"):
+    with pytest.raises(UsageError, match=r"is not UTF-8 text\. Save it as UTF-8"):
         read_camera(path)
 
 
