@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..core.errors import UsageError
+from ..core.errors import UsageError, first_of
 from ..core.frame import Camera
+from ..core.json_values import excerpt, is_number, number_array
+from .json_file import read_json
 
 _KEYS = {"matrix_world", "width", "height", "fov_x", "fx", "fy", "cx", "cy", "orthographic", "clip_start", "clip_end"}
 LARGEST_SIDE = 65536
 #: Bytes; a camera is a few hundred.
 LARGEST_FILE = 1 << 20
+#: Horizontal field of view, degrees.
+_FOV_X = (1e-3, 179.999)
+#: Focal length, pixels (pixels per metre when orthographic).
+_FOCAL = (1e-6, 1e9)
+#: Largest magnitude of elements of the matrix, and of the principal point in pixels.
+_FAR = 1e9
+#: Clipping distances, metres; files of other programs have huge ones for "none".
+_CLIP = (1e-9, 1e30)
 
 
 def read_camera(path: str | Path) -> Camera:
@@ -43,6 +52,7 @@ def read_camera(path: str | Path) -> Camera:
     A field of view of 90 degrees is as wide as twice the focal length:
 
     >>> matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
+    >>> import json
     >>> text = json.dumps({"matrix_world": matrix, "width": 64, "height": 48, "fov_x": 90})
     >>> _ = Path("camera.json").write_text(text)
     >>> camera = read_camera("camera.json")
@@ -50,21 +60,11 @@ def read_camera(path: str | Path) -> Camera:
     (32.0, 32.0, 32.0, 24.0)
     """
     subject = f"camera {path}"
-    path = Path(path)
-    try:
-        size = path.stat().st_size
-        if not path.is_file() or size > LARGEST_FILE:
-            problem = f"has {size} bytes" if path.is_file() else "is not a regular file"
-            raise UsageError(subject, problem, "Choose a JSON file of a camera")
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(subject, f"cannot be read ({error.strerror})", "Check the path") from error
-    except (ValueError, RecursionError) as error:
-        raise UsageError(subject, f"is not JSON ({error})", "Choose a JSON file of a camera") from error
+    data = read_json(Path(path), subject, LARGEST_FILE, "a camera")
     if not isinstance(data, dict):
         raise UsageError(subject, "is not a JSON object", "Choose a JSON file of a camera")
     if unknown := sorted(set(data) - _KEYS):
-        raise UsageError(subject, f"has unknown keys {', '.join(unknown)}", f"The keys are {', '.join(sorted(_KEYS))}")
+        raise UsageError(subject, f"has unknown keys {first_of(unknown)}", f"The keys are {', '.join(sorted(_KEYS))}")
     return _Reader(subject, data).camera()
 
 
@@ -77,32 +77,28 @@ class _Reader:
     def fail(self, key: str, problem: str) -> UsageError:
         return UsageError(self.subject, f"{key} {problem}", "See `drgs relight --help`")
 
-    def number(self, key: str, default: float | None = None, low: float = -math.inf, high: float = math.inf) -> float:
+    def number(self, key: str, low: float, high: float, default: float | None = None) -> float:
         value = self.data.get(key, default)
         if value is None:
             raise self.fail(key, "is missing")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise self.fail(key, f"is {value!r}, not a finite number")
-        if not low < value < high:
-            raise self.fail(key, f"is {value:g}, outside {low:g} to {high:g}")
+        if not is_number(value, -math.inf, math.inf):
+            raise self.fail(key, f"is {excerpt(value, 40)}, not a number")
+        if not is_number(value, low, high):
+            raise self.fail(key, f"is {excerpt(value, 40)}; it must be from {low:.12g} to {high:.12g}")
         return float(value)
 
     def side(self, key: str) -> int:
-        value = self.number(key, low=0, high=LARGEST_SIDE + 1)
+        value = self.number(key, 1, LARGEST_SIDE)
         if value != int(value):
-            raise self.fail(key, f"is {value:g}, not a whole number of pixels")
+            raise self.fail(key, f"is {excerpt(self.data[key], 40)}, not a whole number of pixels")
         return int(value)
 
     def matrix(self, key: str) -> np.ndarray:
-        rows = self.data.get(key)
-        if rows is None:
+        if self.data.get(key) is None:
             raise self.fail(key, "is missing")
-        try:
-            matrix = np.array(rows, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise self.fail(key, "is not 4 rows of 4 numbers") from None
-        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-            raise self.fail(key, "is not 4 rows of 4 finite numbers")
+        matrix = number_array(self.data[key], (4, 4), _FAR)
+        if matrix is None:
+            raise self.fail(key, f"is not 4 rows of 4 numbers from {-_FAR:g} to {_FAR:g}")
         rotation = matrix[:3, :3]
         if not np.allclose(matrix[3], (0, 0, 0, 1)):
             raise self.fail(key, "does not end with the row 0 0 0 1 (is it transposed?)")
@@ -120,22 +116,24 @@ class _Reader:
                 raise self.fail("fov_x", f"and {clash[0]} exclude each other")
             if orthographic:
                 raise self.fail("fov_x", "means nothing to an orthographic camera; give fx and fy in pixels per metre")
-            fx = fy = 0.5 * width / math.tan(math.radians(self.number("fov_x", low=0, high=180)) / 2)
+            fx = fy = 0.5 * width / math.tan(math.radians(self.number("fov_x", *_FOV_X)) / 2)
         elif "fx" in self.data:
-            fx = self.number("fx", low=0)
-            fy = self.number("fy", fx, low=0)
+            fx = self.number("fx", *_FOCAL)
+            fy = self.number("fy", *_FOCAL, fx)
         else:
             raise self.fail("fov_x", "is missing, and so is fx")
-        clip_start = self.number("clip_start", 1e-3, low=0)
+        clip_start, clip_end = self.number("clip_start", *_CLIP, 1e-3), self.number("clip_end", *_CLIP, 1e6)
+        if clip_end <= clip_start:
+            raise self.fail("clip_end", f"is {clip_end:g}, not beyond clip_start, {clip_start:g}")
         return Camera(
             matrix_world=matrix,
             width=width,
             height=height,
             fx=fx,
             fy=fy,
-            cx=self.number("cx", width / 2),
-            cy=self.number("cy", height / 2),
+            cx=self.number("cx", -_FAR, _FAR, width / 2),
+            cy=self.number("cy", -_FAR, _FAR, height / 2),
             orthographic=orthographic,
             clip_start=clip_start,
-            clip_end=self.number("clip_end", 1e6, low=clip_start),
+            clip_end=clip_end,
         )

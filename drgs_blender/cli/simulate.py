@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import json
 import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +18,7 @@ from ..core.errors import UsageError
 from ..core.frame_sequences import frame_path
 from ..core.particle_cache import ParticleCache
 from .interrupt import interruptible
+from .json_file import read_json
 from .output import check_suffix, check_writable
 from .progress import FractionBar, clock, prepare_engine
 from .sampling import int_range
@@ -36,6 +36,8 @@ EXAMPLES = """examples:
 
 #: Time steps a frame from which a bake is slower than its settings let expect.
 _WARN_STEPS = 2000
+#: Bytes; rows of moving force fields are most of it.
+_LARGEST_SETTINGS = 1 << 28
 #: Options that are a number of the material.
 _MATTER = ("youngs_modulus", "poisson", "density")
 
@@ -146,29 +148,27 @@ def _settings(args: argparse.Namespace) -> Settings:
     data: dict[str, Any] = {}
     folder = Path()
     if args.settings:
-        try:
-            data = json.loads(args.settings.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            raise UsageError(str(args.settings), f"cannot be read as JSON ({error})", "Check the file") from error
+        data = read_json(args.settings, str(args.settings), _LARGEST_SETTINGS, "the settings of a simulation")
         folder = args.settings.parent
     if isinstance(data, dict):
         data = dict(data)
         changes = {name: getattr(args, name) for name in _MATTER if getattr(args, name) is not None}
         if args.material:
             data["material"] = args.material
-        if changes:
-            own = data.get("material", "jelly")
+        own = data.get("material", "jelly")
+        if changes and isinstance(own, str | dict):  # anything else is refused below
             data["material"] = ({"name": own} if isinstance(own, str) else own) | changes
         for name in ("resolution", "solver", "device", "gravity", "velocity", "floor", "fps"):
             if getattr(args, name) is not None:
                 data[name] = getattr(args, name)
-        if args.frames:
-            data["last"] = data.get("first", 1) + args.frames - 1
-        if args.pin:
-            data["pins"] = [*data.get("pins", []), *({"group": name} for name in args.pin)]
-        if args.collider:
+        first, pins, colliders = data.get("first", 1), data.get("pins", []), data.get("colliders", [])
+        if args.frames and isinstance(first, int):
+            data["last"] = first + args.frames - 1
+        if args.pin and isinstance(pins, list):
+            data["pins"] = [*pins, *({"group": name} for name in args.pin)]
+        if args.collider and isinstance(colliders, list):
             here = [{"mesh": str(Path(path).resolve())} for path in args.collider]
-            data["colliders"] = [*data.get("colliders", []), *here]
+            data["colliders"] = [*colliders, *here]
     return parse_settings(data, str(args.settings or "settings"), folder)
 
 

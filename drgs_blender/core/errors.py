@@ -6,6 +6,7 @@ The ``exit_code`` of a class is what ``drgs`` returns to the shell or the farm w
 from __future__ import annotations
 
 from collections.abc import Sequence
+from unicodedata import category
 
 EXIT_OK = 0
 EXIT_USAGE = 64
@@ -34,8 +35,23 @@ EXIT_CLASSES = {
 }
 
 
+def printable(text: str) -> str:
+    r"""A text with control, format and other characters that a terminal does not show as escape sequences.
+
+    Names of files and keys of JSON can have them. Letters of all languages, and spaces of all kinds, stay.
+
+    Examples
+    --------
+    >>> print(printable("Würfel\x1b[2J.drgs"))
+    Würfel\x1b[2J.drgs
+    """
+    return "".join(
+        c if c.isprintable() or category(c) == "Zs" else c.encode("unicode_escape").decode("ascii") for c in text
+    )
+
+
 class DrgsError(Exception):
-    """Base of every error meant for a user.
+    """Base of every error meant for a user. Its text is `printable`; its parts are as they were given.
 
     Parameters
     ----------
@@ -54,7 +70,7 @@ class DrgsError(Exception):
         self.subject, self.problem = subject, problem
         self.remedy = self.usual_remedy if remedy is None else remedy
         said = f"{subject}: {problem}." if subject else f"{problem}."
-        super().__init__(said + (f" {self.remedy}." if self.remedy else ""))
+        super().__init__(printable(said + (f" {self.remedy}." if self.remedy else "")))
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
         return type(self), (self.subject, self.problem, self.remedy)

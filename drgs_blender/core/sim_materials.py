@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .errors import UsageError
+from .json_values import excerpt, is_number
 
 Array = np.ndarray
 
@@ -140,12 +141,13 @@ _ROWS = (
 #: Name -> material.
 MATERIALS: dict[str, Material] = {row.name: row for row in _ROWS}
 
-#: Setting -> (lowest, highest) value that means anything; the others must only be finite.
+#: Setting -> (lowest, highest) value.
 _RANGES = {
     "youngs_modulus": (1.0, 1e12),
     "poisson": (0.0, 0.495),
     "density": (1e-2, 1e5),
     "yield_stress": (0.0, 1e12),
+    "hardening": (-1e12, 1e12),
     "viscosity": (0.0, 1e6),
     "friction_angle": (0.0, 89.0),
     "cohesion": (0.0, 1.0),
@@ -153,6 +155,8 @@ _RANGES = {
     "stretch": (1e-5, 1.0),
 }
 _NUMBERS = tuple(f.name for f in fields(Material) if f.name not in ("name", "model", "about"))
+#: Former name of a setting -> its name.
+RENAMED = {"young": "youngs_modulus"}
 
 
 def make_material(name: str, changes: Mapping[str, Any] | None = None, subject: str = "material") -> Material:
@@ -174,14 +178,16 @@ def make_material(name: str, changes: Mapping[str, Any] | None = None, subject: 
     checked: dict[str, float] = {}
     for key, value in (changes or {}).items():
         where = f"{subject}, {key}"
+        if key in RENAMED:
+            raise UsageError(where, f"is now {RENAMED[key]}", f"Write {RENAMED[key]}")
         if key not in _NUMBERS:
             raise UsageError(where, "is not a setting of a material", f"There are {', '.join(_NUMBERS)}")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-            raise UsageError(where, f"is {value!r}, not a finite number", "Give a number in SI units")
-        low, high = _RANGES.get(key, (-np.inf, np.inf))
-        if not low <= value <= high:
+        low, high = _RANGES[key]
+        if not is_number(value, -np.inf, np.inf):
+            raise UsageError(where, f"is {excerpt(value)}, not a number", "Give a number in SI units")
+        if not is_number(value, low, high):
             hint = " Nothing is quite incompressible; 0.49 looks the same" if key == "poisson" and value > high else ""
-            raise UsageError(where, f"is {value:g}", f"It must be from {low:g} to {high:g}.{hint}".rstrip("."))
+            raise UsageError(where, f"is {excerpt(value)}", f"It must be from {low:g} to {high:g}.{hint}".rstrip("."))
         checked[key] = float(value)
     return replace(MATERIALS[name], **checked)  # type: ignore[arg-type]
 

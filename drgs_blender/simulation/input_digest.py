@@ -10,15 +10,19 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
 from ..core.asset.model import Mesh
+from ..core.sim_materials import RENAMED
 from ..core.version import __version__
 from .colliders import Collider
 from .settings import Settings
 
 Array = np.ndarray
+#: Name of a setting -> the former one, which digests hash: caches of before stay valid.
+_FORMER = {new: old for old, new in RENAMED.items()}
 
 
 def digest_of(mesh: Mesh, settings: Settings, colliders: Sequence[Collider], motion: Array | None) -> str:
@@ -43,7 +47,8 @@ def digest_of(mesh: Mesh, settings: Settings, colliders: Sequence[Collider], mot
     described["moved"] = motion is not None
     parts = [*settings.pins, *(region for region, _ in settings.regions)]
     groups = sorted({part.group for part in parts if part.group is not None})
-    digest = hashlib.sha256(json.dumps([__version__, described, groups], sort_keys=True).encode())
+    hashed = [__version__, _with_former_names(described), groups]
+    digest = hashlib.sha256(json.dumps(hashed, sort_keys=True).encode())
     arrays = [mesh.vertices, mesh.faces, *(mesh.groups[name] for name in groups)]
     arrays += [a for c in colliders for a in (c.vertices[0], c.faces)]
     arrays += [] if motion is None else [motion[0]]
@@ -73,6 +78,15 @@ def moves_of(settings: Settings, colliders: Sequence[Collider], motion: Array | 
 def same_until(frame: int, one: Sequence[str], other: Sequence[str]) -> bool:
     """Whether two `moves_of` are of the same motion until `frame`, counted from 0."""
     return one[: frame + 1][-1:] == other[: frame + 1][-1:]
+
+
+def _with_former_names(described: Any) -> Any:
+    """The same settings, JSON-able, with the former name of each key that was renamed."""
+    if isinstance(described, dict):
+        return {_FORMER.get(key, key): _with_former_names(value) for key, value in described.items()}
+    if isinstance(described, list | tuple):
+        return [_with_former_names(value) for value in described]
+    return described
 
 
 def _bytes(array: Array) -> Array:

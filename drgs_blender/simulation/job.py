@@ -20,6 +20,7 @@ from ..deform.sources import MeshSource
 from ..formats.registry import read_mesh
 from .colliders import Collider, lift_surface
 from .contact import Plane
+from .fields import FAR
 from .fill import Filling, fill
 from .grid_blocks import Domain
 from .input_digest import digest_of, moves_of
@@ -134,9 +135,6 @@ class _PinMotion:
     """Pinned points that follow the animated mesh."""
 
     def __init__(self, mesh: Mesh, motion: Array, points: Array, matrix: Array) -> None:
-        if motion.ndim != 3 or motion.shape[1:] != mesh.vertices.shape:
-            expected = f"(frames, {len(mesh.vertices)}, 3)"
-            raise UsageError("motion", f"has shape {motion.shape}, expected {expected}", "Export it from this mesh")
         self.rows = motion
         self._matrix = matrix
         rest = motion[0] @ matrix[:3, :3].T + matrix[:3, 3]
@@ -175,6 +173,7 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
         raise AssetError(name, "has no size", "Choose a mesh with an interior")
     materials = [settings.material, *(material for _, material in settings.regions)]
     loose = [not m.keeps_shape for m in materials]
+    colliders, motion = _colliders(settings), _motion(settings, mesh)
     jitter = settings.jitter if settings.jitter is not None else (_JITTER if any(loose) else 0.0)
     filling = fill(vertices, faces, spacing / PER_CELL, jitter=jitter, seed=settings.seed, name=name)
     points = filling.points
@@ -217,18 +216,15 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
     carried = None
     if not rides:
         carried = _Carried(bind_points(vertices, points, space=filling.space, parts=filling.part))
-    colliders = _colliders(settings)
     solver = _solver(settings, body, spacing, vertices, colliders)
     solver.first = settings.first
-    motion = None
-    if settings.motion is not None and pinned.any():
-        motion = _PinMotion(mesh, _load(settings.motion), points[pinned], matrix)
+    pins = None if motion is None or not pinned.any() else _PinMotion(mesh, motion, points[pinned], matrix)
     log.info("%d particles, %d time steps a frame at least", len(points), solver.steps_of(1 / settings.fps))
-    moved = None if motion is None else motion.rows
+    moved = None if pins is None else pins.rows
     digest, moves = digest_of(mesh, settings, colliders, moved), moves_of(settings, colliders, moved)
     tear = max(m.gap for m in materials) * spacing / abs(float(np.linalg.det(matrix[:3, :3]))) ** (1 / 3)
     grain = min(m.grain for m in materials)
-    return Job(settings, filling, solver, digest, moves, tear, grain, spacing, vertices, carried, motion)
+    return Job(settings, filling, solver, digest, moves, tear, grain, spacing, vertices, carried, pins)
 
 
 def _has(names: Sequence[str]) -> str:
@@ -294,14 +290,30 @@ def _colliders(settings: Settings) -> list[Collider]:
     return found
 
 
+def _motion(settings: Settings, mesh: Mesh) -> Array | None:
+    """Vertices of the animated mesh, (frames, n, 3); None without."""
+    if settings.motion is None:
+        return None
+    motion = _load(settings.motion)
+    if motion.ndim != 3 or not len(motion) or motion.shape[1:] != mesh.vertices.shape:
+        expected = f"(frames, {len(mesh.vertices)}, 3)"
+        raise UsageError(
+            f"motion {settings.motion}", f"has shape {motion.shape}, expected {expected}", "Export it from this mesh"
+        )
+    return motion
+
+
 def _load(path: str) -> Array:
-    """Numbers of a .npy file."""
+    """Positions of a .npy file, metres."""
+    if Path(path).exists() and not Path(path).is_file():
+        raise UsageError(path, "is not a regular file", "Choose a .npy file")
     try:
         array = np.load(path, allow_pickle=False)
     except OSError as error:
         raise UsageError(path, f"cannot be read ({error.strerror or error})", "Check the path") from error
     except (ValueError, EOFError) as error:  # numpy's own words recommend pickle
         raise UsageError(path, "is no .npy file of numbers", "Save it with numpy.save") from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
-        raise UsageError(path, "does not hold finite numbers", "Save positions in metres with numpy.save")
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or not (np.abs(array) <= FAR).all():
+        problem = f"does not hold numbers from {-FAR:g} to {FAR:g}"
+        raise UsageError(path, problem, "Save positions in metres with numpy.save")
     return array.astype(np.float64)

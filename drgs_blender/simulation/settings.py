@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 
 from ..compute.warp.runtime import DEVICES
 from ..core.errors import UsageError
+from ..core.json_values import excerpt, is_number, number_array
 from ..core.sim_materials import Material, make_material
 from .contact import CONTACTS, Contact
 from .fields import FALLOFFS, FAR, KINDS, MOVING, SHAPES, SIDES, ForceField
@@ -21,6 +22,8 @@ Vector = tuple[float, float, float]
 
 SOLVERS = ("mpm", "xpbd", "rigid")
 WALLS = ("open", *CONTACTS)
+#: Largest component of velocities (m/s), of the spin (rad/s) and of gravity (m/s^2).
+_FASTEST = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,14 +149,12 @@ class _Reader:
         return list(self.data)
 
     def fail(self, key: str, expected: str) -> UsageError:
-        return UsageError(f"{self.subject}, {key}", f"is {json.dumps(self.data[key])[:80]}", f"Give {expected}")
+        return UsageError(f"{self.subject}, {key}", f"is {excerpt(self.data[key])}", f"Give {expected}")
 
-    def number(self, key: str, low: float = -np.inf, high: float = np.inf) -> float:
+    def number(self, key: str, low: float = -FAR, high: float = FAR) -> float:
         value = self.data[key]
-        good = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
-        if not good or not low <= value <= high:
-            bounds = f" from {low:g} to {high:g}" if np.isfinite(low) or np.isfinite(high) else ""
-            raise self.fail(key, f"a number{bounds}")
+        if not is_number(value, low, high):
+            raise self.fail(key, f"a number from {low:g} to {high:g}")
         return float(value)
 
     def integer(self, key: str, low: int, high: int) -> int:
@@ -162,32 +163,26 @@ class _Reader:
             raise self.fail(key, f"a whole number from {low} to {high}")
         return value
 
-    def vector(self, key: str) -> Vector:
-        try:
-            array = np.asarray(self.data[key], np.float64)
-        except (TypeError, ValueError):
-            array = np.empty(0)
-        if array.shape != (3,) or not np.isfinite(array).all():
-            raise self.fail(key, "three numbers")
+    def vector(self, key: str, limit: float = FAR) -> Vector:
+        array = number_array(self.data[key], (3,), limit)
+        if array is None:
+            raise self.fail(key, f"three numbers from {-limit:g} to {limit:g}")
         return (float(array[0]), float(array[1]), float(array[2]))
 
     def box(self, key: str) -> tuple[Vector, Vector]:
-        try:
-            array = np.asarray(self.data[key], np.float64)
-        except (TypeError, ValueError):
-            array = np.empty(0)
-        if array.shape != (2, 3) or not np.isfinite(array).all() or (array[0] >= array[1]).any():
-            raise self.fail(key, "two corners, [[x, y, z], [x, y, z]], the lower one first")
+        array = number_array(self.data[key], (2, 3), FAR)
+        if array is None or (array[0] >= array[1]).any():
+            expected = "two corners, [[x, y, z], [x, y, z]], the lower one first"
+            raise self.fail(key, f"{expected}, in metres from {-FAR:g} to {FAR:g}")
         low, high = array.tolist()
         return tuple(low), tuple(high)
 
     def matrix(self, key: str) -> tuple[tuple[float, ...], ...]:
-        try:
-            array = np.asarray(self.data[key], np.float64)
-        except (TypeError, ValueError):
-            array = np.empty(0)
-        if array.shape != (4, 4) or not np.isfinite(array).all() or abs(np.linalg.det(array[:3, :3])) < 1e-12:
-            raise self.fail(key, "four rows of four numbers that can be inverted")
+        array = number_array(self.data[key], (4, 4), FAR)
+        if array is None or abs(np.linalg.det(array[:3, :3])) < 1e-12:
+            raise self.fail(key, f"four rows of four numbers from {-FAR:g} to {FAR:g} that can be inverted")
+        if not np.allclose(array[3], (0, 0, 0, 1)):
+            raise self.fail(key, "a matrix whose last row is 0 0 0 1 (is it transposed?)")
         return tuple(tuple(row) for row in array.tolist())
 
     def choice(self, key: str, among: tuple[str, ...]) -> Any:
@@ -201,7 +196,14 @@ class _Reader:
         return self.data[key]
 
     def path(self, key: str) -> str:
-        return str(self.folder / self.text(key))
+        text = self.text(key)
+        try:
+            possible = b"\0" not in os.fsencode(text)
+        except UnicodeEncodeError:  # half of a surrogate pair
+            possible = False
+        if not possible:
+            raise self.fail(key, "the path of a file")
+        return str(self.folder / text)
 
     def optional(self, key: str, read: Any) -> Any:
         return None if self.data[key] is None else read(key)
@@ -235,12 +237,9 @@ class _Reader:
         return region, self.material("material")
 
     def rows(self, key: str, columns: int) -> tuple[tuple[float, ...], ...]:
-        try:
-            array = np.asarray(self.data[key], np.float64)
-        except (TypeError, ValueError):
-            array = np.empty(0)
-        if array.ndim != 2 or array.shape[1] != columns or not len(array) or not np.isfinite(array).all():
-            raise self.fail(key, f"rows of {columns} numbers")
+        array = number_array(self.data[key], (None, columns), FAR)
+        if array is None:
+            raise self.fail(key, f"rows of {columns} numbers from {-FAR:g} to {FAR:g}")
         return tuple(tuple(row) for row in array.tolist())
 
     def force_field(self) -> ForceField:
@@ -276,13 +275,13 @@ _KEYS: dict[str, Any] = {
     "regions": lambda r, k: tuple(i.region_of_matter() for i in r.items(k)),
     "resolution": lambda r, k: r.integer(k, 4, 400),
     "solver": lambda r, k: r.choice(k, SOLVERS),
-    "gravity": lambda r, k: r.vector(k),
-    "wind": lambda r, k: r.vector(k),
+    "gravity": lambda r, k: r.vector(k, _FASTEST),
+    "wind": lambda r, k: r.vector(k, _FASTEST),
     "drag": lambda r, k: r.number(k, 0, 1e4),
     "damping": lambda r, k: r.number(k, 0, 1e4),
     "fields": lambda r, k: tuple(i.force_field() for i in r.items(k)),
-    "velocity": lambda r, k: r.vector(k),
-    "spin": lambda r, k: r.vector(k),
+    "velocity": lambda r, k: r.vector(k, _FASTEST),
+    "spin": lambda r, k: r.vector(k, _FASTEST),
     "pins": lambda r, k: tuple(i.region() for i in r.items(k)),
     "motion": lambda r, k: r.optional(k, r.path),
     "colliders": lambda r, k: tuple(i.obstacle() for i in r.items(k)),

@@ -66,13 +66,25 @@ def test_numerical_noise_of_an_exporter_is_accepted(write):
         ({"width": ...}, "width is missing"),
         ({"width": 0}, "width is 0"),
         ({"width": 10.5}, "width is 10.5"),
-        ({"width": True}, "width is True"),
-        ({"height": "480"}, "height is '480'"),
+        ({"width": True}, "width is true, not a number"),
+        ({"height": "480"}, 'height is "480", not a number'),
+        ({"width": 10**400}, r"width is 10+\.\.\.; it must be from 1 to 65536"),
+        ({"fov_x": 10**400}, r"fov_x is 10+\.\.\.; it must be from 0\.001 to 179\.999"),
+        ({"fov_x": 5e-324}, r"fov_x is 5e-324; it must be from 0\.001"),
+        ({"fov_x": 179.99999999999997}, r"fov_x is 179\.99999999999997; it must be from 0\.001 to 179\.999"),
+        ({"matrix_world": [[10**400, 0, 0, 0], *np.eye(4).tolist()[1:]]}, "matrix_world is not 4 rows of 4 numbers"),
+        ({"matrix_world": [[1, 0, 0, 1e300], *np.eye(4).tolist()[1:]]}, r"4 numbers from -1e\+09 to 1e\+09"),
+        ({"matrix_world": [["1", 0, 0, 0], *np.eye(4).tolist()[1:]]}, "matrix_world is not 4 rows"),
+        ({"matrix_world": [[True, 0, 0, 0], *np.eye(4).tolist()[1:]]}, "matrix_world is not 4 rows"),
+        ({"cx": 1e300}, r"cx is 1e\+300; it must be from -1000000000 to 1000000000"),
+        ({"fov_x": ..., "fx": 1e308}, r"fx is 1e\+308; it must be"),
+        ({"fov_x": ..., "fx": 5e-324}, "fx is 5e-324; it must be"),
+        ({"clip_end": math.inf}, "clip_end is Infinity; it must be"),
         ({"height": 1_000_000}, "height"),
         ({"fov_x": ...}, "fov_x is missing, and so is fx"),
         ({"fov_x": 180}, "fov_x is 180"),
         ({"fov_x": -1}, "fov_x is -1"),
-        ({"fov_x": float("nan")}, "fov_x is nan"),
+        ({"fov_x": float("nan")}, "fov_x is NaN, not a number"),
         ({"fx": 500}, "fov_x and fx"),
         ({"orthographic": True}, "fov_x means nothing"),
         ({"orthographic": 1}, "orthographic is not"),
@@ -92,6 +104,30 @@ def test_not_a_camera_at_all(tmp_path, text):
     path = tmp_path / "camera.json"
     path.write_bytes(text.encode("latin1"))
     with pytest.raises(UsageError, match=r"camera\.json"):
+        read_camera(path)
+
+
+def test_a_byte_order_mark_is_read(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(GOOD), encoding="utf-8-sig")
+    assert read_camera(path).width == 640
+
+
+@pytest.mark.parametrize(
+    ("encoding", "said"),
+    [("utf-16", "is UTF-16 text. Save it as UTF-8"), ("utf-16-le", "is UTF-16 text"), ("utf-16-be", "is UTF-16 text")],
+)
+def test_another_encoding_is_named(tmp_path, encoding, said):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(GOOD), encoding=encoding)
+    with pytest.raises(UsageError, match=said):
+        read_camera(path)
+
+
+def test_latin_1_is_no_utf_8(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text('{"Höhe": 1}', encoding="latin-1")
+    with pytest.raises(UsageError, match=r"is not UTF-8 text\. Save it as UTF-8"):
         read_camera(path)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pickle
 
+import pytest
+
 from drgs_blender.core.errors import ERROR_CLASSES, AssetError, UsageError
 
 
@@ -24,3 +26,19 @@ def test_errors_cross_processes_whole():
         again = pickle.loads(pickle.dumps(error))
         assert (type(again), again.subject, again.problem, again.remedy) == (kind, "cube", "is flat", "Scale it")
     assert pickle.loads(pickle.dumps(UsageError("cube", "is flat"))).remedy == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("a\x1b[31m\x07.drgs", r"a\x1b[31m\x07.drgs"),
+        ("a\r\nDRGS_EXIT class=ok", r"a\r\nDRGS_EXIT class=ok"),
+        ("a\x9b2J\u202egpj\u2028.drgs", r"a\x9b2J\u202egpj\u2028.drgs"),
+        ("a\udcff.drgs", r"a\udcff.drgs"),
+        ("Würfel \u3000立方体 \xa0é C:\\new.drgs", "Würfel \u3000立方体 \xa0é C:\\new.drgs"),
+    ],
+)
+def test_a_terminal_shows_what_it_would_obey(name, said):
+    error = UsageError(name, f"has key {name}", f"Rename {name}")
+    assert str(error) == f"{said}: has key {said}. Rename {said}."
+    assert (error.subject, str(pickle.loads(pickle.dumps(error)))) == (name, str(error)), "the text alone is escaped"

@@ -228,6 +228,12 @@ def test_black_worlds_are_black() -> None:
         assert not light.lookup([[0, 0, 1]]).any() and not light.pdf([[0, 0, 1]]).any()
 
 
+@pytest.mark.parametrize("strength", [-1.0, 1e39])
+def test_a_strength_that_no_light_has_is_named_and_not_the_pixels(strength: float) -> None:
+    with pytest.raises(UsageError, match=r"environment: its strength is .*must be from 0 to 1e\+06"):
+        EnvironmentLight(World(strength=strength))
+
+
 def test_a_world_that_is_no_world_is_refused() -> None:
     with pytest.raises(UsageError, match="not finite"):
         EnvironmentLight(World(strength=float("nan")))

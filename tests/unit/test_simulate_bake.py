@@ -24,6 +24,7 @@ from drgs_blender.core.errors import AssetError, Cancelled, UsageError, WriteErr
 from drgs_blender.core.particle_cache import ParticleCache
 from drgs_blender.deform.attach import attach
 from drgs_blender.formats.usd_points import write_usd_points
+from drgs_blender.simulation import input_digest
 from drgs_blender.simulation.bake import bake
 from drgs_blender.simulation.job import prepare
 from drgs_blender.simulation.settings import parse_settings
@@ -217,6 +218,17 @@ def test_a_longer_bake_goes_on_also_where_things_move(tmp_path):
     assert prepare(swapped, pins).digest != prepare(mesh, pins).digest
 
 
+def test_the_digest_is_that_of_before_settings_were_renamed(monkeypatch):
+    """A bake that began when Young's modulus was called `young` goes on."""
+    monkeypatch.setattr(input_digest, "__version__", "0.1.0")
+    mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], np.ones((3, 3)), np.ones(3), np.ones(3))
+    mesh.groups["left"] = np.arange(2, dtype=np.int32)
+    metal = {"group": "left", "material": {"name": "metal", "youngs_modulus": 1e7}}
+    settings = parse_settings({"material": {"name": "jelly", "youngs_modulus": 2e4}, "regions": [metal]})
+    digest = input_digest.digest_of(mesh, settings, [], None)
+    assert digest == "534207947bffd29dba4777418cae7a0d01096cdc89d0938f9dfc9bb2e5fa43ec"
+
+
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
@@ -224,12 +236,19 @@ def test_a_longer_bake_goes_on_also_where_things_move(tmp_path):
         ({"pins": [{"group": "nobody"}]}, r"pin 1, group 'nobody': contains no particle"),
         ({"colliders": [{"mesh": "box.ply", "vertices": "few.npy"}]}, r"box.ply: has 2 vertices in its anim.*need 8"),
         ({"colliders": [{"mesh": "box.ply", "vertices": "text.npy"}]}, r"text.npy: is no .npy file(?!.*pickle)"),
+        ({"colliders": [{"mesh": "box.ply", "vertices": "far.npy"}]}, r"far.npy: does not hold numbers from -1e\+09"),
+        ({"motion": "folder"}, r"folder: is not a regular file"),
+        ({"motion": "text.npy"}, r"text.npy: is no .npy file"),
+        ({"motion": "few.npy"}, r"motion .*few.npy: has shape \(3, 2, 3\), expected \(frames, "),
+        ({"motion": "none.npy"}, r"none.npy: cannot be read"),
     ],
 )
 def test_what_cannot_be_simulated_is_named_with_the_remedy(tmp_path, settings, named):
     trimesh.creation.box((9, 9, 1)).export(tmp_path / "box.ply")
     np.save(tmp_path / "few.npy", np.zeros((3, 2, 3)))
+    np.save(tmp_path / "far.npy", np.full((3, 8, 3), 1e300))
     (tmp_path / "text.npy").write_text("hello")
+    (tmp_path / "folder").mkdir()
     mesh = block()
     mesh.groups["nobody"] = np.empty(0, np.int32)
     with pytest.raises((UsageError, AssetError), match=named):
@@ -418,6 +437,43 @@ def test_options_of_the_command_win_over_the_file(tmp_path, capsys):
     assert settings["gravity"] == [-1, 0, -2] and settings["last"] == 2 and settings["pins"][0]["group"] == "left"
     assert main([*command, "--poisson", "0.6"]) == 64
     assert "poisson: is 0.6" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "named"),
+    [
+        ('{"material": 5}', ["--youngs-modulus", "1e5"], "material: is 5. Give a name"),
+        ('{"material": null}', ["--youngs-modulus", "1e5"], "material: is null. Give a name"),
+        ('{"material": ["a"]}', ["--youngs-modulus", "1e5"], 'material: is ["a"]. Give a name'),
+        ('{"first": "a"}', ["--frames", "1"], 'first: is "a". Give a whole number'),
+        ('{"first": null}', ["--frames", "1"], "first: is null. Give a whole number"),
+        ('{"pins": 5}', ["--pin", "g"], "pins: is 5. Give a list"),
+        ('{"pins": null}', ["--pin", "g"], "pins: is null. Give a list"),
+        ('{"pins": "g"}', ["--pin", "g"], 'pins: is "g". Give a list'),
+        ('{"pins": {"group": "g"}}', ["--pin", "g"], "Give a list"),
+        ('{"colliders": "a.obj"}', ["--collider", "b.obj"], "Give a list"),
+        ("{}", ["--velocity", "1e300,0,0"], "velocity: is [1e+300, 0.0, 0.0]. Give three numbers"),
+        ("\ufeff[]", [], "is not a JSON object"),
+        (json.dumps(DROP).encode("utf-16"), [], "s.json: is UTF-16 text. Save it as UTF-8"),
+    ],
+)
+def test_settings_and_options_that_do_not_fit_are_named(tmp_path, capsys, text, options, named):
+    (tmp_path / "s.json").write_bytes(text if isinstance(text, bytes) else text.encode())
+    command = ["simulate", "cube.drgs", "--out", str(tmp_path / "c"), "--settings", str(tmp_path / "s.json")]
+    assert main([*command, "--resolution", "6", *options]) == 64
+    assert named in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes are no files there")
+@pytest.mark.parametrize("kind", ["fifo", "device"])
+def test_settings_are_read_of_regular_files_alone(tmp_path, capsys, kind):
+    path = tmp_path / "s.json"
+    if kind == "fifo":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero")
+    assert main(["simulate", "cube.drgs", "--out", str(tmp_path / "c"), "--settings", str(path)]) == 64
+    assert "s.json: is not a regular file" in capsys.readouterr().err
 
 
 def test_a_frame_that_goes_away_while_it_is_read_is_not_baked(tmp_path, monkeypatch):

@@ -209,6 +209,10 @@ def test_wild_deformation_stays_finite(name):
         assert np.isfinite(tau).all() and np.isfinite(left).all() and math.isfinite(memory)
 
 
+#: An integer that no float holds.
+LONG = 10**340
+
+
 @pytest.mark.parametrize(
     ("data", "said"),
     [
@@ -216,6 +220,7 @@ def test_wild_deformation_stays_finite(name):
         ({"material": {"name": "jelly", "poisson": 0.5}}, "poisson: is 0.5.*0.49"),
         ({"material": {"name": "jelly", "youngs_modulus": 0}}, "youngs_modulus: is 0.*from 1 to"),
         ({"material": {"name": "jelly", "colour": 1}}, "colour: is not a setting"),
+        ({"material": {"name": "jelly", "young": 1e5}}, "material, young: is now youngs_modulus. Write youngs_modulus"),
         ({"resolution": 3}, "resolution: is 3.*from 4 to 400"),
         ({"gravity": [0, 1]}, "gravity.*three numbers"),
         ({"gravity": [0, 1, "nan"]}, "gravity.*three numbers"),
@@ -227,8 +232,28 @@ def test_wild_deformation_stays_finite(name):
         ({"first": 5, "last": 4}, "ends at frame 4"),
         ({"matrix_world": [[0] * 4] * 4}, "can be inverted"),
         ([], "not a JSON object"),
+        ({"material": {"name": "jelly", "density": LONG}}, r"density: is 10+\.\.\."),
+        ({"material": {"name": "jelly", "hardening": 1e300}}, r"hardening: is 1e\+300"),
+        ({"fps": LONG}, r"fps: is 10+\.\.\.\. Give a number from 0.1 to 10000"),
+        ({"floor": 1e300}, "floor: is 1e.*from -1e"),
+        ({"gravity": [LONG, 0, 0]}, "gravity: is .*three numbers from -1e"),
+        ({"gravity": [0, 0, 1e308]}, "gravity: is .*three numbers from -1e"),
+        ({"gravity": ["1", 0, 0]}, "gravity: is .*three numbers"),
+        ({"gravity": [True, 0, 0]}, "gravity: is .*three numbers"),
+        ({"velocity": [1e300, 0, 0]}, "velocity: is .*three numbers"),
+        ({"pins": [{"box": [[LONG, 0, 0], [1, 1, 1]]}]}, "pins 1, box: is .*two corners"),
+        ({"domain": [[-1e300] * 3, [1e300] * 3]}, "domain: is .*two corners.*metres from -1e"),
+        ({"fields": [{"kind": "wind", "frames": [[LONG] * 8]}]}, "fields 1, frames: is .*rows of 8 numbers"),
+        ({"fields": [{"kind": "wind", "strength": 1e308}]}, "fields 1, strength: is 1e"),
+        ({"matrix_world": [[1e200, 0, 0, 0], [0, 1e200, 0, 0], [0, 0, 1e200, 0], [0, 0, 0, 1]]}, "can be inverted"),
+        ({"matrix_world": [[LONG, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "matrix_world: is"),
+        ({"matrix_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [5, 5, 5, 0]]}, "last row is 0 0 0 1"),
+        ({"colliders": [{"mesh": "a\0b.obj"}]}, "colliders 1, mesh: is .*the path of a file"),
+        ({"colliders": [{"mesh": "a\ud800.obj"}]}, "colliders 1, mesh: is .*the path of a file"),
+        ({"motion": "\0"}, "motion: is .*the path of a file"),
     ],
 )
+@pytest.mark.filterwarnings("error")
 def test_settings_that_cannot_be_are_named(data, said):
     with pytest.raises(UsageError, match=said):
         parse_settings(data)

@@ -26,6 +26,8 @@ Array = np.ndarray
 
 #: Radiance above this is cut: its square is still a float32.
 BRIGHTEST = np.float32(1e15)
+#: Largest strength of an environment, that of Blender's Background node.
+STRONGEST = 1e6
 
 #: A constant world as a picture: fine enough to be sampled as a surface faces it.
 _CONSTANT = (16, 32, 3)
@@ -125,6 +127,10 @@ class EnvironmentLight:
         tint = np.asarray(world.colour, np.float64) * float(world.strength)
         if not (np.isfinite(rotation).all() and np.isfinite(tint).all()):
             raise UsageError("world", "has a colour, strength or rotation that is not finite", "Check its settings")
+        if not 0.0 <= world.strength <= STRONGEST:
+            raise UsageError(
+                "environment", f"its strength is {world.strength:g}", f"The strength must be from 0 to {STRONGEST:g}"
+            )
         self.texels = np.zeros((*image.shape[:2], 4), np.float32)
         found = np.zeros((len(image), 3))
         with np.errstate(over="ignore"):
