@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import importlib
 import io
 import logging
@@ -16,11 +17,13 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NoReturn
+from pathlib import Path
+from typing import Any, NoReturn
 
 from ..core import errors
 from ..core.version import __version__
 from .frame_lines import emit, emit_exit_class
+from .output import file_name
 
 logger = logging.getLogger(__name__)
 
@@ -60,10 +63,28 @@ _SIGNED = ("--up", "--from-up", "--frames", "--sequence", "--gravity", "--veloci
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors end with exit code 64, as farms expect, and not 2."""
+    """An argument parser whose errors end with exit code 64, as farms expect, and not 2; no option is abbreviated.
+
+    Options of type Path take no empty names.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(allow_abbrev=False, **options)
+        self.register("type", Path, file_name)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse; an unknown option is an error here, where the command is known, whose usage is shown."""
+        known, rest = super().parse_known_args(args, namespace)
+        if rest:
+            options = list(self._option_string_actions)
+            close = difflib.get_close_matches(rest[0].partition("=")[0], options, n=1, cutoff=0.8)
+            hint = f"; did you mean {close[0]}?" if close else ""
+            self.error(f"unrecognized arguments: {' '.join(rest)}{hint}")
+        return known, rest
 
     def error(self, message: str) -> NoReturn:
         """Print usage and the problem, and leave."""
+        message = re.sub(r"invalid \w+ value: (.*)", r"\1 cannot be read", message)  # names of Python's types
         self.print_usage(sys.stderr)
         self.exit(errors.EXIT_USAGE, f"{self.prog}: {message}\n")
 
