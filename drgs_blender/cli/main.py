@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 
 from ..core import errors
 from ..core.version import __version__
-from .frame_lines import emit, emit_exit_class
+from .frame_lines import emit, emit_exit_class, is_for_farms
 from .output import file_name
 
 logger = logging.getLogger(__name__)
@@ -131,6 +131,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files can have what the terminal has not
     code = run_command(arguments)
+    if code == errors.EXIT_OK and not is_for_farms(arguments) and (trouble := stdout_trouble()):
+        code = report_stdout(trouble)
     with contextlib.suppress(BrokenPipeError):
         emit_exit_class(arguments, code)
     for name in ("stdout", "stderr"):
@@ -173,11 +175,36 @@ def run_command(arguments: Sequence[str], run: Callable[[argparse.Namespace], in
         emit(f"drgs: the memory is not enough for this{reason}. Use a smaller picture or file.\n", sys.stderr)
         return errors.EXIT_RETRY
     except Exception as error:
+        if isinstance(error, OSError) and (trouble := stdout_trouble("\n")):
+            return report_stdout(trouble)
         # The one place where any exception ends: a user gets a sentence, -v a traceback, a farm its exit code.
         logger.info("internal error", exc_info=True)
         hint = "" if verbose else " Run again with -v for details and report it."
         emit(f"drgs: internal: {type(error).__name__}: {error}.{hint}\n", sys.stderr)
         return errors.EXIT_INTERNAL
+
+
+def stdout_trouble(text: str = "") -> OSError | None:
+    """Why what was printed cannot be written, as on a full disk; None where it can, or the reader has left.
+
+    Where writing has failed already, nothing may be left to flush: `text` tries once more.
+    """
+    try:
+        if sys.stdout is not None:
+            sys.stdout.write(text)
+            sys.stdout.flush()
+    except BrokenPipeError:
+        return None
+    except OSError as error:
+        return error
+    return None
+
+
+def report_stdout(trouble: OSError) -> int:
+    """Say why stdout cannot be written, and give it up; the exit code."""
+    sys.stdout = None
+    emit(f"drgs: standard output cannot be written: {trouble.strerror or trouble}\n", sys.stderr)
+    return errors.EXIT_CANNOT_WRITE
 
 
 def join_values(arguments: Sequence[str]) -> list[str]:

@@ -20,6 +20,7 @@ from drgs_blender.cli.find_blender import CHECKOUT, find_blender
 from drgs_blender.cli.frame_lines import FrameLines
 from drgs_blender.cli.main import COMMANDS, build_parser, main
 from drgs_blender.cli.output import check_writable, write_preview
+from drgs_blender.compute.numba_variables import check_numba_variables
 from drgs_blender.core import errors
 from drgs_blender.core.frame import RenderSettings
 from drgs_blender.core.passes import BY_NAME
@@ -356,3 +357,28 @@ def test_a_name_that_openexr_cannot_open_is_said_before_the_work(tmp_path, capsy
     (tmp_path / "s.blend").touch()
     assert main(["render", str(tmp_path / "s.blend"), "--frames", "1", "--out", out]) == errors.EXIT_USAGE
     assert "bad\\xff.exr: is not a name in UTF-8" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux has such a file")
+@pytest.mark.parametrize("size", [10, 100_000])
+def test_a_full_disk_below_standard_output_is_said(monkeypatch, capsys, size):
+    from drgs_blender.cli import inspect_file
+
+    monkeypatch.setattr(inspect_file, "inspect_file", lambda path: {"kind": "x" * size})
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert main(["inspect", "a.drgs"]) == errors.EXIT_CANNOT_WRITE
+        with pytest.raises(OSError):
+            full.close()
+    assert capsys.readouterr().err == "drgs: standard output cannot be written: No space left on device\n"
+
+
+@pytest.mark.parametrize("setting", ["NUMBA_NUM_THREADS=0", "NUMBA_DISABLE_JIT=1"])
+def test_variables_with_which_numba_is_of_no_use_are_named(monkeypatch, setting):
+    name, value = setting.split("=")
+    check_numba_variables()
+    monkeypatch.setenv(name, value)
+    with pytest.raises(errors.UsageError, match=f"{name}.*unset it"):
+        check_numba_variables()
+    monkeypatch.setenv(name, "many")  # Numba warns of that
+    check_numba_variables()
