@@ -18,6 +18,7 @@ from pathlib import Path
 from ..core.errors import EXIT_CANNOT_WRITE, EXIT_INTERRUPTED, Cancelled, DrgsError
 from ..core.memory import available_memory
 from ..core.phases import PREPARING
+from ..core.switches import is_on
 
 try:
     from . import manifest, shipped
@@ -62,7 +63,7 @@ def prepare_kernels(
     ------
     Cancelled
     """
-    if os.environ.get("DRGS_PREPARE") != "0":
+    if is_on("DRGS_PREPARE", True):
         _compile(jobs, progress, cancelled)
 
 
