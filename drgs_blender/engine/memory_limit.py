@@ -16,7 +16,7 @@ _MOST = 1 << 24
 
 
 def requested_limit(arguments: list[str]) -> int | None:
-    """Megabytes that the command line or the environment allow; None for no limit, with a warning where they make no sense."""
+    """Megabytes that the command line or the environment allow; None for no limit. What makes no sense is warned of."""
     text = arguments[arguments.index(OPTION) + 1] if OPTION in arguments[:-1] else os.environ.get(VARIABLE, "")
     if text.isdecimal() and int(text) <= _MOST:
         return int(text) or None

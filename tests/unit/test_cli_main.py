@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from drgs_blender.cli import doctor, sampling
 from drgs_blender.cli import main as command_line
-from drgs_blender.cli import sampling
 from drgs_blender.cli.find_blender import CHECKOUT, find_blender
 from drgs_blender.cli.frame_lines import FrameLines
 from drgs_blender.cli.main import COMMANDS, build_parser, main
@@ -382,3 +382,12 @@ def test_variables_with_which_numba_is_of_no_use_are_named(monkeypatch, setting)
         check_numba_variables()
     monkeypatch.setenv(name, "many")  # Numba warns of that
     check_numba_variables()
+
+
+def test_a_variable_that_fails_several_checks_is_said_at_one_of_them():
+    def fail(args):
+        raise errors.UsageError("DRGS_CPU_TARGET", "is foo", "Correct or unset it")
+
+    at_card, at_kernels = (doctor.check(name, False, fail, None) for name in ("GPU", "kernels"))
+    assert (at_card.state, at_card.detail) == ("none", "not checked: see kernels")
+    assert (at_kernels.state, at_kernels.detail) == ("missing", "DRGS_CPU_TARGET: is foo")

@@ -14,15 +14,8 @@ def test_words_switch_on_and_off_and_others_are_warned_of_once(
     name = f"DRGS_TEST_{default}"
     monkeypatch.delenv(name, raising=False)
     assert is_on(name, default) is default
-    for text, wanted in {
-        "": default,
-        "0": False,
-        " Off": False,
-        "no": False,
-        "FALSE": False,
-        "1": True,
-        "yes": True,
-    }.items():
+    wants = {"": default, "0": False, " Off": False, "no": False, "FALSE": False, "1": True, "yes": True}
+    for text, wanted in wants.items():
         monkeypatch.setenv(name, text)
         assert is_on(name, default) is wanted
     assert not caplog.messages

@@ -21,7 +21,7 @@ def is_environ(node: ast.expr) -> bool:
 
 
 def keys_of(tree: ast.Module) -> set[str]:
-    """Names with which a module looks into ``os.environ``, or asks `switches.is_on`; constants of the module are resolved."""
+    """Names with which a module asks ``os.environ`` or `switches.is_on`; constants of the module are resolved."""
     constants = {
         target.id: node.value.value
         for node in tree.body
