@@ -47,7 +47,11 @@ COMMANDS: tuple[Command, ...] = (
     Command("reconstruct", "reconstruct", "make an asset from calibrated photographs"),
     Command("convert", "convert", "write an asset, splats, a mesh or a light in a format of other programs"),
     Command("bake", "bake", "bake the light on the objects of a frame to their vertices or to images"),
-    Command("inspect", "inspect_file", "say what a file holds: asset, mesh, surfels, environment, rendered or exported frame"),
+    Command(
+        "inspect",
+        "inspect_file",
+        "say what a file holds: asset, mesh, surfels, environment, rendered or exported frame",
+    ),
     Command("relight", "relight", "render an asset under an environment, without Blender"),
     Command("render", "render", "render frames of a .blend file through Blender"),
     Command("simulate", "simulate", "simulate the matter that fills an asset, without Blender"),
