@@ -14,15 +14,13 @@ import imbuf
 
 from ..drgs_blender.core.errors import EXIT_CANNOT_WRITE, EXIT_CLASSES
 from ..drgs_blender.core.file_integrity import is_whole
+from ..drgs_blender.core.switches import is_on
 from . import engine_link, messages
-
-#: Environment variable with which a failure ends a Blender that has no window.
-VARIABLE = "DRGS_FARM"
 
 
 def fail(text: str, code: int) -> None:
-    """On a farm, end Blender with the exit code of a failure; elsewhere do nothing."""
-    if not (bpy.app.background and os.environ.get(VARIABLE)):
+    """On a farm (``DRGS_FARM=1``), end a Blender without a window with the code of a failure; else do nothing."""
+    if not (bpy.app.background and is_on("DRGS_FARM", False)):
         return
     engine_link.stop()
     sys.stderr.write(f"drgs: {text}\n")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -26,6 +27,8 @@ WINDOW_TIMES = 3
 #: With one processor, too, two suites run side by side: many tests wait for other programs.
 LEAST_WORKERS, MOST_WORKERS = 2, 8
 SLOWEST = 25
+#: Exit code of pytest for options or files that it cannot use.
+USAGE = 4
 LINT = "lint"
 WINDOW = "window"
 
@@ -116,7 +119,7 @@ def parse(words: Sequence[str], names: Iterable[str], root: Path) -> tuple[list[
     Raises
     ------
     Failure
-        For a word that is neither.
+        For a word that is neither, or an option without its word.
     """
     known, suites, files = list(names), [], []
     first = next((i for i, word in enumerate(words) if word.startswith("-")), len(words))
@@ -130,6 +133,8 @@ def parse(words: Sequence[str], names: Iterable[str], root: Path) -> tuple[list[
                 f"{word} is neither a suite nor a file; there are the suites {', '.join(known)}, and -k {word} runs "
                 "the tests with that word in their name"
             )
+    if words and words[-1] in ("-k", "-m"):  # pytest would take the folder that follows for it
+        raise Failure(f"{words[-1]} needs a word after it, as in {words[-1]} material")
     for word in words[first:]:
         if ("/" in word or word.endswith(".py")) and not word.startswith("-") and (root / word.split("::")[0]).exists():
             raise Failure(f"name {word} before the options, which pytest is given as they are")
@@ -287,6 +292,8 @@ def run(
     began = time.monotonic()
     runner.run(all_jobs)
     report, wrong, left = Report(), [], 0
+    if refused := [job.log for job in all_jobs if job.report is not None and USAGE in runner.codes[job.title]]:
+        raise Failure(f"pytest does not run {' '.join([*plan.files, *plan.options])}: {usage_error(refused[0])}")
     for job in all_jobs:
         codes, tests = runner.codes[job.title], 0
         if job.report is not None:
@@ -296,6 +303,13 @@ def run(
                 wrong.append(job.title)
         wrong += [job.title] * (any(codes) and job.title not in wrong)
     return summarise(plan, report, wrong, left, time.monotonic() - began, earlier, build)
+
+
+def usage_error(log: Path) -> str:
+    """The error that pytest printed last before it ended with `USAGE`."""
+    text = log.read_text(encoding="utf-8", errors="replace") if log.is_file() else ""  # a job alone has no log
+    found = re.findall(r"error: (.+)", text, re.IGNORECASE)
+    return found[-1].strip() if found else "its message is above"
 
 
 def summarise(

@@ -106,7 +106,7 @@ def _bake(
         if name not in index:
             known = ", ".join(index) or "none"
             raise UsageError(f"--object {name}", f"is not in {path}, which has {known}", "Choose one of them")
-        check_writable(out)
+        check_writable(out, (path, uvs))
         item = posed[index[name]]
         if not len(item.mesh.faces):
             raise UsageError(f"object {name}", "has no mesh that light could be baked to", "Import it with a mesh")

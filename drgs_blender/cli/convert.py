@@ -104,7 +104,7 @@ def convert(args: argparse.Namespace) -> None:
     kind = writer.kind
     if writer.fixed and args.up not in (None, writer.up):
         raise UsageError("--up", f"is {args.up}, but {writer.name} is {writer.up} up", "Leave --up out")
-    check_writable(args.output)
+    check_writable(args.output, (args.input, args.vertices, args.env))
     up = args.up or writer.up
     if kind == "environment":
         environment = source.environment()

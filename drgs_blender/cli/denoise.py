@@ -30,7 +30,7 @@ from ..core.version import __version__
 from . import sampling, session_link
 from .frame_lines import FrameLines
 from .frame_range import check_template, parse_frames
-from .output import check_suffix, check_writable
+from .output import check_not_input, check_suffix, check_writable, file_pattern
 from .progress import bar
 
 if TYPE_CHECKING:
@@ -46,9 +46,11 @@ the frames for it:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs denoise``."""
-    parser.add_argument("noisy", metavar="PATTERN", help="noisy EXR files; #### is the frame's number")
+    parser.add_argument(
+        "noisy", type=file_pattern, metavar="PATTERN", help="noisy EXR files; #### is the frame's number"
+    )
     parser.add_argument("--frames", required=True, help="frames to denoise: 1-24, 1-24x2,30")
-    parser.add_argument("--out", required=True, metavar="PATTERN", help="EXR files to write")
+    parser.add_argument("--out", type=file_pattern, required=True, metavar="PATTERN", help="EXR files to write")
     parser.add_argument("--window", type=odd, default=5, metavar="N", help="frames averaged into one, odd; default 5")
     parser.add_argument(
         "--sequence",
@@ -91,6 +93,8 @@ def denoise(args: argparse.Namespace) -> int:
         raise UsageError(f"--out {args.out}", "is where the noisy frames are", "Choose another folder or name")
     if sequence is not None and not sequence.issuperset(frames):
         raise UsageError("--frames", "has frames that are not in --sequence", "Give all frames of the shot there")
+    for number in frames:
+        check_not_input(frame_path(args.out, number), (frame_path(args.noisy, number),))
     check_writable(frame_path(args.out, frames[0]))
 
     from ..compute.threads import use_threads

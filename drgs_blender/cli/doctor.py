@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from ..compute import numba_variables, targets
 from ..core.errors import EXIT_NO_DEVICE, EXIT_OK, DeviceError, DrgsError
 from ..core.version import __version__
 
@@ -41,6 +42,8 @@ _JOBS = {
     "simulate": "simulation",
     "surfel rays": "--rays-see surfels",
 }
+#: Variables that make several checks fail -> the one where that is said.
+_SAID_AT = {targets.VARIABLE: "kernels", numba_variables.THREADS: "Numba", numba_variables.DISABLED: "Numba"}
 _PACKAGE = "." if (Path(__file__).parents[2] / "pyproject.toml").is_file() else "drgs-blender"
 _REINSTALL = f"Install it again: pip install --upgrade {_PACKAGE}"
 
@@ -95,6 +98,10 @@ def check(name: str, essential: bool, test: Callable[[argparse.Namespace], str],
     except NotNeeded as reason:
         return Finding(name, "none", *reason.args)
     except DrgsError as error:
+        if where := _SAID_AT.get(error.subject):
+            if where != name:
+                return Finding(name, "none", f"not checked: see {where}")
+            state = "missing"  # no kernel can be called
         subject = "" if error.subject.lower() == name.lower() else f"{error.subject}: "
         return Finding(name, state, f"{subject}{error.problem}", error.remedy)
     except ImportError as error:

@@ -35,10 +35,15 @@ def emit(text: str, stream: IO[str] | None) -> None:
         pass  # nobody reads it
 
 
+def is_for_farms(arguments: Sequence[str]) -> bool:
+    """Whether a command is one that farms run, whose log may be lost."""
+    command = next((word for word in arguments if not word.startswith("-")), None)
+    return command in ("render", "denoise") and not {"-h", "--help"} & set(arguments)
+
+
 def emit_exit_class(arguments: Sequence[str], code: int) -> None:
     """The last line of the commands that farms run, which they read."""
-    command = next((word for word in arguments if not word.startswith("-")), None)
-    if command in ("render", "denoise") and not {"-h", "--help"} & set(arguments):
+    if is_for_farms(arguments):
         emit(f"DRGS_EXIT class={EXIT_CLASSES.get(code, 'internal')}\n", sys.stdout)
 
 

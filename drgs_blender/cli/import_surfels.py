@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _import(args: argparse.Namespace) -> int:
     check_suffix(args.out, (".drgs",))
-    check_writable(args.out)
+    check_writable(args.out, (args.surfels, args.mesh, args.env))
     if args.remove_light and args.env is None:
         raise UsageError("--remove-light", "needs the light of the capture", "Give it with --env")
     if args.exposure is not None and not args.remove_light:

@@ -63,10 +63,25 @@ def inspect_file(path: Path) -> dict[str, Any]:
         return {"kind": "asset", **inspect_asset(path)}
     if magic == _EXR and (frame := inspect_frame(path)):
         return frame
+    from ..ipc.frame_file import SUFFIX
+
+    if path.suffix.lower() == SUFFIX:
+        return inspect_exported_frame(path)
     from ..formats.registry import find_format, read
 
     kind = find_format(path)
     return {"kind": kind.kind, "format": kind.name, **describe(read(path))}
+
+
+def inspect_exported_frame(path: Path) -> dict[str, Any]:
+    """Describe a frame that Blender exported, for `drgs convert` and `drgs bake`."""
+    from ..ipc.frame_file import read_frame_file, read_frame_version
+
+    frame = read_frame_file(path)
+    objects = {state.name: state.asset for state in frame.objects}
+    size = {"width": frame.camera.width, "height": frame.camera.height}
+    about = {"version": read_frame_version(path), **size, "passes": list(frame.passes), "objects": objects}
+    return {"kind": "exported frame", **about, "settings": describe(frame.settings)}
 
 
 def inspect_frame(path: Path) -> dict[str, Any] | None:

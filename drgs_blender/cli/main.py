@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import importlib
 import io
 import logging
@@ -16,11 +17,13 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NoReturn
+from pathlib import Path
+from typing import Any, NoReturn
 
 from ..core import errors
 from ..core.version import __version__
-from .frame_lines import emit, emit_exit_class
+from .frame_lines import emit, emit_exit_class, is_for_farms
+from .output import file_name
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +47,11 @@ COMMANDS: tuple[Command, ...] = (
     Command("reconstruct", "reconstruct", "make an asset from calibrated photographs"),
     Command("convert", "convert", "write an asset, splats, a mesh or a light in a format of other programs"),
     Command("bake", "bake", "bake the light on the objects of a frame to their vertices or to images"),
-    Command("inspect", "inspect_file", "say what a file holds: asset, mesh, surfels, environment or rendered frame"),
+    Command(
+        "inspect",
+        "inspect_file",
+        "say what a file holds: asset, mesh, surfels, environment, rendered or exported frame",
+    ),
     Command("relight", "relight", "render an asset under an environment, without Blender"),
     Command("render", "render", "render frames of a .blend file through Blender"),
     Command("simulate", "simulate", "simulate the matter that fills an asset, without Blender"),
@@ -60,10 +67,28 @@ _SIGNED = ("--up", "--from-up", "--frames", "--sequence", "--gravity", "--veloci
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors end with exit code 64, as farms expect, and not 2."""
+    """An argument parser whose errors end with exit code 64, as farms expect, and not 2; no option is abbreviated.
+
+    Options of type Path take no empty names.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(allow_abbrev=False, **options)
+        self.register("type", Path, file_name)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse; an unknown option is an error here, where the command is known, whose usage is shown."""
+        known, rest = super().parse_known_args(args, namespace)
+        if rest:
+            options = list(self._option_string_actions)
+            close = difflib.get_close_matches(rest[0].partition("=")[0], options, n=1, cutoff=0.8)
+            hint = f"; did you mean {close[0]}?" if close else ""
+            self.error(f"unrecognized arguments: {' '.join(rest)}{hint}")
+        return known, rest
 
     def error(self, message: str) -> NoReturn:
         """Print usage and the problem, and leave."""
+        message = re.sub(r"invalid \w+ value: (.*)", r"\1 cannot be read", message)  # names of Python's types
         self.print_usage(sys.stderr)
         self.exit(errors.EXIT_USAGE, f"{self.prog}: {message}\n")
 
@@ -110,6 +135,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files can have what the terminal has not
     code = run_command(arguments)
+    if code == errors.EXIT_OK and not is_for_farms(arguments) and (trouble := stdout_trouble()):
+        code = report_stdout(trouble)
     with contextlib.suppress(BrokenPipeError):
         emit_exit_class(arguments, code)
     for name in ("stdout", "stderr"):
@@ -152,11 +179,36 @@ def run_command(arguments: Sequence[str], run: Callable[[argparse.Namespace], in
         emit(f"drgs: the memory is not enough for this{reason}. Use a smaller picture or file.\n", sys.stderr)
         return errors.EXIT_RETRY
     except Exception as error:
+        if isinstance(error, OSError) and (trouble := stdout_trouble("\n")):
+            return report_stdout(trouble)
         # The one place where any exception ends: a user gets a sentence, -v a traceback, a farm its exit code.
         logger.info("internal error", exc_info=True)
         hint = "" if verbose else " Run again with -v for details and report it."
         emit(f"drgs: internal: {type(error).__name__}: {error}.{hint}\n", sys.stderr)
         return errors.EXIT_INTERNAL
+
+
+def stdout_trouble(text: str = "") -> OSError | None:
+    """Why what was printed cannot be written, as on a full disk; None where it can, or the reader has left.
+
+    Where writing has failed already, nothing may be left to flush: `text` tries once more.
+    """
+    try:
+        if sys.stdout is not None:
+            sys.stdout.write(text)
+            sys.stdout.flush()
+    except BrokenPipeError:
+        return None
+    except OSError as error:
+        return error
+    return None
+
+
+def report_stdout(trouble: OSError) -> int:
+    """Say why stdout cannot be written, and give it up; the exit code."""
+    sys.stdout = None
+    emit(f"drgs: standard output cannot be written: {trouble.strerror or trouble}\n", sys.stderr)
+    return errors.EXIT_CANNOT_WRITE
 
 
 def join_values(arguments: Sequence[str]) -> list[str]:

@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Make and write one asset."""
     check_suffix(args.out, (".drgs",))
-    check_writable(args.out)
+    check_writable(args.out, (args.mesh, args.env))
 
     from ..build.make import make_asset
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +16,43 @@ from ..core.asset import Asset
 from ..core.errors import UsageError, WriteError
 
 
+def file_name(text: str) -> Path:
+    """Parser of the path of a file or folder, which is not empty."""
+    return Path(file_pattern(text))
+
+
+def file_pattern(text: str) -> str:
+    """Parser of a pattern of files, which is not empty."""
+    if not text:
+        raise argparse.ArgumentTypeError("an empty file name")
+    return text
+
+
 def check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
     """Refuse an output whose extension is not one of `suffixes`."""
     if path.suffix.lower() not in suffixes:
         raise UsageError(f"--out {path}", f"does not end in {' or '.join(suffixes)}", "Choose such a name")
 
 
-def check_writable(path: Path) -> None:
+def check_writable(path: Path, inputs: Iterable[Path | None] = ()) -> None:
     """Make the folder of `path` and prove that a file can be written there; a long job must not find out last.
+
+    Parameters
+    ----------
+    path : Path
+        File to write; it may be there.
+    inputs : iterable of Path or None
+        Files that are read, which `path` must not replace.
 
     Raises
     ------
+    UsageError
+        `path` is one of `inputs`, or OpenEXR cannot write a file of that name.
     WriteError
         Naming the path and the system's reason.
     """
+    check_not_input(path, inputs)
+    _check_name(path)
     try:
         if path.is_dir():
             raise WriteError(str(path), "is a folder", "Choose the name of a file")
@@ -40,6 +66,24 @@ def check_writable(path: Path) -> None:
     except (OSError, RuntimeError) as error:  # pathlib's RuntimeError: links in a circle
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise WriteError(str(path), f"cannot be written ({reason})", "Check the folder and its permissions") from error
+
+
+def check_not_input(path: Path, inputs: Iterable[Path | None]) -> None:
+    """Refuse an output that is one of the files read, also under another name. Raises UsageError."""
+    for source in inputs:
+        with contextlib.suppress(OSError, ValueError):  # what is not there is no input
+            if source is not None and path.samefile(source):
+                raise UsageError(str(path), "is also the input", "Choose another name")
+
+
+def _check_name(path: Path) -> None:
+    """Refuse a name that OpenEXR, which takes UTF-8, cannot open. Raises UsageError."""
+    try:
+        os.fspath(path.absolute()).encode()
+    except UnicodeEncodeError as error:
+        if path.suffix.lower() == ".exr":
+            shown = os.fsencode(path).decode(errors="backslashreplace")
+            raise UsageError(shown, "is not a name in UTF-8", "Choose another name or folder") from error
 
 
 def write_and_report(path: Path, asset: Asset) -> None:

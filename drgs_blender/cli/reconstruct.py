@@ -110,7 +110,7 @@ def _minutes(text: str) -> float:
 def run(args: argparse.Namespace) -> int:
     """Reconstruct one capture."""
     check_suffix(args.out, (".drgs",))
-    check_writable(args.out)
+    check_writable(args.out, (args.capture,))
 
     from ..core.errors import Cancelled, DeviceError
 

@@ -68,9 +68,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def finite(text: str) -> float:
     """Parser of a finite number."""
-    value = float(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text} is not a finite number")
+    value = sampling.number(text)
+    if not abs(value) <= sampling.LARGEST:
+        raise argparse.ArgumentTypeError(f"{text} is not a finite number, or too large")
     return value
 
 
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     sampling.check_size(camera, args.passes)
     poses, (tear, grain) = _poses(args)
     for number, _ in poses:
-        check_writable(frame_path(args.out, number))
+        check_writable(frame_path(args.out, number), (args.asset, args.camera, args.env, args.vertices))
 
     with many_imports():
         from ..engine.session import Session

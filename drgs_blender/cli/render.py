@@ -27,7 +27,7 @@ from . import sampling, session_link
 from .find_blender import find_blender
 from .frame_lines import FrameLines
 from .frame_range import absolute_template, check_template, parse_frames
-from .output import check_suffix, check_writable
+from .output import check_suffix, check_writable, file_pattern
 from .progress import bar
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", required=True, help="frames: 1-24, every second 1-24x2, several 1-24x2,30")
     parser.add_argument(
         "--out",
+        type=file_pattern,
         required=True,
         metavar="PATTERN",
         help="EXR files; #### becomes the frame's number, // the scene's folder",
@@ -73,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def seconds(text: str) -> float:
     """A time that is longer than nothing."""
-    value = float(text)
+    value = sampling.number(text)
     if not value > 0:
         raise argparse.ArgumentTypeError(f"{text} is not a time")
     return value
@@ -98,7 +99,7 @@ def render(args: argparse.Namespace, machine: Machine) -> int:
     check_suffix(Path(template), (".exr",))
     if not scene.is_file():
         raise AssetError(str(args.scene), "does not exist", "Check the path of the .blend file")
-    check_writable(frame_path(template, frames[0]))
+    check_writable(frame_path(template, frames[0]), (scene,))
     blender = find_blender(args.blender)
     logger.info("Blender: %s (%s)", blender.program, blender.origin)
 

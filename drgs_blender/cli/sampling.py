@@ -11,6 +11,8 @@ from ..core.errors import UsageError
 from ..core.frame import Camera, RenderSettings
 from ..core.passes import BY_NAME, PASSES, TEMPORAL
 
+#: The largest float32, which the renderer computes with.
+LARGEST = 3.4028234663852886e38
 #: Pixels times passes of one picture; 16k x 16k with one pass.
 MOST_PIXEL_PASSES = 1 << 28
 
@@ -27,21 +29,23 @@ def add_arguments(
     settings, hints = RenderSettings(), get_type_hints(RenderSettings)
     group = parser.add_argument_group("sampling and render" + ("" if defaults else " (default: what the scene says)"))
 
-    def add(flag: str, field: str, about: str, **options: Any) -> None:
+    def add(flag: str, field: str, about: str, among: Any = group, **options: Any) -> None:
         default = samples if field == "samples" else getattr(settings, field)
         about += f"; default {default}" if defaults else ""
-        group.add_argument(flag, dest=field, default=default if defaults else None, help=about, **options)
+        among.add_argument(flag, dest=field, default=default if defaults else None, help=about, **options)
 
     def choices(field: str) -> tuple[str, ...]:
         return get_args(hints[field])
 
+    either = group.add_mutually_exclusive_group()
     add(
         "--samples",
         "samples",
         "per pixel; shared among light, diffuse and glossy sampling by the material",
+        among=either,
         type=int_range(1, 65536),
     )
-    group.add_argument(
+    either.add_argument(
         "--strategy-samples",
         type=strategies,
         metavar="C,G,L",
@@ -107,31 +111,46 @@ def int_range(low: int, high: int) -> Any:
     """Parser of a whole number from `low` to `high`."""
 
     def parse(text: str) -> int:
-        value = int(text)
+        value = whole_number(text)
         if not low <= value <= high:
             raise argparse.ArgumentTypeError(f"{value} is not from {low} to {high}")
         return value
 
-    parse.__name__ = "whole number"
     return parse
+
+
+def whole_number(text: str) -> int:
+    """Parser of a whole number."""
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+
+
+def number(text: str) -> float:
+    """Parser of a number, also of an infinite one."""
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
 
 
 def strategies(text: str) -> tuple[int, int, int]:
     """``16,8,8`` -> counts of the three strategies."""
-    counts = [int(word) for word in text.split(",")]
+    try:
+        counts = [int(word) for word in text.split(",")]
+    except ValueError:
+        counts = []
     if len(counts) != 3 or min(counts) < 0 or not 1 <= sum(counts) <= 65536:
         raise argparse.ArgumentTypeError(f"{text} is not three numbers of samples, such as 16,8,8")
     return counts[0], counts[1], counts[2]
 
 
 def at_least_zero(text: str) -> float:
-    """A finite number that is not negative."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not a number of at least 0")
+    """Parser of a number that is not negative, and finite as float32."""
+    value = number(text)
+    if not 0.0 <= value <= LARGEST:
+        raise argparse.ArgumentTypeError(f"{text} is not a number from 0 to {LARGEST:.1e}")
     return value
 
 

@@ -19,15 +19,17 @@ import numpy as np
 
 from . import targets
 from .folders import cache_folder
+from .numba_variables import check_numba_variables
 
+check_numba_variables()
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-import numba
-from numba.core.ccallback import CFunc
-from numba.extending import overload as _overload
+import numba  # noqa: E402
+from numba.core.ccallback import CFunc  # noqa: E402
+from numba.extending import overload as _overload  # noqa: E402
 
-from . import closure, kernel_compiler
-from .kernel_cache import KernelCache
+from . import closure, kernel_compiler  # noqa: E402
+from .kernel_cache import KernelCache  # noqa: E402
 
 log = logging.getLogger(__name__)
 closure.note_package()

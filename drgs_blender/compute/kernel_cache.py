@@ -79,6 +79,12 @@ class Claim:
             self._lock.close()
 
 
+@functools.cache
+def _warn_of_record(path: str, reason: str) -> None:
+    """Warn, once, of a file that cannot be written."""
+    log.warning("DRGS_RECORD_KERNELS: kernels are not recorded in %s (%s)", path, reason)
+
+
 class KernelCache(NullCache):
     """The compiled forms of one function.
 
@@ -176,8 +182,11 @@ class KernelCache(NullCache):
         if self.kind == "kernel" and (path := os.environ.get("DRGS_RECORD_KERNELS")):
             arguments = describe(sigutils.normalize_signature(sig)[0])
             row = [self.function.__module__, self.function.__qualname__, arguments, round(seconds, 2)]
-            with open(path, "a", encoding="utf-8") as file:
-                file.write(json.dumps(row) + "\n")
+            try:
+                with open(path, "a", encoding="utf-8") as file:
+                    file.write(json.dumps(row) + "\n")
+            except (OSError, ValueError) as error:  # a name that cannot be is a ValueError
+                _warn_of_record(path, str(error))
 
     def _found(self, name: str) -> Iterator[bytes]:
         if (data := shipped.read(name)) is not None:

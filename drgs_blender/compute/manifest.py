@@ -16,8 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from numba import types
-from numba.core.errors import NumbaError
+from .numba_variables import check_numba_variables
+
+check_numba_variables()
+
+from numba import types  # noqa: E402
+from numba.core.errors import NumbaError  # noqa: E402
 
 log = logging.getLogger(__name__)
 PATH = Path(__file__).with_name("kernels.json")

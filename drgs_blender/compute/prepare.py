@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -17,7 +18,15 @@ from pathlib import Path
 from ..core.errors import EXIT_CANNOT_WRITE, EXIT_INTERRUPTED, Cancelled, DrgsError
 from ..core.memory import available_memory
 from ..core.phases import PREPARING
-from . import manifest, shipped
+from ..core.switches import is_on
+
+try:
+    from . import manifest, shipped
+except DrgsError as error:  # variables of Numba
+    if __name__ != "__main__":
+        raise
+    print(f"prepare: {error}", file=sys.stderr)
+    sys.exit(error.exit_code)
 from .folders import cache_folder
 from .kernel_cache import KernelCache
 from .manifest import Kernel
@@ -54,7 +63,7 @@ def prepare_kernels(
     ------
     Cancelled
     """
-    if os.environ.get("DRGS_PREPARE") != "0":
+    if is_on("DRGS_PREPARE", True):
         _compile(jobs, progress, cancelled)
 
 
@@ -195,5 +204,14 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
+def _end_at_signals() -> None:
+    """Let SIGTERM and SIGHUP end the workers, too; one that is ignored, as by ``nohup``, stays so."""
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda which, _: sys.exit(128 + which))
+
+
 if __name__ == "__main__":
+    _end_at_signals()
     sys.exit(main())

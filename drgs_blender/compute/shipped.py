@@ -10,11 +10,11 @@ from __future__ import annotations
 import functools
 import json
 import logging
-import os
 import sys
 import zipfile
 import zlib
 
+from ..core.switches import is_on
 from . import closure, targets
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ def versions() -> dict[str, str]:
 
 @functools.cache
 def _archive() -> zipfile.ZipFile | None:
-    if os.environ.get("DRGS_SHIPPED") == "0":
+    if not is_on("DRGS_SHIPPED", True):
         return None
     path = FOLDER / archive_name(targets.current())
     try:

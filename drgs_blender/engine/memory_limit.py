@@ -11,12 +11,19 @@ logger = logging.getLogger(__name__)
 #: Environment variable with the most megabytes, for engines that the extension starts; `OPTION` wins.
 VARIABLE = "DRGS_MEMORY_MB"
 OPTION = "--memory-mb"
+#: Megabytes of 16 TiB; what is beyond is mistyped.
+_MOST = 1 << 24
 
 
 def requested_limit(arguments: list[str]) -> int | None:
-    """Megabytes that the command line or the environment allow; None for no limit, also where they make no sense."""
+    """Megabytes that the command line or the environment allow; None for no limit. What makes no sense is warned of."""
     text = arguments[arguments.index(OPTION) + 1] if OPTION in arguments[:-1] else os.environ.get(VARIABLE, "")
-    return int(text) if text.isdecimal() and int(text) > 0 else None
+    if text.isdecimal() and int(text) <= _MOST:
+        return int(text) or None
+    if text:
+        name = OPTION if OPTION in arguments[:-1] else VARIABLE
+        logger.warning("%s is %s, which is no number of megabytes: the memory has no limit", name, text)
+    return None
 
 
 def limit_memory(megabytes: int) -> bool:

@@ -52,6 +52,16 @@ def read_frame_file(path: Path) -> Frame:
     VersionError
         A later version of the program wrote it.
     """
+    return _read(path)[0]
+
+
+def read_frame_version(path: Path) -> str:
+    """Version of the program that wrote a frame; raises what `read_frame_file` raises."""
+    return _read(path)[1]
+
+
+def _read(path: Path) -> tuple[Frame, str]:
+    """The frame, and the version of the program that wrote it."""
     subject = str(path)
     try:
         if path.exists() and not path.is_file():
@@ -75,7 +85,7 @@ def read_frame_file(path: Path) -> Frame:
     except (TypeError, KeyError, AttributeError) as error:
         raise AssetError(subject, f"is no frame ({type(error).__name__}: {error})", _REMEDY) from error
     try:
-        return decode_frame(frame, arrays)
+        return decode_frame(frame, arrays), str(content.get("version"))
     except CodecError as error:
         raise AssetError(subject, f"is no frame ({error})", _REMEDY) from error
 

@@ -14,13 +14,19 @@ from drgs_blender.engine.memory_limit import requested_limit
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux alone has such a limit")
 
 
-def test_option_wins_over_the_variable(monkeypatch):
+def test_option_wins_over_the_variable(monkeypatch, caplog):
     monkeypatch.setenv("DRGS_MEMORY_MB", "500")
     assert requested_limit(["-m", "--memory-mb", "700"]) == 700
     assert requested_limit(["-m"]) == requested_limit(["-m", "--memory-mb"]) == 500
-    for nonsense in ("", "-3", "0", "much"):
+    for unlimited in ("", "0"):
+        monkeypatch.setenv("DRGS_MEMORY_MB", unlimited)
+        assert requested_limit([]) is None
+    assert not caplog.messages
+    for nonsense in ("-3", "much", "4GB", "9" * 20):
         monkeypatch.setenv("DRGS_MEMORY_MB", nonsense)
         assert requested_limit([]) is None
+        assert caplog.messages.pop().startswith(f"DRGS_MEMORY_MB is {nonsense}, which is no number of megabytes")
+        caplog.clear()
 
 
 @linux

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -184,3 +185,11 @@ def test_a_file_a_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         np.testing.assert_allclose(
             read_surfels(tmp_path / f"o{number:02d}.spz").surfels.centre[:, 1], number, atol=2e-4
         )
+
+
+def test_inspect_describes_an_exported_frame(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", str(KEPT / "frame-1.drgsframe"), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    frame = read_frame_file(KEPT / "frame-1.drgsframe")
+    assert (report["kind"], report["width"]) == ("exported frame", frame.camera.width)
+    assert report["version"] and list(report["objects"]) == [state.name for state in frame.objects]

@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from drgs_blender.cli import doctor, sampling
 from drgs_blender.cli import main as command_line
-from drgs_blender.cli import sampling
 from drgs_blender.cli.find_blender import CHECKOUT, find_blender
 from drgs_blender.cli.frame_lines import FrameLines
 from drgs_blender.cli.main import COMMANDS, build_parser, main
 from drgs_blender.cli.output import check_writable, write_preview
+from drgs_blender.compute.numba_variables import check_numba_variables
 from drgs_blender.core import errors
 from drgs_blender.core.frame import RenderSettings
 from drgs_blender.core.passes import BY_NAME
@@ -300,3 +301,93 @@ def test_ctrl_c_while_python_imports_has_its_exit_code_and_no_traceback(moment):
 def test_minutes_that_are_none_are_refused_in_words(minutes: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["reconstruct", "photographs", "--out", "a.drgs", f"--time-budget={minutes}"]) == 64
     assert f"--time-budget: {minutes} is not a time above zero" in capsys.readouterr().err
+
+
+RELIGHT = ["relight", "a.drgs", "--camera", "c.json", "--out", "o.exr"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([*RELIGHT, "--rays", "32"], "usage: drgs relight"),
+        ([*RELIGHT, "--sample", "32"], "did you mean --samples?"),
+        ([*RELIGHT, "--strategy-samples", "16,8,8", "--samples", "4"], "not allowed with argument"),
+        ([*RELIGHT, "--strategy-samples", "many"], "many is not three numbers of samples, such as 16,8,8"),
+        ([*RELIGHT, "--samples", "many"], "'many' is not a whole number"),
+        ([*RELIGHT, "--env-strength", "much"], "'much' is not a number"),
+        ([*RELIGHT, "--clamp-indirect", "1e300"], "is not a number from 0 to 3.4e+38"),
+        ([*RELIGHT, "--env-strength", "1e39"], "too large"),
+        (["inspect", ""], "an empty file name"),
+        (["make", "", "--out", "a.drgs"], "an empty file name"),
+        (["make", "a.glb", "--out", ""], "an empty file name"),
+        (["render", "s.blend", "--frames", "1", "--out", ""], "an empty file name"),
+        (["render", "s.blend", "--frames", "1", "--out", "o.exr", "--timeout", "soon"], "'soon' is not a number"),
+        (["simulate", "a.drgs", "--out", "o", "--gravity", "down"], "'down' cannot be read"),
+    ],
+)
+def test_what_cannot_be_parsed_is_said_in_words(words, said, capsys):
+    assert main(words) == errors.EXIT_USAGE
+    message = capsys.readouterr().err
+    assert said in message and "invalid" not in message and "--rays-see" not in message.splitlines()[-1]
+
+
+def test_an_output_replaces_no_input(tmp_path, capsys):
+    source, link = tmp_path / "in.drgs", tmp_path / "link.drgs"
+    source.write_bytes(b"kept")
+    link.hardlink_to(source)
+    (tmp_path / "1.exr").write_bytes(b"kept")
+    (tmp_path / "clean").symlink_to(tmp_path, target_is_directory=True)
+    own, exr = str(source), str(tmp_path / "1.exr")
+    for words in (
+        ["make", own, "--out", own],
+        ["make", own, "--out", str(link)],
+        ["make", "a.glb", "--env", own, "--out", own],
+        ["import", own, "--out", own],
+        ["denoise", str(tmp_path / "#.exr"), "--frames", "2,1", "--out", str(tmp_path / "clean" / "#.exr")],
+        ["render", exr, "--frames", "1", "--out", exr],
+    ):
+        assert main(words) == errors.EXIT_USAGE, words
+        assert "Choose another" in capsys.readouterr().err
+    assert source.read_bytes() == b"kept" == (tmp_path / "1.exr").read_bytes()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names elsewhere are Unicode")
+def test_a_name_that_openexr_cannot_open_is_said_before_the_work(tmp_path, capsys):
+    out = os.fsdecode(os.fsencode(tmp_path) + b"/bad\xff.exr")
+    (tmp_path / "s.blend").touch()
+    assert main(["render", str(tmp_path / "s.blend"), "--frames", "1", "--out", out]) == errors.EXIT_USAGE
+    assert "bad\\xff.exr: is not a name in UTF-8" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux has such a file")
+@pytest.mark.parametrize("size", [10, 100_000])
+def test_a_full_disk_below_standard_output_is_said(monkeypatch, capsys, size):
+    from drgs_blender.cli import inspect_file
+
+    monkeypatch.setattr(inspect_file, "inspect_file", lambda path: {"kind": "x" * size})
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert main(["inspect", "a.drgs"]) == errors.EXIT_CANNOT_WRITE
+        with pytest.raises(OSError):
+            full.close()
+    assert capsys.readouterr().err == "drgs: standard output cannot be written: No space left on device\n"
+
+
+@pytest.mark.parametrize("setting", ["NUMBA_NUM_THREADS=0", "NUMBA_DISABLE_JIT=1"])
+def test_variables_with_which_numba_is_of_no_use_are_named(monkeypatch, setting):
+    name, value = setting.split("=")
+    check_numba_variables()
+    monkeypatch.setenv(name, value)
+    with pytest.raises(errors.UsageError, match=f"{name}.*unset it"):
+        check_numba_variables()
+    monkeypatch.setenv(name, "many")  # Numba warns of that
+    check_numba_variables()
+
+
+def test_a_variable_that_fails_several_checks_is_said_at_one_of_them():
+    def fail(args):
+        raise errors.UsageError("DRGS_CPU_TARGET", "is foo", "Correct or unset it")
+
+    at_card, at_kernels = (doctor.check(name, False, fail, None) for name in ("GPU", "kernels"))
+    assert (at_card.state, at_card.detail) == ("none", "not checked: see kernels")
+    assert (at_kernels.state, at_kernels.detail) == ("missing", "DRGS_CPU_TARGET: is foo")

@@ -128,3 +128,10 @@ def test_words_choose_suites_files_and_tests(dev, plans, tmp_path):
     assert chosen["engine"].endswith(" tests/unit tests/engine") and chosen["farm"].endswith(" tests/farm")
     assert dev.main(["test", "enigne"]) == 1
     assert dev.main(["test", "-x", "tests/unit/test_light.py"]) == 1
+
+
+@pytest.mark.parametrize("words", [["clean", "--al"], ["env", "--eng"]])
+def test_an_option_is_written_out(dev, words, capsys):
+    with pytest.raises(SystemExit):
+        dev.parse(words)
+    assert "unrecognized arguments" in capsys.readouterr().err

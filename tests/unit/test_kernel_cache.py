@@ -529,3 +529,11 @@ def test_no_more_workers_than_processors_and_memory_allow(monkeypatch):
     assert 1 <= prepare.processes() <= 3
     monkeypatch.setattr(prepare, "_BYTES", 1 << 60)
     assert prepare.processes() == 1 or sys.platform != "linux"
+
+
+def test_a_record_that_cannot_be_written_is_warned_of_once(folder, monkeypatch, caplog, tmp_path):
+    monkeypatch.setenv("DRGS_RECORD_KERNELS", str(tmp_path / "nowhere" / "record"))
+    cache = kernel_cache.KernelCache(_inner)
+    for _ in range(2):
+        cache._record((numba.types.float64,), 0.0)
+    assert len(caplog.messages) == 1 and "DRGS_RECORD_KERNELS" in caplog.messages[0]

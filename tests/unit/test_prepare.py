@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -272,3 +273,22 @@ def test_workers_yield_but_the_one_with_the_longest_kernel(small) -> None:
         assert found == [own, min(own + worker_pool._LOWER, 19)]
     finally:
         pool.close()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_preparing_as_an_exit(number: int) -> None:
+    previous = {n: signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        for n in previous:
+            signal.signal(n, signal.SIG_DFL)
+        prepare._end_at_signals()
+        with pytest.raises(SystemExit) as ending:
+            signal.raise_signal(number)
+        assert ending.value.code == 128 + number
+        signal.signal(number, signal.SIG_IGN)
+        prepare._end_at_signals()
+        assert signal.getsignal(number) is signal.SIG_IGN
+    finally:
+        for n, handler in previous.items():
+            signal.signal(n, handler)

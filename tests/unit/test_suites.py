@@ -107,6 +107,15 @@ def test_a_word_may_fit_tests_of_one_suite_alone_but_not_none(run):
     assert code == 1 and "not passed: no test fits -k green" in lines
 
 
+def test_options_that_pytest_refuses_are_the_cause(run, suites):
+    with pytest.raises(suites.Failure, match="pytest does not run --lanes=foo: unrecognized arguments: --lanes=foo"):
+        run({"one": "def test_red(): pass\n", "two": "def test_blue(): pass\n"}, options=("--lanes=foo",))
+    with pytest.raises(suites.Failure, match="its message is above"):
+        run({"one": "def test_red(): pass\n"}, options=("--lanes=foo",))
+    with pytest.raises(suites.Failure, match="-k needs a word"):
+        suites.parse(["-k"], [], ROOT)
+
+
 @pytest.mark.skipif(os.name == "nt", reason="processes are told apart by their ids")
 def test_a_job_that_hangs_is_ended_with_its_children_and_named(suites, tmp_path, capfd):
     jobs = [job_of(suites, tmp_path, name, SLEEP.format(name, name), seconds=1.0) for name in "ab"]

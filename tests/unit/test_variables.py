@@ -21,7 +21,7 @@ def is_environ(node: ast.expr) -> bool:
 
 
 def keys_of(tree: ast.Module) -> set[str]:
-    """Names with which a module looks into ``os.environ``; constants of the module are resolved."""
+    """Names with which a module asks ``os.environ`` or `switches.is_on`; constants of the module are resolved."""
     constants = {
         target.id: node.value.value
         for node in tree.body
@@ -34,8 +34,9 @@ def keys_of(tree: ast.Module) -> set[str]:
         keys: list[ast.expr] = []
         if isinstance(node, ast.Subscript) and is_environ(node.value):
             keys = [node.slice]
-        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and is_environ(node.func.value):
-            keys = node.args[:1]
+        elif isinstance(node, ast.Call):
+            asks = isinstance(node.func, ast.Attribute) and is_environ(node.func.value)
+            keys = node.args[:1] if asks or (isinstance(node.func, ast.Name) and node.func.id == "is_on") else []
         elif isinstance(node, ast.Compare) and any(is_environ(side) for side in node.comparators):
             keys = [node.left]
         for key in keys:
