@@ -434,12 +434,16 @@ def test_convert_says_what_becomes_of_materials(tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize("suffix", ["ply", "spz", "sog", "glb"])
-@pytest.mark.parametrize("scale", ["1e39", "1e-50"])
+@pytest.mark.parametrize(
+    ("scale", "said"),
+    [("1e39", "1e39 is not a finite number"), ("3e38", "3e+38: makes lengths"), ("1e-50", "1e-50: makes lengths")],
+)
 def test_convert_refuses_scales_that_numbers_do_not_hold(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], suffix: str, scale: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], suffix: str, scale: str, said: str
 ) -> None:
     write_splat_ply(tmp_path / "a.ply", random_splats(5))
     out = tmp_path / f"b.{suffix}"
     assert main(["convert", str(tmp_path / "a.ply"), str(out), "--scale", scale]) == 64
-    assert f"--scale {float(scale):g}: makes lengths" in capsys.readouterr().err
+    shown = capsys.readouterr().err
+    assert "--scale" in shown and said in shown
     assert not out.exists()
