@@ -17,7 +17,6 @@ import shutil
 import statistics
 import subprocess
 import sys
-import sysconfig
 import tempfile
 import time
 from pathlib import Path
@@ -25,6 +24,9 @@ from pathlib import Path
 import OpenEXR
 from bench_engine import first_frame, plane_asset
 from report import DOCUMENT, ROOT, table, write_section
+
+sys.path.insert(0, str(ROOT / "tools"))
+from environments import borrowing
 
 #: The first pixel of this commit and of another one, measured in turn.
 IN_TURN = "the same, in turn with the next row", "the same of an earlier commit"
@@ -175,10 +177,7 @@ def first_pixels(commits: list[str], folder: Path, pairs: int = 9) -> list[float
         checkout, environment = folder / f"checkout{number}", folder / f"environment{number}"
         subprocess.run(["git", "clone", "--quiet", "--shared", "--no-checkout", ROOT, checkout], check=True)
         subprocess.run(["git", "-C", checkout, "checkout", "--quiet", "--detach", commit], check=True)
-        subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
-        site = Path(sysconfig.get_path("purelib", vars={"base": str(environment)}))
-        (site / "checkout.pth").write_text(f"{checkout}\n{sysconfig.get_path('purelib')}\n")
-        python = environment / Path(sys.executable).relative_to(sys.prefix)
+        python, _ = borrowing(environment, checkout)
         paths = os.pathsep.join(map(str, (checkout, checkout / "bench")))
         variables = {"PYTHONPATH": paths, "DRGS_ENGINE": str(python), "DRGS_SHIPPED": "0"}
         variables["DRGS_CACHE_DIR"] = str(folder / f"kernels{number}")

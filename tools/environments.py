@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
+import sysconfig
 from pathlib import Path
 
 from steps import Step, counted
@@ -18,6 +20,21 @@ FOR_ENGINE, FOR_BLENDER = "engine", "blender"
 def python_of(folder: Path) -> Path:
     """The interpreter of an environment."""
     return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def borrowing(folder: Path, *first: Path) -> tuple[Path, Path]:
+    """Make an environment with the packages of this one, behind its own and the folders `first`.
+
+    Returns
+    -------
+    tuple of Path
+        Its interpreter, and the folder of its own packages.
+    """
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
+    site = Path(sysconfig.get_path("purelib", vars={"base": str(folder)}))
+    paths = [*map(str, first), sysconfig.get_path("purelib")]
+    (site / "borrowed.pth").write_text("".join(f"{path}\n" for path in paths), encoding="utf-8")
+    return python_of(folder), site
 
 
 def blender() -> Path:

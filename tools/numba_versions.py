@@ -12,9 +12,10 @@ import argparse
 import os
 import subprocess
 import sys
-import sysconfig
 import tempfile
 from pathlib import Path
+
+from environments import borrowing
 
 ROOT = Path(__file__).resolve().parent.parent
 #: What Numba before 0.66 takes.
@@ -45,14 +46,10 @@ def digest_by(version: str, asset: Path, folder: Path) -> tuple[bool, str]:
     ------
     subprocess.CalledProcessError
     """
-    environment = folder / version
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
-    site = Path(sysconfig.get_path("purelib", vars={"base": str(environment)}))
-    (site / "other.pth").write_text(f"{sysconfig.get_path('purelib')}\n")
+    python, site = borrowing(folder / version)
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--target", str(site)]
     old = [OLD_NUMPY] if tuple(map(int, version.split(".")[:2])) < (0, 66) else []
     subprocess.run([*pip, f"numba=={version}", *old], check=True)
-    python = environment / Path(sys.executable).relative_to(sys.prefix)
     variables = {"PYTHONPATH": str(ROOT), "DRGS_SHIPPED": "0", "DRGS_CACHE_DIR": str(folder / f"kernels-{version}")}
     command = [str(python), "-P", "-c", FRAME, str(asset)]
     done = subprocess.run(command, env=os.environ | variables, check=True, stdout=subprocess.PIPE, text=True)

@@ -100,7 +100,7 @@ def _is_uniform(values: Array, faces: Array) -> bool:
 
 
 def _side(count: int) -> int:
-    """Texels along the side of the texture of so many triangles."""
+    """Texels along the side of the texture of a number of triangles."""
     return CELL * int(np.ceil(np.sqrt(-(-count // 2))))
 
 

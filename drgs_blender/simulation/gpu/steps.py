@@ -397,7 +397,7 @@ def end_step(lane, lanes, room, spacing, times, out):  # type: ignore[no-untyped
     times : array
         A row per step: DT, DRAG_FACTOR, DAMPING_FACTOR, GAIN.
     out : tuple of array
-        The clock, and (SLOTS,) bits of the highest speed, which begin anew.
+        The clock, and (SLOTS,) bits of the highest speed, which are reset.
     """
     clock, fastest = out
     if clock[STOPPED] != 0.0:
