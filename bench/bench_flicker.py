@@ -20,7 +20,7 @@ from subjects import asset_path
 from drgs_blender.cli import frame_store
 from drgs_blender.cli.main import main as drgs
 from drgs_blender.core.asset.container import read_asset
-from drgs_blender.core.frame import Frame, Moment, ObjectState, RenderSettings, World
+from drgs_blender.core.frame import Frame, MotionStep, ObjectState, RenderSettings, World
 from drgs_blender.core.passes import TEMPORAL
 from drgs_blender.formats.registry import read_environment
 from drgs_blender.render.denoise.oidn import available
@@ -41,7 +41,9 @@ def frames(options: argparse.Namespace, environment: str) -> list[Frame]:
         a = np.radians(options.step * number)
         turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
         world = World(radiance, turn)
-        out.append(Frame(number, camera, [ObjectState("cat", key)], world, settings, previous=Moment(camera, [None])))
+        out.append(
+            Frame(number, camera, [ObjectState("cat", key)], world, settings, previous=MotionStep(camera, [None]))
+        )
     return out
 
 

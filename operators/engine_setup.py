@@ -99,7 +99,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         if engine_environment.RECONSTRUCT in groups and sys.platform == "linux":
             more = f"{engine_environment.CUDA_BYTES / 1e9:.0f} GB more"
             column.label(text=f"Linux: PyTorch comes with CUDA, {more} and of no use here,")
-            column.label(text="unless an index has a build for processors alone")
+            column.label(text="unless an index has a CPU-only build")
         layout.prop(self, "python")
         if groups:
             layout.prop(self, "index")

@@ -96,7 +96,7 @@ def engine(folder: Path, what: str) -> None:
         Light,
         Material,
         MeshState,
-        Moment,
+        MotionStep,
         ObjectState,
         Pose,
         RenderSettings,
@@ -136,7 +136,7 @@ def engine(folder: Path, what: str) -> None:
             client.render(frame)
             client.render(replace(frame, noise_index=2))
         elif what == "motion":
-            moment = Moment(camera, [Pose("cow", matrix[None].copy(), body.vertices)])
+            moment = MotionStep(camera, [Pose("cow", matrix[None].copy(), body.vertices)])
             client.render(replace(frame, previous=moment, next=moment, passes=("Combined", "Vector")))
         elif what == "viewport":
             for denoise in ("none", "svgf"):

@@ -1,4 +1,4 @@
-"""Camera and shapes at another time -> frame.Moment, for passes of motion."""
+"""Motion steps: camera and shapes at another time -> frame.MotionStep, for passes of motion."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.core.arrays import same_bits
-from ...drgs_blender.core.frame import Frame, Moment, Pose
+from ...drgs_blender.core.frame import Frame, MotionStep, Pose
 from .. import mesh_arrays
 from .camera import export_camera, picture_of
 from .instances import Key, uncancelled, visible
@@ -62,7 +62,7 @@ def _moment(
     object_keys: list[Key],
     mesh_keys: list[list[Key]],
     cancelled: Callable[[], bool] | None,
-) -> Moment:
+) -> MotionStep:
     """The scene as `depsgraph` is evaluated now; what is not there any more is taken as not moved."""
     shape_of = {key: ("object", i) for i, key in enumerate(object_keys)}
     shape_of |= {key: ("mesh", i) for i, keys in enumerate(mesh_keys) for key in keys}
@@ -95,4 +95,4 @@ def _moment(
         places = np.stack([matrices.get(key, now) for key, now in zip(keys, mesh.matrices)])
         meshes.append(Pose(mesh.name, places, moved(("mesh", i), mesh.vertices)))
     scene = depsgraph.scene_eval
-    return Moment(export_camera(camera.evaluated_get(depsgraph), picture_of(scene)), objects, meshes)
+    return MotionStep(export_camera(camera.evaluated_get(depsgraph), picture_of(scene)), objects, meshes)

@@ -21,8 +21,8 @@ from .jit import numba
 
 #: Pieces per thread, so that threads that are done early have something to take.
 _PIECES = 8
-#: Lanes per thread: few, since each may make scratch memory.
-_LANES = 4
+#: Calls per thread of `over_strided`: few, since each may make scratch memory.
+_CALLS = 4
 #: Fewest rows of a picture in a piece, because handing one over costs as much as some of them.
 ROWS = 24
 #: The same of elements of arrays: vertices, faces, surfels.
@@ -98,8 +98,8 @@ def over_range(kernel: Callable[..., Any], count: int, *arguments: Any, fewest: 
     return results
 
 
-def over_lanes(kernel: Callable[..., Any], most: int, *arguments: Any) -> None:
-    """Call ``kernel(first, last, lanes, *arguments)`` for pieces of 0 .. `lanes`; a lane is every `lanes`-th item.
+def over_strided(kernel: Callable[..., Any], most: int, *arguments: Any) -> None:
+    """Call ``kernel(first, last, stride, *arguments)`` for pieces of 0 .. `stride`; each is every `stride`-th item.
 
     For items of which neighbours cost alike: no thread is left with all the costly ones.
 
@@ -108,12 +108,12 @@ def over_lanes(kernel: Callable[..., Any], most: int, *arguments: Any) -> None:
     kernel : callable
         As of `over_range`.
     most : int
-        Number of items: there are no more lanes.
+        Number of items: the stride is at most that.
     *arguments : object
         The same for every piece.
     """
-    lanes = min(most, _LANES * get_num_threads())
-    over_range(kernel, lanes, lanes, *arguments)
+    stride = min(most, _CALLS * get_num_threads())
+    over_range(kernel, stride, stride, *arguments)
 
 
-__all__ = ["ELEMENTS", "ROWS", "get_num_threads", "over_lanes", "over_range", "use_threads"]
+__all__ = ["ELEMENTS", "ROWS", "get_num_threads", "over_range", "over_strided", "use_threads"]

@@ -215,7 +215,7 @@ class Material:
 
 @dataclass(slots=True)
 class MeshState:
-    """An ordinary mesh next to the DR-GS objects, in one frame: one shape, standing in one or more places.
+    """An ordinary mesh next to the DR-GS objects, in one frame: one shape with one or more instances.
 
     Attributes
     ----------
@@ -387,10 +387,10 @@ class RenderSettings:
 
     @property
     def subpixel_count(self) -> int:
-        """Places per pixel: ``subpixel_samples``, or as many as let edges and textures keep up with the noise."""
+        """``subpixel_samples``, or as many per pixel as let edges and textures keep up with the noise."""
         if self.subpixel_samples:
             return self.subpixel_samples
-        # Another place costs surfels more than a mesh, and they come filtered.
+        # Another one costs surfels more than a mesh, and they come filtered.
         count = self.sample_count
         wanted = min(count // 8, 16) if self.camera_sees == "surfels" else max(min(count // 2, 16), count // 4)
         return min(max(wanted, 4), 64, max(count, 1))
@@ -416,7 +416,7 @@ class Pose:
 
 
 @dataclass(slots=True)
-class Moment:
+class MotionStep:
     """Camera and shapes at another time, for motion.
 
     ``objects`` and ``meshes`` are in the order of the frame's own; what is None has not moved.
@@ -435,7 +435,7 @@ class Frame:
     ----------
     noise_index : int
         Part of the seed of all random numbers. It is the scene's frame number only while *Animated Seed* is on.
-    previous, next : Moment, optional
+    previous, next : MotionStep, optional
         One frame earlier and later, for the passes of motion; None: nothing moves.
     history : str
         Name of the sequence of pictures that this one continues. With the denoiser SVGF, what the engine rendered
@@ -451,6 +451,6 @@ class Frame:
     meshes: list[MeshState] = field(default_factory=list)
     lights: list[Light] = field(default_factory=list)
     images: list[Image] = field(default_factory=list)
-    previous: Moment | None = None
-    next: Moment | None = None
+    previous: MotionStep | None = None
+    next: MotionStep | None = None
     history: str = ""

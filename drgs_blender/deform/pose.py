@@ -155,15 +155,15 @@ def _pose(first, last, blocks, mesh, by_corner, linear, sign, rest, out):  # typ
 
 
 @njit
-def pose_surfels(lane, lanes, room, mesh, by_corner, linear, sign, rest, out):  # type: ignore[no-untyped-def]
-    """Pose every `lanes`-th block of surfels, from the `lane`-th on.
+def pose_surfels(thread, stride, scratch, mesh, by_corner, linear, sign, rest, out):  # type: ignore[no-untyped-def]
+    """Pose every `stride`-th block of surfels, from the `thread`-th on.
 
     Arithmetic in double so that a small object far from the origin stays exact.
 
     Parameters
     ----------
-    lane, lanes : int
-    room : object
+    thread, stride : int
+    scratch : object
         Not used.
     mesh : PosedMesh
         Or a tuple in its order, as devices have it; so `rest` and `out`.
@@ -180,7 +180,7 @@ def pose_surfels(lane, lanes, room, mesh, by_corner, linear, sign, rest, out):  
     vertices, faces, normals = mesh
     face, weights, offset, rest_edge, local_normal, coordinates, span, in_span = rest
     centre, tangent_u, tangent_v, normal, opacity = out
-    for block in range(lane, (len(face) + _BLOCK - 1) // _BLOCK, lanes):
+    for block in range(thread, (len(face) + _BLOCK - 1) // _BLOCK, stride):
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(face))):
             f = face[i]
             ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]

@@ -11,7 +11,7 @@ from ..ipc.change_detection import reuse_equal
 from ..render.camera import camera_parameters
 from ..render.denoise.svgf_temporal import History
 from ..render.film.film import COMPONENTS
-from ..render.film.motion_vectors import Instant
+from ..render.film.motion_vectors import SceneState
 from ..render.scene.trace_scene import TraceScene
 
 #: Names of which the session keeps the history.
@@ -25,9 +25,9 @@ class Sequence:
     Attributes
     ----------
     history : History
-        For the next picture; its instant holds the scene's own arrays where nothing moved, which saves looking.
-    past : Instant, optional
-        The instant of the last picture.
+        For the next picture; its scene state holds the scene's own arrays where nothing moved, which saves looking.
+    past : SceneState, optional
+        The scene at the last picture.
     fit : tuple
         Key under which the history is valid: layout of the scene, window, primary surface, split of light.
     situation : tuple
@@ -37,7 +37,7 @@ class Sequence:
     """
 
     history: History = field(default_factory=History)
-    past: Instant | None = None
+    past: SceneState | None = None
     fit: tuple[Any, ...] = ()
     situation: tuple[Any, ...] = (None, None)
     pictures: int = 0
@@ -80,22 +80,22 @@ class Histories:
         if fit != old.fit or old.past is None:
             return Sequence(fit=fit, situation=situation)
         still = len(situation) == len(old.situation) and all(a is b for a, b in zip(situation, old.situation))
-        instant = Instant(
+        scene_state = SceneState(
             scene.vertices if still or same_bits(old.past.vertices, scene.vertices) else old.past.vertices,
             scene.instances if still or same_bits(old.past.instances, scene.instances) else old.past.instances,
             old.past.parameters,
         )
-        return Sequence(History(old.history.signal, instant, still), old.past, fit, situation, old.pictures)
+        return Sequence(History(old.history.signal, scene_state, still), old.past, fit, situation, old.pictures)
 
     def store(self, frame: Frame, sequence: Sequence, scene: TraceScene) -> None:
         """Remember `sequence` after its picture `frame` was made."""
-        before, past = sequence.history.instant, sequence.past
-        sequence.past = Instant(
+        before, past = sequence.history.scene_state, sequence.past
+        sequence.past = SceneState(
             past.vertices if past and before and before.vertices is scene.vertices else scene.vertices.copy(),
             past.instances if past and before and before.instances is scene.instances else scene.instances.copy(),
             camera_parameters(frame.camera, frame.settings, frame.noise_index),
         )
-        sequence.history.instant = None  # the scene's arrays are for this picture only
+        sequence.history.scene_state = None  # the scene's arrays are for this picture only
         sequence.pictures += 1
         self._known.pop(frame.history, None)
         self._known[frame.history] = sequence

@@ -14,13 +14,13 @@ from ..compute.warp.posed_surfels import DevicePosedSurfels, joined
 from ..core.asset.container import read_asset
 from ..core.asset.model import Asset, PosedSurfels, Surfels
 from ..core.errors import AssetError, UsageError
-from ..core.frame import Frame, Image, Light, MeshState, Moment, ObjectState, RenderSettings, World
+from ..core.frame import Frame, Image, Light, MeshState, MotionStep, ObjectState, RenderSettings, World
 from ..deform.gpu.mesh_driven import Deformer
 from ..deform.mesh_driven import MeshDriven
 from ..ipc.change_detection import reuse_equal
 from ..render.backend import CPU, RenderBackend
 from ..render.camera import camera_parameters
-from ..render.film.motion_vectors import Instant
+from ..render.film.motion_vectors import SceneState
 from ..render.lights.environment import EnvironmentLight
 from ..render.lights.light_sampler import Lights
 from ..render.lights.mesh_lights import Emitters
@@ -222,13 +222,13 @@ class SceneCache:
         tree.update(join([item.posed for item in objects if item.posed is not None]), np.array(masks, np.int32))
         self.tree, self._in_tree = tree, objects
 
-    def instant(self, frame: Frame, moment: Moment | None) -> Instant | None:
+    def scene_state(self, frame: Frame, step: MotionStep | None) -> SceneState | None:
         """The scene at another time; None when no pass asks for it."""
-        if moment is None or not {"Vector", "Previous Position"}.intersection(frame.passes):
+        if step is None or not {"Vector", "Previous Position"}.intersection(frame.passes):
             return None
         for what, poses, shapes in (
-            ("objects", moment.objects, frame.objects),
-            ("meshes", moment.meshes, frame.meshes),
+            ("objects", step.objects, frame.objects),
+            ("meshes", step.meshes, frame.meshes),
         ):
             if len(poses) != len(shapes):
                 raise UsageError(
@@ -236,10 +236,10 @@ class SceneCache:
                 )
         moved = [
             None if pose is None else moved_vertices(item.state, item.loaded.asset, pose)
-            for pose, item in zip(moment.objects, self.objects)
+            for pose, item in zip(step.objects, self.objects)
         ]
-        vertices, instances = self.scene.at(moved, moment.meshes)
-        return Instant(vertices, instances, camera_parameters(moment.camera, frame.settings, frame.noise_index))
+        vertices, instances = self.scene.at(moved, step.meshes)
+        return SceneState(vertices, instances, camera_parameters(step.camera, frame.settings, frame.noise_index))
 
     def warnings(self) -> list[str]:
         """Warnings about the meshes of the last frame."""

@@ -247,8 +247,8 @@ class Session:
             static_state = *self._scene_cache.static_state, self._lights
             sequence = self._histories.continued(frame, prepared.scene, static_state)
             statistics["history"] = float(sequence.pictures)
-        instant = self._scene_cache.instant
-        prepared = replace(prepared, previous=instant(frame, frame.previous), following=instant(frame, frame.next))
+        state_at = self._scene_cache.scene_state
+        prepared = replace(prepared, previous=state_at(frame, frame.previous), following=state_at(frame, frame.next))
         history = None if sequence is None else sequence.history
         pictures = render(prepared, frame, report, cancelled, history=history, backend=backend)
         if sequence is not None:

@@ -59,7 +59,7 @@ class EngineClient:
         Command line of the engine, see `locate_engine`.
     silence : float
         Timeout: seconds without a heartbeat after which the engine counts as dead.
-    greeting : float
+    handshake : float
         Seconds a new process has to say something; importing Python on a busy machine takes some.
     stall : float
         Timeout: seconds its main thread may work on one step.
@@ -74,13 +74,13 @@ class EngineClient:
         command: list[str],
         *,
         silence: float = 20.0,
-        greeting: float = 15.0,
+        handshake: float = 15.0,
         stall: float = 900.0,
         restarts: int = 1,
         shared: bool = True,
     ) -> None:
         self.command = list(command)
-        self.silence, self.greeting, self.stall = silence, greeting, stall
+        self.silence, self.handshake, self.stall = silence, handshake, stall
         self.restarts, self.shared = restarts, shared
         self._child: Child | None = None
         self._sent = SentSlots()
@@ -299,7 +299,7 @@ class EngineClient:
             self._to_load = list(self._assets)
         if not self._child.greeted:
             try:
-                watchdog = Watchdog(self._child, self.greeting, self.stall)
+                watchdog = Watchdog(self._child, self.handshake, self.stall)
                 greet(self._child, self.command[0], watchdog, lambda: self._stopped(cancelled))
             except DrgsError:
                 self._abandon()

@@ -20,7 +20,7 @@ from .inverse_rendering.gatherer import Gatherer
 from .losses.photometric import difference
 from .losses.shape import shape_loss
 from .model.attributes import attributes
-from .model.raster import Maps, Tally, rasterise
+from .model.raster import GradientStatistics, Maps, rasterise
 from .model.reflection_probe import mirrored
 from .optim.adam import descend
 
@@ -41,17 +41,17 @@ class LearningBackend:
         return target
 
     def attributes(
-        self, parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, mirrors: bool
+        self, parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, reflections: bool
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """`attributes.attributes`."""
-        return attributes(parameters, centre, eye, bands, mirrors)
+        return attributes(parameters, centre, eye, bands, reflections)
 
     def rasterise(
         self, centre: Tensor, tangent_u: Tensor, tangent_v: Tensor, opacity: Tensor, features: Tensor, camera: Camera,
-        tally: Tally | None = None,
+        statistics: GradientStatistics | None = None,
     ) -> Maps:  # fmt: skip
         """`raster.rasterise`."""
-        return rasterise(centre, tangent_u, tangent_v, opacity, features, camera, tally)
+        return rasterise(centre, tangent_u, tangent_v, opacity, features, camera, statistics)
 
     def mirrored(self, features: Tensor, alpha: Tensor, rays: Tensor, texels: Tensor) -> Tensor:
         """`reflection_probe.mirrored`."""

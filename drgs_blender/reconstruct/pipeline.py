@@ -81,7 +81,7 @@ class Settings:
     fixed : tuple of str
         Parameters of surfels on faces that are not learned: "offset", "opacity" (the paper's ablation).
     device : {"cpu", "cuda"}
-        "cpu", or "cuda" to learn on the first NVIDIA card; without one this processor does.
+        "cpu", or "cuda" to learn on the first NVIDIA card; without one the CPU does.
     """
 
     variant: Literal["p", "m"] = "p"

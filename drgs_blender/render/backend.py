@@ -98,7 +98,7 @@ class RenderBackend:
         frames, materials : tuple of array
             Written: origin, normal, geometric normal and view of the points; albedo, roughness and metallic.
         seen : tuple of array
-            Written: position, depth, object, face, place and barycentric coordinates, see `GBuffer`.
+            Written: position, depth, object, face, instance and barycentric coordinates, see `GBuffer`.
         """
         tie_to_mesh(scene, rules, view_of, samples, keys, frames, materials, seen)
 

@@ -22,7 +22,7 @@ from .denoise.oidn import denoise_oidn, require
 from .denoise.svgf_temporal import History, NoisyPicture
 from .film.cryptomatte import CryptoFilm
 from .film.film import COMPONENTS, Film
-from .film.motion_vectors import Instant, MotionFilm, vector_pass
+from .film.motion_vectors import MotionFilm, SceneState, vector_pass
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.mesh import primary_mesh
 from .gbuffer.surfels import Stages, primary_surfels, snap_windows
@@ -105,8 +105,8 @@ def render(
     if settings.denoise != "svgf":
         history = None
     left, top, right, bottom = camera.window
-    now = Instant(scene.vertices, scene.instances, parameters)
-    past = None if history is None else history.instant
+    now = SceneState(scene.vertices, scene.instances, parameters)
+    past = None if history is None else history.scene_state
     moving = [
         None if then is None else MotionFilm((bottom - top, right - left), (left, top), now, then)
         for then in (prepared.previous, prepared.following, past)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..core.asset.model import PosedSurfels
-from .film.motion_vectors import Instant
+from .film.motion_vectors import SceneState
 from .lights.environment import EnvironmentLight
 from .lights.light_sampler import Lights
 from .scene.trace_scene import TraceScene
@@ -28,7 +28,7 @@ class PreparedScene:
         All lights but the environment, emitting meshes included.
     surfel_bvh : SurfelBVH, optional
         The surfels that light meets, where ``frame.settings.rays_see`` is "surfels".
-    previous, following : Instant, optional
+    previous, following : SceneState, optional
         The scene one frame earlier and later, for motion vectors; None: nothing moves.
     """
 
@@ -37,5 +37,5 @@ class PreparedScene:
     surfels: PosedSurfels
     lights: Lights | None = None
     surfel_bvh: SurfelBVH | None = None
-    previous: Instant | None = None
-    following: Instant | None = None
+    previous: SceneState | None = None
+    following: SceneState | None = None

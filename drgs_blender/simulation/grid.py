@@ -1,4 +1,4 @@
-"""The grid of the particle solver and the particles on it, while a frame is computed: on this processor's cores."""
+"""The grid of the particle solver and the particles on it, while a frame is computed: on the CPU's cores."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Grid(ABC):
     most : int
         Steps that it takes at once, at most.
     launcher : Launcher, optional
-        Of the device that it works on, if that is not this processor.
+        Of the device that it works on, if that is not the CPU.
     """
 
     most = 1
@@ -124,7 +124,7 @@ class Grid(ABC):
 
 
 class HostGrid(Grid):
-    """On this processor: particles lie in the order of the blocks."""
+    """On the CPU: particles lie in the order of the blocks."""
 
     _state: Particles
     _a: Arrangement

@@ -88,7 +88,7 @@ class Job:
 
     def _surface(self) -> Array:
         """Vertices of the mesh as matter carries them, world."""
-        return self.solver.riders if self._carried is None else self._carried.vertices(self.solver)
+        return self.solver.markers if self._carried is None else self._carried.vertices(self.solver)
 
     def _to_object(self, points: Array, gradients: Array, vertices: Array) -> ParticleFrame:
         matrix = np.asarray(self.settings.matrix_world)

@@ -31,7 +31,7 @@ _BOUNDS = (0, 1, 5, 8)
 #: the last node held is then, over all positions of the grid, on average on the border itself.
 PINNED = np.float32(0.2)
 
-#: Share of the matter of the fullest node around below which a node says nothing about how a rider moves: the few
+#: Share of the matter of the fullest node around below which a node says nothing about how a marker moves: the few
 #: grains at its rim, pushed by all others, are no surface.
 BARE = np.float32(0.1)
 
@@ -116,7 +116,7 @@ def _steps():  # type: ignore[no-untyped-def]
 
 @inlined
 def _carried(scratch, base, wx, wy, wz):  # type: ignore[no-untyped-def]
-    """Velocity that matter gives to a rider, and the weight of the nodes it comes from: 0 where there is no matter."""
+    """Velocity that matter gives to a marker, and the weight of the nodes it comes from: 0 where there is no matter."""
     heaviest = _ZERO
     for ii in range(3):
         for jj in range(3):
@@ -408,7 +408,7 @@ def _move_particles(first, last, particles, properties, places, grid, dt, fastes
             blend = along * blend
             vx, vy, vz, _ = fold(blend)
             if mass[p] == _ZERO:
-                # Riders may be where some nodes have no matter: what there is counts fully; F follows no riders.
+                # Markers may be where some nodes have no matter: what there is counts fully; F follows no markers.
                 vx, vy, vz, weight = _carried(scratch, base, wx, wy, wz)
                 if weight <= _ZERO:
                     vx, vy, vz = v[p, 0], v[p, 1], v[p, 2]

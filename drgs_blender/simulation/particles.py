@@ -47,7 +47,7 @@ class Properties(NamedTuple):
     Attributes
     ----------
     mass : (n,) float32 array
-        kg; none: riders.
+        kg; none: markers.
     volume : (n,) float32 array
         Cubic metres at rest.
     model : (n,) uint8 array

@@ -92,8 +92,8 @@ class Rigid(Stepper):
         return np.tile(self.turn.astype(np.float32), (len(self.body.points), 1, 1))
 
     @property
-    def riders(self) -> Array:
-        return (self.body.riders - self._centre) @ self.turn.T + self.place
+    def markers(self) -> Array:
+        return (self.body.markers - self._centre) @ self.turn.T + self.place
 
     def arrays(self) -> dict[str, Array]:
         return {"place": self.place, "turn": self.turn, "motion": self.motion, "spin": self.spin}

@@ -48,7 +48,7 @@ class Body:
         Cubic metres.
     matter : ParticleMaterials
         Of the points.
-    riders : (k, 3) float64 array
+    markers : (k, 3) float64 array
         Points without mass that move along.
     pinned : (n,) bool array, optional
         Points that are kinematic.
@@ -59,7 +59,7 @@ class Body:
     points: Array
     volume: Array
     matter: ParticleMaterials
-    riders: Array = field(default_factory=lambda: np.empty((0, 3)))
+    markers: Array = field(default_factory=lambda: np.empty((0, 3)))
     pinned: Array | None = None
     velocity: Array | Sequence[float] = (0.0, 0.0, 0.0)
 
@@ -82,12 +82,12 @@ class Solver(Stepper):
         The Courant number (CFL condition): time step in parts of what elastic waves and viscosity bear; above 1 is
         unstable.
     device : str
-        One of `DEVICES`; what it cannot do is done by this processor, with a warning.
+        One of `DEVICES`; what it cannot do is done by the CPU, with a warning.
 
     Attributes
     ----------
     state : Particles
-        In the order of ``body.points`` and then ``body.riders``.
+        In the order of ``body.points`` and then ``body.markers``.
     """
 
     def __init__(
@@ -103,16 +103,16 @@ class Solver(Stepper):
         self.body, self.domain, self.forces = body, domain, forces or Forces()
         self.colliders = [MovingCollider(c, domain.spacing, domain.low, domain.high) for c in colliders]
         self.planes, self._fields = plane_rows(planes), FieldRows(self.forces.fields)
-        n, riders = len(body.points), len(body.riders)
+        n, markers = len(body.points), len(body.markers)
         matter = body.matter
-        mass = np.concatenate([body.volume * matter.density, np.zeros(riders)]).astype(np.float32)
-        volume = np.concatenate([body.volume, np.zeros(riders)]).astype(np.float32)
+        mass = np.concatenate([body.volume * matter.density, np.zeros(markers)]).astype(np.float32)
+        volume = np.concatenate([body.volume, np.zeros(markers)]).astype(np.float32)
 
         def padded(values: Array) -> Array:
-            return np.concatenate([values, np.zeros((riders, *values.shape[1:]), values.dtype)])
+            return np.concatenate([values, np.zeros((markers, *values.shape[1:]), values.dtype)])
 
         self._model = padded(matter.model)
-        self._reach = np.maximum(self._nearest(body.points, body.riders)[0], domain.spacing)
+        self._reach = np.maximum(self._nearest(body.points, body.markers)[0], domain.spacing)
         self._pins = np.flatnonzero(body.pinned) if body.pinned is not None else np.empty(0, np.int64)
         properties = Properties(mass, volume, self._model, padded(matter.parameters), padded(matter.keeps_shape))
         self._scene = Scene(
@@ -141,7 +141,7 @@ class Solver(Stepper):
 
     def _at_rest(self) -> Particles:
         body, n = self.body, len(self.body.points)
-        x = np.concatenate([body.points, body.riders]).astype(np.float64)
+        x = np.concatenate([body.points, body.markers]).astype(np.float64)
         v = np.zeros((len(x), 3), np.float32)
         v[:n] = np.asarray(body.velocity, np.float32)
         if len(x) > n:
@@ -174,7 +174,7 @@ class Solver(Stepper):
         return self.state.x[: len(self.body.points)]
 
     @property
-    def riders(self) -> Array:
+    def markers(self) -> Array:
         return self.state.x[len(self.body.points) :]
 
     def arrays(self) -> dict[str, Array]:
@@ -268,15 +268,15 @@ class Solver(Stepper):
         return found
 
     @staticmethod
-    def _nearest(points: Array, riders: Array) -> tuple[Array, Array]:
-        """Distance (k,) of each rider from the particle nearest to it, and which that is."""
-        if not len(riders):
+    def _nearest(points: Array, markers: Array) -> tuple[Array, Array]:
+        """Distance (k,) of each marker from the particle nearest to it, and which that is."""
+        if not len(markers):
             return np.empty(0), np.empty(0, np.int64)
-        found: tuple[Array, Array] = cKDTree(points).query(riders, workers=-1)
+        found: tuple[Array, Array] = cKDTree(points).query(markers, workers=-1)
         return found
 
     def _rejoin(self) -> None:
-        """Bring riders that matter has left behind back to it: the nearest particle carries them."""
+        """Bring markers that matter has left behind back to it: the nearest particle carries them."""
         n, state = len(self.body.points), self.state
         distance, nearest = self._nearest(state.x[:n], state.x[n:])
         lost = np.flatnonzero(distance > self._reach)

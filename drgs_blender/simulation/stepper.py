@@ -28,7 +28,7 @@ class Stepper(ABC):
     rate : float
         Time steps a second, at least.
     launcher : Launcher or None
-        Of the device that computes frames, if that is not this processor.
+        Of the device that computes frames, if that is not the CPU.
     colliders : list of MovingCollider
         Meshes that particles cannot enter.
     planes : array
@@ -58,7 +58,7 @@ class Stepper(ABC):
 
     @property
     @abstractmethod
-    def riders(self) -> Array:
+    def markers(self) -> Array:
         """(k, 3) float64 points that ride along, world."""
 
     @abstractmethod

@@ -192,7 +192,7 @@ class Lattice(Stepper):
         return found
 
     @property
-    def riders(self) -> Array:
+    def markers(self) -> Array:
         return np.empty((0, 3))  # matter that keeps its shape needs none
 
     @property

@@ -9,7 +9,7 @@ import pytest
 from pictures import assert_same_bits, fresh, with_meshes
 
 from drgs_blender.core.errors import Cancelled, UsageError
-from drgs_blender.core.frame import Moment, Pose
+from drgs_blender.core.frame import MotionStep, Pose
 from drgs_blender.render.camera import camera_parameters
 from drgs_blender.render.film.motion_vectors import project
 
@@ -44,7 +44,7 @@ def moving_frame(make_frame, **settings):
         poses = [Pose("Ball", (ball @ frame.objects[0].matrix_world)[None])]
         squares = np.stack([left, right]) @ frame.meshes[1].matrices
         meshes = [Pose("Floor", floor @ frame.meshes[0].matrices), Pose("Squares", squares)]
-        moments.append(Moment(moved, poses, meshes))
+        moments.append(MotionStep(moved, poses, meshes))
         maps.append({1: ball, 5: floor, 6: left, 7: right})
     frame.previous, frame.next = moments
     return frame, maps
@@ -128,7 +128,7 @@ def test_nothing_moves_where_nothing_is_said(session, make_frame, asset_path):
         (None, np.full((4, 4), np.nan)),
     ):
         same = [Pose(m.name, m.matrices.copy(), m.vertices.copy()) for m in frame.meshes]
-        frame.previous = frame.next = Moment(frame.camera, [Pose("Ball", matrices[None], vertices)], same)
+        frame.previous = frame.next = MotionStep(frame.camera, [Pose("Ball", matrices[None], vertices)], same)
         again = session.render(frame)
         assert (again["Vector"] == 0).all() and (again["Previous Position"] == again["Position"]).all()
         assert_same_bits(again, fresh(asset_path, frame))
@@ -144,7 +144,7 @@ def test_what_was_behind_the_camera_has_no_vector(session, make_frame):
     frame.passes = PASSES
     away = frame.camera.matrix_world.copy()
     away[1, 3] = 40.0  # looks along +Y from beyond the ball
-    frame.previous = Moment(replace(frame.camera, matrix_world=away), [None])
+    frame.previous = MotionStep(replace(frame.camera, matrix_world=away), [None])
     pictures = session.render(frame)
     assert (pictures["Vector"] == 0).all() and (pictures["Coverage"] > 0).any()
 

@@ -110,7 +110,7 @@ def test_what_is_no_engine_is_an_error_that_says_why(command, problem):
 def test_command_that_says_nothing_meets_the_deadline_once(tmp_path):
     """It is no engine, so that another start would only make the user wait longer."""
     program = f"open({str(tmp_path / 'starts')!r}, 'a').write('x'); import time; time.sleep(60)"
-    client = EngineClient([sys.executable, "-c", program], greeting=1.5)
+    client = EngineClient([sys.executable, "-c", program], handshake=1.5)
     start = time.monotonic()
     with pytest.raises(DeviceError, match="does not greet as an engine does"):
         client.start()

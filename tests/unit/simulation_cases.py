@@ -34,7 +34,7 @@ def solver_of(
     damping: float = 0.0,
     velocity: Any = (0, 0, 0),
     pinned: np.ndarray | None = None,
-    riders: Any = (),
+    markers: Any = (),
     colliders: Any = (),
     planes: Any = (),
     courant: float = 0.5,
@@ -46,7 +46,7 @@ def solver_of(
     low = points.min(axis=0) - 8 * h if low is None else low
     high = points.max(axis=0) + 8 * h if high is None else high
     volume = np.full(len(points), (h / 2) ** 3, np.float32)
-    body = Body(points, volume, matter, np.reshape(riders, (-1, 3)), pinned, velocity)
+    body = Body(points, volume, matter, np.reshape(markers, (-1, 3)), pinned, velocity)
     forces = Forces(gravity=gravity, damping=damping)
     return Solver(body, domain or aligned(low, high, h), forces, colliders, planes, courant)
 

@@ -15,7 +15,7 @@ from drgs_blender.cli.frame_lines import FrameLines
 from drgs_blender.cli.main import main
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.asset.model import Asset, Mesh
-from drgs_blender.core.frame import Camera, Frame, Moment, ObjectState, Pose, RenderSettings, World
+from drgs_blender.core.frame import Camera, Frame, MotionStep, ObjectState, Pose, RenderSettings, World
 from drgs_blender.core.passes import TEMPORAL
 from drgs_blender.deform.attach import attach
 from drgs_blender.engine.session import Session
@@ -65,7 +65,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory):
                 World(light),
                 RenderSettings(3 * samples, subpixel_samples=3, film_transparent=True),
                 TEMPORAL,
-                previous=Moment(seen(number - 1, side), [Pose("ball", placed(number - 1)[None])]),
+                previous=MotionStep(seen(number - 1, side), [Pose("ball", placed(number - 1)[None])]),
             )
             pictures = session.render(frame)
             frame_store.save(folder / name / f"{number:04d}.exr", pictures, frame, number, f"hash {number}")

@@ -136,7 +136,7 @@ def test_a_card_that_fails_between_hits_and_points_leaves_them_whole(monkeypatch
 
     def once(*arguments: object) -> object:
         hits = trace(*arguments)  # type: ignore[arg-type]
-        monkeypatch.setattr(device.launcher, "_room", broken)
+        monkeypatch.setattr(device.launcher, "_scratch_for", broken)
         return hits
 
     shape = 48, 64, int(parameters[SUBPIXELS])

@@ -31,15 +31,15 @@ from drgs_blender.simulation.gpu import cells, steps
 ARCHITECTURE = 80
 
 
-def made(works: tuple[object, ...], launcher: Launcher, folder: Path) -> set[object]:
-    """Compile what a device was asked for, of some works; those that were."""
+def made(wanted: tuple[object, ...], launcher: Launcher, folder: Path) -> set[object]:
+    """Compile what a device was asked for, of these kernels; those that were."""
     found = set()
-    for work, types in launcher._modules:
-        if work in works:
-            module = work.module(types, True)
+    for kernel, types in launcher._modules:
+        if kernel in wanted:
+            module = kernel.module(types, True)
             (file,) = warp.compile_aot_module(module, arch=ARCHITECTURE, module_dir=str(folder))
             assert Path(file).stat().st_size > 1000
-            found.add(work)
+            found.add(kernel)
     return found
 
 
@@ -56,11 +56,11 @@ def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
     history = None
     for picture in pictures(2):
         _, history = device.denoise_next(picture, history, True, False, nothing)
-    works = raster.BLEND, attach.ATTACH, *denoise.WORKS
-    works += deformation.WEIGH, deformation.SUM, deformation.POSE
-    works += bvhs.PLACE, camera_hits.TRACE, camera_hits.SHADE
-    works += splats.PROJECT, splats.KEY, splats.FIND, splats.GATHER, splats.LIST
-    assert made(works, device.launcher, tmp_path) == set(works)
+    wanted = raster.BLEND, attach.ATTACH, *denoise.KERNELS
+    wanted += deformation.WEIGH, deformation.SUM, deformation.POSE
+    wanted += bvhs.PLACE, camera_hits.TRACE, camera_hits.SHADE
+    wanted += splats.PROJECT, splats.KEY, splats.FIND, splats.GATHER, splats.LIST
+    assert made(wanted, device.launcher, tmp_path) == set(wanted)
     assert not device.failed
 
 
@@ -79,8 +79,10 @@ def test_learnings_kernels_compile_for_a_card(tmp_path: Path) -> None:
     test_device_learning.test_a_step_down(device)
     test_device_gather.test_what_arrives_and_its_derivatives(device, {})
     modules = kernels, losses, warp_backend, gather
-    works = {work for module in modules for work in vars(module).values() if isinstance(work, kernels.Work)}
-    assert made(tuple(works), device.launcher, tmp_path) == works
+    wanted = {
+        kernel for module in modules for kernel in vars(module).values() if isinstance(kernel, kernels.WarpKernel)
+    }
+    assert made(tuple(wanted), device.launcher, tmp_path) == wanted
 
 
 @pytest.mark.slow
@@ -89,7 +91,7 @@ def test_particles_kernels_compile_for_a_card(tmp_path: Path, case: str) -> None
     launcher = Launcher("cpu")
     test_device_mpm.test_a_step_is_the_processors_to_the_last_digits(launcher, case)
     test_device_gmls.test_a_device_carries_points_as_the_processor_does(launcher, "torn", 16, np.float64)
-    works = (
+    wanted = (
         cells.NUMBER,
         cells.LIST,
         cells.INDEX,
@@ -99,8 +101,8 @@ def test_particles_kernels_compile_for_a_card(tmp_path: Path, case: str) -> None
         steps.MOVE,
         steps.END_STEP,
     )
-    works += (gmls.CARRY,)
-    assert made(works, launcher, tmp_path) == set(works)
+    wanted += (gmls.CARRY,)
+    assert made(wanted, launcher, tmp_path) == set(wanted)
 
 
 @pytest.mark.skipif(os.environ.get("DRGS_FAULTS") != "whole", reason="takes minutes; DRGS_FAULTS=whole runs it")

@@ -111,7 +111,7 @@ def test_materials_and_light_are_those_that_the_processor_finds(
 ) -> None:
     capture, mesh, asked = balls(count=8, size=32), two_balls(BALLS), []
     launch = there.launcher.launch
-    monkeypatch.setattr(there.launcher, "launch", lambda work, *rest: asked.append(work) or launch(work, *rest))
+    monkeypatch.setattr(there.launcher, "launch", lambda kernel, *rest: asked.append(kernel) or launch(kernel, *rest))
     settings = Settings(iterations=40, pixels=128, cosine=4, ggx=4, light=4, environment=8, normals=True)
     here, other = (decouple(capture, mesh, settings, backend=by) for by in (CPU, there))
     assert asked == [GATHER] * 40

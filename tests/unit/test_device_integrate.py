@@ -249,7 +249,7 @@ def test_a_device_that_fails_is_left_alone_and_its_work_done_here(device: WarpRe
     scene, light, shining, points = under_lights()
     broken = WarpRenderBackend("cpu")
     monkeypatch.setattr(
-        broken.launcher, "_room", lambda *arguments: (_ for _ in ()).throw(RuntimeError("out of memory\nat 0"))
+        broken.launcher, "_scratch_for", lambda *arguments: (_ for _ in ()).throw(RuntimeError("out of memory\nat 0"))
     )
     found = broken.integrate(scene, light, points, SETTINGS, 3, shining)
     np.testing.assert_array_equal(found.components, integrate(scene, light, points, SETTINGS, 3, shining).components)
@@ -292,6 +292,6 @@ def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> Non
         array.setflags(write=True)
         array.view(np.uint8)[...] = 0x7F
     found = apart.integrate(scene, light, points, SETTINGS, 3, shining)
-    rooms = [room for own in apart.launcher._rooms.values() for room in own]
-    assert not apart.failed and rooms and not any(room.is_contiguous for room in rooms)
+    scratch = [scratch for own in apart.launcher._scratch.values() for scratch in own]
+    assert not apart.failed and scratch and not any(scratch.is_contiguous for scratch in scratch)
     assert psnr(found.total, expected.total) > 60.0

@@ -15,7 +15,7 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 from capture_cases import balls  # noqa: E402
 from test_reconstruct_attributes import EYE, surfels  # noqa: E402
 
-from drgs_blender.compute.warp.kernels import Work  # noqa: E402
+from drgs_blender.compute.warp.kernels import WarpKernel  # noqa: E402
 from drgs_blender.compute.warp.runtime import parts_of  # noqa: E402
 from drgs_blender.core.errors import DeviceError  # noqa: E402
 from drgs_blender.reconstruct.backend import CPU, LearningBackend  # noqa: E402
@@ -60,12 +60,12 @@ def assert_alike(
         assert (a - b).norm() <= close * a.norm(), (k, float(a.norm()), float((a - b).norm()))
 
 
-@pytest.mark.parametrize(("bands", "mirrors"), [(0, True), (2, True), (1, False)])
-def test_attributes(on_device: WarpLearningBackend, bands: int, mirrors: bool) -> None:
+@pytest.mark.parametrize(("bands", "reflections"), [(0, True), (2, True), (1, False)])
+def test_attributes(on_device: WarpLearningBackend, bands: int, reflections: bool) -> None:
     raw, centre = surfels()
     names = list(raw)
     assert_alike(
-        lambda by, *values: by.attributes(dict(zip(names, values, strict=True)), centre, EYE, bands, mirrors),
+        lambda by, *values: by.attributes(dict(zip(names, values, strict=True)), centre, EYE, bands, reflections),
         list(raw.values()), on_device,
     )  # fmt: skip
 
@@ -165,7 +165,7 @@ def test_first_steps_are_the_processors(capture: Capture, region: Region, on_dev
 def test_a_device_learns_as_well_as_the_processor(
     capture: Capture, region: Region, on_device: WarpLearningBackend
 ) -> None:
-    """All of the schedule: surfels cut, mirrors, shape. What begins as last digits grows, but leads no other way."""
+    """All of it: surfels cut, reflections, shape. What begins as last digits grows, but leads no other way."""
     here, other = (learned(capture, region, by, SCHEDULE.iterations) for by in (CPU, on_device))
     assert here.densification.rounds == other.densification.rounds == SCHEDULE.rounds
     assert here.psnr > 20
@@ -188,9 +188,9 @@ def test_a_state_of_one_processor_is_of_use_to_the_other(
 
 
 @pytest.mark.parametrize("error", [DeviceError("device cuda", "failed"), RuntimeError("CUDA out of memory")])
-@pytest.mark.parametrize("work", [kernels.PROJECT, kernels.SUM_PIXELS, losses.ROWS], ids=["forth", "back", "loss"])
+@pytest.mark.parametrize("kernel", [kernels.PROJECT, kernels.SUM_PIXELS, losses.ROWS], ids=["forth", "back", "loss"])
 def test_a_device_that_fails_is_a_warning_and_the_processor_goes_on(
-    capture: Capture, region: Region, work: Work, error: Exception, monkeypatch: pytest.MonkeyPatch,
+    capture: Capture, region: Region, kernel: WarpKernel, error: Exception, monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
     """From where it failed: nothing is lost."""
@@ -198,7 +198,7 @@ def test_a_device_that_fails_is_a_warning_and_the_processor_goes_on(
     training = learned(capture, region, on_device, 10)
     expected = Training(capture, region, SCHEDULE)
     expected.restore(training.arrays())
-    fail_at(work, on_device, error, monkeypatch)
+    fail_at(kernel, on_device, error, monkeypatch)
     for _ in range(10):
         training.step()
         expected.step()
@@ -211,12 +211,14 @@ def test_a_device_that_fails_is_a_warning_and_the_processor_goes_on(
     assert alike(expected, training) == 0
 
 
-def fail_at(work: Work, on_device: WarpLearningBackend, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have the device fail at some work from now on."""
+def fail_at(
+    kernel: WarpKernel, on_device: WarpLearningBackend, error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Have the device fail at a kernel from now on."""
     launch = on_device.launcher.launch
 
-    def failing(asked: Work, *arguments: Any) -> None:
-        if asked is work:
+    def failing(asked: WarpKernel, *arguments: Any) -> None:
+        if asked is kernel:
             raise error
         launch(asked, *arguments)
 
@@ -358,10 +360,10 @@ def test_nothing_of_this_process_meets_what_is_on_a_device(
     """A whole step with tensors that have a place but no content: torch refuses what it would refuse on a card."""
     asked = []
 
-    def launch(work: Work, pieces: int, arguments: Any, out: Any) -> None:
+    def launch(kernel: WarpKernel, pieces: int, arguments: Any, out: Any) -> None:
         tensors = [part for part in parts_of((arguments, out)) if isinstance(part, torch.Tensor)]
-        assert {tensor.device.type for tensor in tensors} == {"meta"}, work.function.__name__
-        asked.append(work)
+        assert {tensor.device.type for tensor in tensors} == {"meta"}, kernel.function.__name__
+        asked.append(kernel)
 
     on_device = WarpLearningBackend("cpu")
     on_device.device = torch.device("meta")
@@ -370,7 +372,7 @@ def test_nothing_of_this_process_meets_what_is_on_a_device(
     monkeypatch.setattr(device_raster, "starts", ends)
     monkeypatch.setattr(torch, "nonzero", lambda x: torch.zeros(90, x.dim(), dtype=torch.int64, device=x.device))
     monkeypatch.setattr(torch.Tensor, "__float__", lambda _: 0.5)
-    training = Training(capture, region, replace(SCHEDULE, mirrors=0.0, shape=0.0))
+    training = Training(capture, region, replace(SCHEDULE, reflections=0.0, shape=0.0))
     training.move(on_device)
     training.learner.step(training.views.of_step(0, half=True, without_held_out=False), 0.0)
     training.learner.optimiser.reindex(np.array([0, -1, 2]))

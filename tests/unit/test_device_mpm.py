@@ -49,7 +49,7 @@ def launcher() -> Launcher:
 
 
 def body(
-    material: str = "jelly", *, along: Any = (0, 0, 0), pinned: bool = False, riders: bool = False, **more: Any
+    material: str = "jelly", *, along: Any = (0, 0, 0), pinned: bool = False, markers: bool = False, **more: Any
 ) -> Solver:
     """A block that tumbles, is sheared, and stands a little above the floor."""
     points = np.add(lattice((0.3, 0.25, 0.25), H / 2), [0.012, 0.007, 0.05])
@@ -57,7 +57,7 @@ def body(
     more = {"gravity": (0.5, 0, -9.81), "low": (-1, -1, -1), "high": (1.5, 1.5, 1.5)} | more
     return solver_of(
         points, H, material, velocity=velocity, pinned=points[:, 0] < 0.06 if pinned else None,
-        riders=points[::7] + 0.011 if riders else (), **more,
+        markers=points[::7] + 0.011 if markers else (), **more,
     )  # fmt: skip
 
 
@@ -91,11 +91,11 @@ CASES: dict[str, Any] = {
     **{name: (lambda name=name: body(name)) for name in ("jelly", "cloth", "metal", "foam", "snow", "honey")},
     "sand": lambda: body("sand", planes=[floor()]),
     "pins": lambda: body(pinned=True),
-    "riders": lambda: body("water", riders=True),
+    "markers": lambda: body("water", markers=True),
     **{f"floor {c}": (lambda c=c: body("clay", planes=[floor(c)])) for c in ("separate", "slip", "sticky")},
     **{f"slab {c}": (lambda c=c: body("sand", colliders=[slab(c)])) for c in ("separate", "slip", "sticky")},
     "slab that bends": lambda: body(colliders=[slab(bends=True)]),
-    "all": lambda: body("metal", pinned=True, riders=True, planes=[floor()], colliders=[slab(), slab(bends=True)]),
+    "all": lambda: body("metal", pinned=True, markers=True, planes=[floor()], colliders=[slab(), slab(bends=True)]),
     "force": lambda: blown(body(), moved("force", power=1.5, nearest=0.05, farthest=2.0)),
     "force from a line": lambda: blown(body(), moved("force", shape="line", falloff="tube", radial=1.2, inner=0.01)),
     "wind": lambda: blown(body(), moved("wind", shape="plane", side="above"), wind=(4.0, 1.0, 0.0), drag=3.0),

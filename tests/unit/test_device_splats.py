@@ -77,7 +77,7 @@ def test_a_card_that_fails_after_its_splats_are_made_leaves_a_whole_picture(monk
     def broken(*arguments: object) -> None:
         raise RuntimeError("out of memory")
 
-    monkeypatch.setattr(device.launcher, "_room", broken)
+    monkeypatch.setattr(device.launcher, "_scratch_for", broken)
     np.testing.assert_array_equal(device.rasterise(there, 0, 50).alpha, rasterise(here, 0, 50).alpha)
     assert "out of memory" in device.failed
     again = both(device, random_surfels(1500))[1]  # the card is left alone

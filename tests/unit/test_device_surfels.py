@@ -23,7 +23,7 @@ from drgs_blender.core.errors import DeviceError  # noqa: E402
 from drgs_blender.reconstruct.gpu import raster as there  # noqa: E402
 from drgs_blender.reconstruct.gpu.launch import TensorLauncher  # noqa: E402
 from drgs_blender.reconstruct.model import raster as here  # noqa: E402
-from drgs_blender.reconstruct.model.raster import Tally  # noqa: E402
+from drgs_blender.reconstruct.model.raster import GradientStatistics  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -47,13 +47,13 @@ def of_its_own(monkeypatch: pytest.MonkeyPatch) -> Iterator[TensorLauncher]:
 
 
 def seen(rasterise: Any, n: int, size: float, width: int, height: int) -> list[Any]:
-    """Maps, gradients and tally of random surfels."""
-    given, tally = surfels(n, seed=n, size=size), Tally.of(n)
-    maps = rasterise(**given, camera=camera(width, height), tally=tally)
+    """Maps, gradients and statistics of random surfels."""
+    given, statistics = surfels(n, seed=n, size=size), GradientStatistics.of(n)
+    maps = rasterise(**given, camera=camera(width, height), statistics=statistics)
     found = [maps.features, maps.alpha, maps.depth, maps.median, maps.distortion]
     rng = np.random.default_rng(1)
     sum((m * torch.tensor(rng.normal(size=m.shape), dtype=torch.float32)).sum() for m in found).backward()
-    return [*(m.detach() for m in found), *(v.grad for v in given.values()), tally.travel, tally.views]
+    return [*(m.detach() for m in found), *(v.grad for v in given.values()), statistics.gradient, statistics.views]
 
 
 SIZES = [(60, 0.25, 37, 29), (12, 1.5, 100, 70), (2000, 0.08, 100, 70)]

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from drgs_blender.compute.jit import njit
-from drgs_blender.compute.warp.kernels import Launcher, Room, Work
+from drgs_blender.compute.warp.kernels import Launcher, ScratchArray, WarpKernel
 from drgs_blender.compute.warp.runtime import load_module, warp
 from drgs_blender.compute.warp.translate import Native, Translation
 from drgs_blender.compute.warp.types import Array, Struct, TranslationError
@@ -245,10 +245,10 @@ def _at(span, i):  # type: ignore[no-untyped-def]
     return x
 
 
-def records(lane, lanes, room, spans, out):  # type: ignore[no-untyped-def]
+def records(thread, stride, scratch, spans, out):  # type: ignore[no-untyped-def]
     values, ends, _, scale = spans.first
-    room.count[0] = len(values)
-    for i in range(lane, room.count[0], lanes):
+    scratch.count[0] = len(values)
+    for i in range(thread, scratch.count[0], stride):
         out[0][i] = _at(spans.first, i) + F(spans.start)
         out[1][i] = _at(Span(values, (ends[1], ends[0]), False, scale), i)
 
@@ -263,7 +263,7 @@ def test_records_hold_arrays_and_tuples_by_name() -> None:
         spans = Spans(Span(values, (F(0.25), F(3.0)), doubled, Scale(F(0.3), 7)), 5)
         expected, found = np.zeros((2, 40), np.float32), np.zeros((2, 40), np.float32)
         records(0, 1, Own(np.zeros(1, np.int64)), spans, expected)
-        Launcher("cpu").launch(Work(records, Own(Room("int64", (1,))), {}), 40, [spans], list(found))
+        Launcher("cpu").launch(WarpKernel(records, Own(ScratchArray("int64", (1,))), {}), 40, [spans], list(found))
         np.testing.assert_array_equal(found, expected)
 
 
@@ -278,8 +278,8 @@ def test_powers_and_angles() -> None:
     np.testing.assert_allclose(on_device(powers, columns), here(powers, columns), rtol=5e-7, atol=1e-7)
 
 
-def rows_of(lane, lanes, room, table, out):  # type: ignore[no-untyped-def]
-    for i in range(lane, len(table), lanes):
+def rows_of(thread, stride, scratch, table, out):  # type: ignore[no-untyped-def]
+    for i in range(thread, len(table), stride):
         row = table[i]
         out[0][i] = _inner(row[1], table[i, 0]) + len(row)
 
@@ -291,14 +291,14 @@ def _inner(a, b):  # type: ignore[no-untyped-def]
 
 def test_rows_of_arrays_are_arrays() -> None:
     table, found = np.random.default_rng(1).normal(size=(9, 2, 3)), np.zeros(9)
-    Launcher("cpu").launch(Work(rows_of, (), {}), 9, [table], [found])
+    Launcher("cpu").launch(WarpKernel(rows_of, (), {}), 9, [table], [found])
     np.testing.assert_array_equal(found, table[:, 1, 0] * table[:, 0, 1] + 3 + 2)
 
 
 def test_a_recorded_launch_does_its_work_whenever_it_is_called() -> None:
     launcher = Launcher("cpu")
     table, found = launcher.array(np.ones((9, 2, 3)), copy=True), launcher.zeros((9,), "float64")
-    again = launcher.recorded(Work(rows_of, (), {}), 9, [table], [found])
+    again = launcher.recorded(WarpKernel(rows_of, (), {}), 9, [table], [found])
     assert not found.numpy().any()
     for value in (1.0, 2.0):
         table.fill_(value)

@@ -11,7 +11,7 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from test_device_integrate import ball, floor, placed
 
-from drgs_blender.compute.warp.kernels import Work
+from drgs_blender.compute.warp.kernels import WarpKernel
 from drgs_blender.core.frame import Visibility
 from drgs_blender.render.gpu.native_functions import NATIVES
 from drgs_blender.render.gpu.scene_mirror import Mirror
@@ -21,16 +21,16 @@ from drgs_blender.render.scene.ray_masks import DIFFUSE
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 
-def cast(lane, lanes, room, tracer, origin, direction, mask, out):  # type: ignore[no-untyped-def]
+def cast(thread, stride, scratch, tracer, origin, direction, mask, out):  # type: ignore[no-untyped-def]
     depth, face, place = out
-    for i in range(lane, len(origin), lanes):
+    for i in range(thread, len(origin), stride):
         depth[i], face[i], place[i], _, _, _, _, _ = nearest(
             tracer, origin[i, 0], origin[i, 1], origin[i, 2], direction[i, 0], direction[i, 1], direction[i, 2],
             np.float32(0.0), np.float32(100.0), np.int32(mask),
         )  # fmt: skip
 
 
-CAST = Work(cast, (), NATIVES)
+CAST = WarpKernel(cast, (), NATIVES)
 
 
 def hits(device: WarpRenderBackend, scene: TraceScene, count: int = 4000) -> list[tuple[np.ndarray, ...]]:

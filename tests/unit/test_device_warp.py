@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from drgs_blender.compute.folders import cache_folder
-from drgs_blender.compute.warp.kernels import Launcher, Work
+from drgs_blender.compute.warp.kernels import Launcher, WarpKernel
 from drgs_blender.compute.warp.runtime import VERSION, load_module, warp
 from drgs_blender.core.errors import Cancelled, DeviceError
 from drgs_blender.core.frame import RenderSettings
@@ -55,13 +55,13 @@ def test_warp_prints_nothing_where_programs_read(tmp_path: Path) -> None:
     code = """
 import numpy as np
 from drgs_blender.compute.folders import cache_folder
-from drgs_blender.compute.warp.kernels import Launcher, Work
-def double(lane, lanes, room, x, out):
-    for i in range(lane, len(x), lanes):
+from drgs_blender.compute.warp.kernels import Launcher, WarpKernel
+def double(thread, stride, scratch, x, out):
+    for i in range(thread, len(x), stride):
         out[0][i] = x[i] + x[i]
 found = np.zeros(3, np.float32)
 """
-    script = f"{code}Launcher('cpu').launch(Work(double, (), {{}}), 3, [np.ones(3, np.float32)], [found])\n"
+    script = f"{code}Launcher('cpu').launch(WarpKernel(double, (), {{}}), 3, [np.ones(3, np.float32)], [found])\n"
     path = tmp_path / "silent.py"
     path.write_text(script + "assert (found == 2).all()\n")
     variables = os.environ | {"DRGS_CACHE_DIR": str(tmp_path)}
@@ -80,7 +80,7 @@ def test_whatever_warp_raises_is_the_devices_failure_but_a_stop_is_none() -> Non
         raise Cancelled
 
 
-def _nothing(lane, lanes, room, x, out):  # type: ignore[no-untyped-def]
+def _nothing(thread, stride, scratch, x, out):  # type: ignore[no-untyped-def]
     pass
 
 
@@ -99,7 +99,7 @@ def test_a_folder_of_kernels_that_cannot_be_written_is_the_devices_failure(folde
     shutil.rmtree(folder / "warp", ignore_errors=True)
     (folder / "warp").write_bytes(b"")
     with pytest.raises(DeviceError, match="nothing"):
-        launcher.launch(Work(_nothing, (), {}), 1, [np.ones(7, np.int8)], [np.zeros(1)])
+        launcher.launch(WarpKernel(_nothing, (), {}), 1, [np.ones(7, np.int8)], [np.zeros(1)])
 
 
 def test_a_module_that_does_not_load_is_not_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ def surfels(n: int = 200, seed: int = 0) -> tuple[dict[str, torch.Tensor], torch
     return raw, torch.tensor(rng.normal(size=(n, 3)), dtype=torch.float32)
 
 
-def reference(p: dict[str, torch.Tensor], centre: torch.Tensor, bands: int, mirrors: bool) -> list[torch.Tensor]:
+def reference(p: dict[str, torch.Tensor], centre: torch.Tensor, bands: int, reflections: bool) -> list[torch.Tensor]:
     away = torch.nn.functional.normalize(centre.double() - torch.tensor(EYE), dim=1)
     w, x, y, z = torch.nn.functional.normalize(p["rotation"], dim=1).unbind(1)
     turn = torch.stack([
@@ -34,17 +34,17 @@ def reference(p: dict[str, torch.Tensor], centre: torch.Tensor, bands: int, mirr
     colour = (0.5 + (torch.tensor(basis(away.numpy(), bands))[:, :, None] * p["sh"][:, :k]).sum(1)).clamp(min=0)
     side = -torch.sign((away * normal).sum(1, keepdim=True)).detach()
     features = [colour, side * normal]
-    if mirrors:
+    if reflections:
         features += [torch.sigmoid(p["tint"]), torch.sigmoid(p["blur"])[:, None]]
     return [u * size[:, :1], v * size[:, 1:], torch.sigmoid(p["opacity"]), torch.cat(features, 1)]
 
 
-@pytest.mark.parametrize(("bands", "mirrors"), [(0, True), (2, True), (1, False)])
-def test_values_and_gradients(bands, mirrors):
+@pytest.mark.parametrize(("bands", "reflections"), [(0, True), (2, True), (1, False)])
+def test_values_and_gradients(bands, reflections):
     raw, centre = surfels()
     mine = {k: v.clone().requires_grad_() for k, v in raw.items()}
     plain = {k: v.double().requires_grad_() for k, v in raw.items()}
-    found, expected = attributes(mine, centre, EYE, bands, mirrors), reference(plain, centre, bands, mirrors)
+    found, expected = attributes(mine, centre, EYE, bands, reflections), reference(plain, centre, bands, reflections)
     rng = np.random.default_rng(1)
     pull = [torch.tensor(rng.normal(size=e.shape)) for e in expected]
     for a, e in zip(found, expected, strict=True):

@@ -12,7 +12,7 @@ from drgs_blender.core.asset.model import PosedSurfels  # noqa: E402
 from drgs_blender.core.errors import UsageError  # noqa: E402
 from drgs_blender.core.frame import Camera, RenderSettings  # noqa: E402
 from drgs_blender.reconstruct.model.projection import LOW_PASS  # noqa: E402
-from drgs_blender.reconstruct.model.raster import Tally, rasterise  # noqa: E402
+from drgs_blender.reconstruct.model.raster import GradientStatistics, rasterise  # noqa: E402
 from drgs_blender.render.camera import camera_parameters  # noqa: E402
 from drgs_blender.render.reference import raster as reference  # noqa: E402
 from drgs_blender.render.surfels import raster as renderer  # noqa: E402
@@ -139,10 +139,12 @@ def test_same_bits_with_any_number_of_threads_and_again():
     try:
         for count in (1, threads, threads):
             use_threads(count)
-            given, tally = surfels(2000, seed=5, size=0.08), Tally.of(2000)
-            maps = rasterise(**given, camera=view, tally=tally)
+            given, statistics = surfels(2000, seed=5, size=0.08), GradientStatistics.of(2000)
+            maps = rasterise(**given, camera=view, statistics=statistics)
             (maps.features.square().sum() + maps.depth.sum() + maps.distortion.sum()).backward()
-            results.append([maps.features.detach().numpy(), *(v.grad.numpy() for v in given.values()), tally.travel])
+            results.append(
+                [maps.features.detach().numpy(), *(v.grad.numpy() for v in given.values()), statistics.gradient]
+            )
     finally:
         use_threads(threads)
     for other in results[1:]:

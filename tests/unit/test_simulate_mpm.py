@@ -459,14 +459,14 @@ def test_riders_are_not_lost_when_sand_falls_apart():
     side, axis = rng.integers(2, size=400), rng.integers(3, size=400)
     on[np.arange(400), axis] = np.where(side, points.max(axis=0)[axis] + h / 4, points.min(axis=0)[axis] - h / 4)
     solver = solver_of(
-        points, h, "sand", riders=on, gravity=(0, 0, -9.81), velocity=(0, 0, -2.0), low=(-1.5, -1.5, -1.6),
+        points, h, "sand", markers=on, gravity=(0, 0, -9.81), velocity=(0, 0, -2.0), low=(-1.5, -1.5, -1.6),
         high=(1.8, 1.8, 0.8), colliders=[Collider("plate", *box((0, 0, -0.12), (0.3, 0.3, 0)))],
     )  # fmt: skip
     for _ in range(7):
         solver.advance(FRAME)
-        apart = cKDTree(solver.points).query(solver.riders)[0]
+        apart = cKDTree(solver.points).query(solver.markers)[0]
         assert apart.max() <= h * (1 + 1e-6)
-        assert np.isfinite(solver.riders).all()
+        assert np.isfinite(solver.markers).all()
 
 
 def test_riders_move_with_the_matter():
@@ -482,9 +482,9 @@ def test_riders_move_with_the_matter():
     solver = Solver(body, Domain.around([-1] * 3, [2] * 3, h), Forces(gravity=(0, 0, 0)))
     mass = momenta(solver_of(points, h, "sand", velocity=(0.5, 0.2, 1.0)))[0]
     solver.advance(0.4)
-    assert np.abs(solver.riders - corners - [0.2, 0.08, 0.4]).max() < 1e-4
+    assert np.abs(solver.markers - corners - [0.2, 0.08, 0.4]).max() < 1e-4
     m = masses(solver)[:, None]
-    assert (m * solver.state.v[: len(points)]).sum(axis=0) == pytest.approx(mass, rel=1e-4)  # riders weigh nothing
+    assert (m * solver.state.v[: len(points)]).sum(axis=0) == pytest.approx(mass, rel=1e-4)  # markers weigh nothing
 
 
 def test_what_goes_wrong_is_said_with_frame_cause_and_remedy():

@@ -13,7 +13,7 @@ from drgs_blender.render.denoise.svgf_spatial import prepare
 from drgs_blender.render.denoise.svgf_temporal import NoisyPicture, denoise_next
 from drgs_blender.render.denoise.svgf_window import window
 from drgs_blender.render.film.guides import Guides
-from drgs_blender.render.film.motion_vectors import Instant, Motion, MotionFilm, previous_positions, project
+from drgs_blender.render.film.motion_vectors import Motion, MotionFilm, SceneState, previous_positions, project
 
 H, W = 48, 64
 PITCH = 1e-3  # metres a pixel
@@ -111,10 +111,10 @@ def test_projection_inverts_the_camera_ray(orthographic: bool) -> None:
         assert np.allclose(project(p, *(o[:3] + depth * o[3:])), (x, y, depth), atol=1e-9)
 
 
-def instant(vertices: np.ndarray | None = None, places: object = (), **changes: object) -> Instant:
+def scene_state(vertices: np.ndarray | None = None, places: object = (), **changes: object) -> SceneState:
     """The given shapes before the camera."""
     shapes = np.zeros((0, 3), np.float32) if vertices is None else vertices
-    return Instant(shapes, np.array(places, np.float32).reshape(-1, 3, 4), parameters(**changes))
+    return SceneState(shapes, np.array(places, np.float32).reshape(-1, 3, 4), parameters(**changes))
 
 
 def mesh(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -136,13 +136,13 @@ def test_points_move_with_their_faces() -> None:
     before = (vertices @ turn.T + [1, 2, 3]).astype(np.float32)
     for points in (on, on + tilt):  # on the mesh, and off it
         tied = face, np.full(200, -1, np.int32), weights[:, 1:]
-        found = previous_positions(faces, instant(vertices), instant(before), *tied, points.astype(np.float32))
+        found = previous_positions(faces, scene_state(vertices), scene_state(before), *tied, points.astype(np.float32))
         assert np.abs(found - (points @ turn.T + [1, 2, 3])).max() < 2e-5
     # Any affine map: what lies in the face's plane follows exactly, what stands off keeps its distance.
     matrix = rng.normal(size=(3, 3))
     before = (vertices @ matrix.T).astype(np.float32)
     shifted = on + 0.05 * (corners[:, 1] - corners[:, 0])
-    found = previous_positions(faces, instant(vertices), instant(before), *tied, shifted.astype(np.float32))
+    found = previous_positions(faces, scene_state(vertices), scene_state(before), *tied, shifted.astype(np.float32))
     assert np.abs(found - shifted @ matrix.T).max() < 2e-4
 
 
@@ -152,23 +152,23 @@ def test_points_without_a_face_stand_still_and_flat_faces_do_no_harm() -> None:
     points = np.random.default_rng(3).normal(size=(2, 3)).astype(np.float32)
     third = np.full((2, 2), 1 / 3, np.float32)
     tied = np.array([-1, 3], np.int32), np.array([-1, -1], np.int32), third
-    found = previous_positions(faces, instant(vertices), instant(vertices + np.float32(1)), *tied, points)
+    found = previous_positions(faces, scene_state(vertices), scene_state(vertices + np.float32(1)), *tied, points)
     assert (found[0] == points[0]).all()
     assert np.allclose(found[1], points[1] + 1, atol=1e-5)
 
 
 def test_vectors_lead_to_the_place_in_the_picture_before() -> None:
     guides = wall()
-    film = MotionFilm((H, W), (0, 0), instant(), instant())
+    film = MotionFilm((H, W), (0, 0), scene_state(), scene_state())
     rest = film.motion(guides.position, guides.coverage)
     assert (rest.vector == 0).all() and (rest.previous == guides.position).all()
     matrix = camera().matrix_world.copy()
     matrix[0, 3] = 3 * PITCH  # the camera was three pixels further right: the wall, further left in its picture
-    film.then = instant(matrix_world=matrix)
+    film.then = scene_state(matrix_world=matrix)
     found = film.motion(guides.position, guides.coverage)
     assert np.allclose(found.vector, [-3, 0], atol=1e-4)
     film.displacement[..., 2] = 2 * PITCH  # the wall was higher
-    film.then = instant()
+    film.then = scene_state()
     found = film.motion(guides.position, guides.coverage)
     assert np.allclose(found.vector, [0, -2], atol=1e-4)
     film.displacement[..., 1] = -5  # it was behind the camera
@@ -190,7 +190,7 @@ def test_samples_make_up_a_pixels_motion_as_they_make_up_its_position() -> None:
     buffer.points.weight[:] = [0.25, 0.75, 1.0, 1.0]
     buffer.points.flags[3] = CATCHER
     previous = np.float32([[4, 0, 0], [0, 4, 0], [9, 9, 9], [7, 7, 7]])
-    film = MotionFilm((H, W), (0, 0), instant(), instant())
+    film = MotionFilm((H, W), (0, 0), scene_state(), scene_state())
     buffer.face[:] = 3
     film.displace(buffer, previous)
     assert np.allclose(film.displacement[7, 9], [1, 3, 0])

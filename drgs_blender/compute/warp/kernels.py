@@ -1,7 +1,7 @@
 """Kernels of translated functions: made when they are first needed, launched with arrays of this process or a device's.
 
-What is launched is a function ``f(lane, lanes, room, *arguments, out)`` that does every `lanes`-th piece of some work
-from the `lane`-th on, with scratch memory of its own, and writes to the arrays `out`.
+What is launched is a function ``f(thread, stride, scratch, *arguments, out)``, a grid-stride loop: it does every
+`stride`-th piece from the `thread`-th on, with scratch memory of its own, and writes to the arrays `out`.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from .types import Record, Type, given, like, spelled
 
 Array = np.ndarray
 
-#: Threads (lanes) of one launch at most.
+#: Threads of one launch at most.
 MAX_THREADS = 1 << 17
 
 
-class Room(NamedTuple):
-    """An array of scratch memory for one lane: type of its elements, and its shape."""
+class ScratchArray(NamedTuple):
+    """An array of scratch memory for one thread: type of its elements, and its shape."""
 
     element: str
     shape: tuple[int, ...]
 
 
-#: Scratch memory of a function: nested tuples and named tuples of `Room`.
-Rooms = Any
+#: Scratch memory of a function: nested tuples and named tuples of `ScratchArray`.
+ScratchTree = Any
 
 
-class Work:
+class WarpKernel:
     """A function that can be launched.
 
     Parameters
     ----------
     function : callable
         See this module's head.
-    rooms : Room or tuple
-        Of what it takes as `room`.
+    scratch : ScratchArray or tuple
+        Its scratch memory.
     natives : mapping
         See `Translation`.
     constants : callable
@@ -54,24 +54,24 @@ class Work:
     def __init__(
         self,
         function: Callable[..., Any],
-        rooms: Rooms,
+        scratch: ScratchTree,
         natives: Mapping[Any, Any],
         constants: Constants = lambda module, name, value: value,
     ) -> None:
-        self.function, self.rooms = function, rooms
+        self.function, self.scratch = function, scratch
         self._natives, self._constants = natives, constants
 
     def module(self, types: tuple[Type, ...], fused: bool) -> ModuleType:
         """Module whose ``run`` is the kernel for arguments of these types."""
         translation = Translation(self._natives, self._constants, fused)
-        kinds = _types(self.rooms)
+        kinds = _types(self.scratch)
         made = translation.function(self.function, ["int64", "int64", kinds, *types])
-        rooms = [f"r{i}" for i in range(len(given(kinds)))]
+        scratch = [f"r{i}" for i in range(len(given(kinds)))]
         names = [f"a{i}" for i in range(len(given(types)))]
-        parameters = ["lanes: wp.int64"]
-        parameters += [f"{n}: {ArrayType(k.element, k.axes + 1)}" for n, k in zip(rooms, given(kinds))]
+        parameters = ["stride: wp.int64"]
+        parameters += [f"{n}: {ArrayType(k.element, k.axes + 1)}" for n, k in zip(scratch, given(kinds))]
         parameters += [f"{n}: {spelled(k)}" for n, k in zip(names, given(types))]
-        arguments = ["wp.int64(t)", "lanes", *(f"{n}[t]" for n in rooms), *names]
+        arguments = ["wp.int64(t)", "stride", *(f"{n}[t]" for n in scratch), *names]
         translation.add(
             f"@wp.kernel\ndef run({', '.join(parameters)}):\n    t = wp.tid()\n    {made.name}({', '.join(arguments)})"
         )
@@ -79,7 +79,7 @@ class Work:
 
 
 class Launcher:
-    """Launches work on one device.
+    """Launches kernels on one device.
 
     Parameters
     ----------
@@ -95,11 +95,11 @@ class Launcher:
     def __init__(self, device: str) -> None:
         self.device = warp().get_device(device)
         self.apart = bool(self.device.is_cuda)
-        self._rooms: dict[Work, list[Any]] = {}
-        self._modules: dict[tuple[Work, tuple[Type, ...]], ModuleType] = {}
+        self._scratch: dict[WarpKernel, list[Any]] = {}
+        self._modules: dict[tuple[WarpKernel, tuple[Type, ...]], ModuleType] = {}
 
     def array(self, array: Array, copy: bool | None = None) -> Any:
-        """A Warp array of an array's content; on the processor it is the same memory unless a copy is asked for."""
+        """A Warp array of an array's content; on the CPU it is the same memory unless a copy is asked for."""
         wp = warp()
         copy = self.apart if copy is None else copy
         array = np.ascontiguousarray(array)
@@ -109,33 +109,35 @@ class Launcher:
         """An array on the device."""
         return warp().zeros(shape, dtype=getattr(warp(), element), device=self.device)
 
-    def launch(self, work: Work, pieces: int, arguments: Sequence[Any], out: Sequence[Any]) -> None:
-        """Do `pieces` of work.
+    def launch(self, kernel: WarpKernel, pieces: int, arguments: Sequence[Any], out: Sequence[Any]) -> None:
+        """Do `pieces` of a kernel's work.
 
         Parameters
         ----------
-        work : Work
+        kernel : WarpKernel
         pieces : int
         arguments : sequence
             Numbers, arrays here or on the device, tuples and named tuples of all these.
         out : sequence
             Arrays that are written to, or tuples of them: those of this process as a whole, those on the device where
-            the work does.
+            the kernel does.
 
         Raises
         ------
         DeviceError
             When the device fails, for one of the reasons that a device has.
         """
-        with self.failures(work.function.__name__.replace("_", " ")):
+        with self.failures(kernel.function.__name__.replace("_", " ")):
             arrays = list(parts_of(tuple(out)))
             found = [a if is_there(a) else self.zeros(a.shape, a.dtype.name) for a in arrays]
-            self._launch(work, pieces, arguments, tuple(out), found)
+            self._launch(kernel, pieces, arguments, tuple(out), found)
             for array, result in zip(arrays, found):
                 if array is not result:
                     array[...] = result.numpy()
 
-    def recorded(self, work: Work, pieces: int, arguments: Sequence[Any], out: Sequence[Any]) -> Callable[[], None]:
+    def recorded(
+        self, kernel: WarpKernel, pieces: int, arguments: Sequence[Any], out: Sequence[Any]
+    ) -> Callable[[], None]:
         """A recorded launch, executed whenever it is called, at little cost; all its arrays are the device's.
 
         Raises
@@ -143,9 +145,9 @@ class Launcher:
         DeviceError
             As `launch`; what it does later belongs into `failures`.
         """
-        with self.failures(work.function.__name__.replace("_", " ")):
-            made = self._launch(work, pieces, arguments, tuple(out), list(parts_of(tuple(out))), record_cmd=True)
-            kept = arguments, out, self._rooms.get(work)
+        with self.failures(kernel.function.__name__.replace("_", " ")):
+            made = self._launch(kernel, pieces, arguments, tuple(out), list(parts_of(tuple(out))), record_cmd=True)
+            kept = arguments, out, self._scratch.get(kernel)
 
             def again(kept: Any = kept) -> None:
                 made.launch()
@@ -153,22 +155,28 @@ class Launcher:
             return again
 
     def _launch(
-        self, work: Work, pieces: int, arguments: Sequence[Any], out: tuple[Any, ...], found: list[Any], **how: bool
+        self,
+        kernel: WarpKernel,
+        pieces: int,
+        arguments: Sequence[Any],
+        out: tuple[Any, ...],
+        found: list[Any],
+        **how: bool,
     ) -> Any:
-        module = self._ready(work, tuple(type_for(a) for a in (*arguments, out)))
-        lanes = min(pieces, MAX_THREADS)
+        module = self._ready(kernel, tuple(type_for(a) for a in (*arguments, out)))
+        stride = min(pieces, MAX_THREADS)
         inputs = [self._argument(module, part) for part in parts_of(tuple(arguments))]
-        given = [lanes, *self._room(work, lanes), *inputs, *found]
-        return warp().launch(module.run, lanes, given, device=self.device, **how)
+        given = [stride, *self._scratch_for(kernel, stride), *inputs, *found]
+        return warp().launch(module.run, stride, given, device=self.device, **how)
 
-    def _ready(self, work: Work, types: tuple[Type, ...]) -> ModuleType:
+    def _ready(self, kernel: WarpKernel, types: tuple[Type, ...]) -> ModuleType:
         """The module for arguments of these types, compiled."""
-        if (work, types) not in self._modules:
+        if (kernel, types) not in self._modules:
             with preparing():
-                module = work.module(types, self.device.is_cuda)
+                module = kernel.module(types, self.device.is_cuda)
                 warp().load_module(module, self.device)
-            self._modules[work, types] = module
-        return self._modules[work, types]
+            self._modules[kernel, types] = module
+        return self._modules[kernel, types]
 
     @contextlib.contextmanager
     def failures(self, work: str) -> Iterator[None]:
@@ -192,29 +200,29 @@ class Launcher:
             return struct
         return value.item() if isinstance(value, np.generic) else value
 
-    def _room(self, work: Work, lanes: int) -> list[Any]:
-        """Scratch memory; neighbouring lanes find theirs next to each other on a card."""
-        known = self._rooms.get(work)
-        if known and known[0].shape[0] >= lanes:
+    def _scratch_for(self, kernel: WarpKernel, stride: int) -> list[Any]:
+        """Scratch memory; neighbouring threads find theirs next to each other on a card."""
+        known = self._scratch.get(kernel)
+        if known and known[0].shape[0] >= stride:
             return known
         wp = warp()
         made = []
-        for room in _flat(work.rooms):
-            dtype, axes = getattr(wp, room.element), len(room.shape)
+        for array in _flat(kernel.scratch):
+            dtype, axes = getattr(wp, array.element), len(array.shape)
             if self.apart:
-                turned = wp.zeros((*room.shape, lanes), dtype=dtype, device=self.device)
+                turned = wp.zeros((*array.shape, stride), dtype=dtype, device=self.device)
                 made.append(turned.transpose((axes, *range(axes))))
             else:
-                made.append(wp.zeros((lanes, *room.shape), dtype=dtype, device=self.device))
-        self._rooms[work] = made
+                made.append(wp.zeros((stride, *array.shape), dtype=dtype, device=self.device))
+        self._scratch[kernel] = made
         return made
 
 
-def _flat(rooms: Rooms) -> list[Room]:
-    return [rooms] if isinstance(rooms, Room) else [room for inner in rooms for room in _flat(inner)]
+def _flat(scratch: ScratchTree) -> list[ScratchArray]:
+    return [scratch] if isinstance(scratch, ScratchArray) else [array for inner in scratch for array in _flat(inner)]
 
 
-def _types(rooms: Rooms) -> Type:
-    if isinstance(rooms, Room):
-        return ArrayType(rooms.element, len(rooms.shape))
-    return like(Record(type(rooms), ()) if hasattr(rooms, "_fields") else (), map(_types, rooms))
+def _types(scratch: ScratchTree) -> Type:
+    if isinstance(scratch, ScratchArray):
+        return ArrayType(scratch.element, len(scratch.shape))
+    return like(Record(type(scratch), ()) if hasattr(scratch, "_fields") else (), map(_types, scratch))

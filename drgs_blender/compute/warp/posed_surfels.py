@@ -1,4 +1,4 @@
-"""Posed surfels in a device's memory, copied to this processor on demand."""
+"""Posed surfels in a device's memory, copied to the CPU on demand."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class DevicePosedSurfels(PosedSurfels):
     there : dict
         Every field by its name, on the device or, where nobody has needed it there, here.
     here : callable
-        Makes the same on this processor; called when a field is first read that is not among the `known`.
+        Makes the same on the CPU; called when a field is first read that is not among the `known`.
     known : mapping of str to array, optional
-        Fields that are on this processor, too.
+        Fields that are on the CPU, too.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ def arrays_of(posed: PosedSurfels, launcher: Launcher) -> dict[str, Any]:
 
 
 def with_fields(posed: PosedSurfels, fields: dict[str, Array]) -> PosedSurfels:
-    """The surfels with other arrays (of this processor) for some fields."""
+    """The surfels with other arrays (of the CPU) for some fields."""
     if not isinstance(posed, DevicePosedSurfels):
         return dataclasses.replace(posed, **fields)
 
@@ -76,7 +76,7 @@ def with_fields(posed: PosedSurfels, fields: dict[str, Array]) -> PosedSurfels:
 
 
 def joined(launcher: Launcher, parts: Sequence[PosedSurfels], here: Callable[[], PosedSurfels]) -> DevicePosedSurfels:
-    """The surfels of some parts as one, on a device; `here` joins them on this processor."""
+    """The surfels of some parts as one, on a device; `here` joins them on the CPU."""
     wp = warp()
     with launcher.failures("joining surfels"):
         there, found = {}, [arrays_of(part, launcher) for part in parts]

@@ -27,7 +27,7 @@ from .types import Known, Record, Struct, Type, is_struct, like, type_of
 Array = np.ndarray
 
 #: Devices that a user may ask for, and what each stands for.
-DEVICES = {"cpu": "this processor", "cuda": "the first NVIDIA card"}
+DEVICES = {"cpu": "the CPU", "cuda": "the first NVIDIA card"}
 
 #: Called with 1 when kernels begin to be made ready, which nothing interrupts, and with -1 when they are.
 watchers: list[Callable[[int], None]] = []

@@ -1,4 +1,4 @@
-"""Translates Numba's scalar functions for Warp: the same source, compiled for the processor here and the device there.
+"""Translates Numba's scalar functions for Warp: the same source, compiled for the CPU here and the device there.
 
 What is translated are functions of numbers, tuples, named tuples and elements of arrays, as the renderer's kernels
 call them for one ray or one point. Their types are inferred from those of the first arguments as Numba infers them, and
@@ -36,7 +36,7 @@ _FRESH = "@wp.func\ndef fresh_{kind}(x: wp.{kind}):\n    return x"
 
 @dataclass(frozen=True)
 class Native:
-    """A function of the device's own, in place of one that only the processor has.
+    """A function of the device's own, in place of one that only the CPU has.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Translation:
     constants : callable
         May replace integers of modules, see `Constants`.
     fused : bool
-        Whether products and sums may be fused, which rounds otherwise than the processor does.
+        Whether products and sums may be fused, which rounds otherwise than the CPU does.
     """
 
     natives: Mapping[Any, Native | types.FunctionType] = field(default_factory=dict)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...compute.warp.kernels import Launcher, Work
+from ...compute.warp.kernels import Launcher, WarpKernel
 from ..gmls import Weights, blank, pack, settled
 
 Array = np.ndarray
@@ -22,12 +22,12 @@ def _gradient(rows: Any, s: Any) -> Any:
     )  # fmt: skip
 
 
-def carry_points(lane, lanes, room, source, weight, offset, reach, rows, centre, out):  # type: ignore[no-untyped-def]
+def carry_points(thread, stride, scratch, source, weight, offset, reach, rows, centre, out):  # type: ignore[no-untyped-def]
     """`gmls._carry`; `source` and `weight` with the point as their last axis.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
         See `compute.warp.kernels`.
     source : (k, n) int array
         Particles of each point.
@@ -42,7 +42,7 @@ def carry_points(lane, lanes, room, source, weight, offset, reach, rows, centre,
     """
     points, gradients, turned = out
     zero = np.float32(0.0)
-    for i in range(lane, len(reach), lanes):
+    for i in range(thread, len(reach), stride):
         first = source[0, i]
         ox, oy, oz = rows[first, 12], rows[first, 13], rows[first, 14]
         apart = zero
@@ -73,7 +73,7 @@ def carry_points(lane, lanes, room, source, weight, offset, reach, rows, centre,
         points[i, 2] = centre[2] + (oz + at[2])
 
 
-CARRY = Work(carry_points, (), {})
+CARRY = WarpKernel(carry_points, (), {})
 
 
 class Carrier:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...compute.warp.kernels import Launcher, Work
+from ...compute.warp.kernels import Launcher, WarpKernel
 from ...compute.warp.posed_surfels import DevicePosedSurfels
 from ...compute.warp.runtime import warp
 from ...core.asset.model import MATERIAL_CHANNELS, PosedSurfels
@@ -25,12 +25,12 @@ Array = np.ndarray
 _USABLE = 1e28
 
 
-def weigh_corners(lane, lanes, room, vertices, faces, place, out):  # type: ignore[no-untyped-def]
+def weigh_corners(thread, stride, scratch, vertices, faces, place, out):  # type: ignore[no-untyped-def]
     """`geometry._weigh`, one face after the other.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
         See `compute.warp.kernels`.
     vertices : (n, 3) float32 array
         Metres.
@@ -41,7 +41,7 @@ def weigh_corners(lane, lanes, room, vertices, faces, place, out):  # type: igno
         Angle times unit normal of each corner, (3 m, 3) float32; written.
     """
     (weighted,) = out
-    for f in range(lane, len(faces), lanes):
+    for f in range(thread, len(faces), stride):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         x, y, z = vertices[a, 0], vertices[a, 1], vertices[a, 2]
         nx, ny, nz, first, second, third = face_normal(
@@ -54,12 +54,12 @@ def weigh_corners(lane, lanes, room, vertices, faces, place, out):  # type: igno
             weighted[p, 0], weighted[p, 1], weighted[p, 2] = w * nx, w * ny, w * nz
 
 
-def sum_corners(lane, lanes, room, weighted, start, sign, out):  # type: ignore[no-untyped-def]
+def sum_corners(thread, stride, scratch, weighted, start, sign, out):  # type: ignore[no-untyped-def]
     """Vertex normals, as `geometry._sum`.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
         See `compute.warp.kernels`.
     weighted : (3 m, 3) float32 array
         Of `weigh_corners`.
@@ -71,7 +71,7 @@ def sum_corners(lane, lanes, room, weighted, start, sign, out):  # type: ignore[
         Unit normals, (n, 3) float32; written.
     """
     (normals,) = out
-    for v in range(lane, len(normals), lanes):
+    for v in range(thread, len(normals), stride):
         x, y, z = vertex_normal(weighted, start[v], start[v + 1])
         normals[v, 0], normals[v, 1], normals[v, 2] = sign * x, sign * y, sign * z
 
@@ -81,9 +81,9 @@ def _constants(module: ModuleType, name: str, value: Any) -> Any:
     return 1 if module is pose and name == "_BLOCK" else value
 
 
-WEIGH = Work(weigh_corners, (), {})
-SUM = Work(sum_corners, (), {})
-POSE = Work(pose.pose_surfels, (), {}, _constants)
+WEIGH = WarpKernel(weigh_corners, (), {})
+SUM = WarpKernel(sum_corners, (), {})
+POSE = WarpKernel(pose.pose_surfels, (), {}, _constants)
 
 
 class _Tables(NamedTuple):

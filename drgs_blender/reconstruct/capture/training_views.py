@@ -105,7 +105,7 @@ def half_size(picture: Array) -> Array:
 
 
 def pixel_rays(camera: Camera, device: torch.device | None = None) -> Tensor:
-    """(h, w, 3) float32 directions of the pixels' centres, world space, of unit depth; on the processor or a device."""
+    """(h, w, 3) float32 directions of the pixels' centres, world space, of unit depth; on the CPU or a device."""
     local = _local_rays(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, device)
     turn = torch.tensor(np.asarray(camera.matrix_world)[:3, :3].T, dtype=torch.float32, device=device)
     return local @ turn

@@ -18,7 +18,7 @@ _BITS = 36
 
 
 def attributes(
-    parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, mirrors: bool
+    parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, reflections: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """`attributes.attributes`."""
     away = normalize(centre.detach() - torch.tensor(eye, dtype=torch.float32, device=centre.device), dim=1)
@@ -30,7 +30,7 @@ def attributes(
     colour = (0.5 + (values[:, :, None] * sh[:, : values.shape[1]]).sum(1)).clamp(min=0)
     back = (away * normal).sum(1, keepdim=True) > 0
     features = [colour, torch.where(back, -normal, normal)]
-    if mirrors:
+    if reflections:
         features += [torch.sigmoid(parameters["tint"]), torch.sigmoid(parameters["blur"])[:, None]]
     return u, v, torch.sigmoid(parameters["opacity"]), torch.cat(features, 1)
 

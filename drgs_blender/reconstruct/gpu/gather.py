@@ -1,4 +1,4 @@
-"""The rendering equation at pixels on a device, one lane a pixel: `inverse_rendering.estimator` with Warp's rays."""
+"""Rendering equation at pixels on a device, one thread per pixel: `inverse_rendering.estimator` with Warp's rays."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...compute.warp.kernels import Launcher, Work
+from ...compute.warp.kernels import Launcher, WarpKernel
 from ...compute.warp.runtime import warp
 from ...compute.warp.translate import Native
 from ...core.asset.model import Mesh
@@ -52,12 +52,12 @@ def trace_mesh(
 _HIT = ("float32", "int32", "int32", "int32", "float32", "float32", "float32", "float32", "float32")
 
 
-def gather_points(lane, lanes, room, points, lobes, plan, occluder, sky, envmap, out):  # type: ignore[no-untyped-def]
+def gather_points(thread, stride, scratch, points, lobes, plan, occluder, sky, envmap, out):  # type: ignore[no-untyped-def]
     """`inverse_rendering.estimator.gather`.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
         See `compute.warp.kernels`.
     points, lobes, plan, occluder, sky, envmap : Points, Lobes, Plan, Occluder, Sky or EnvMap
         As of `gather_point`.
@@ -65,11 +65,11 @@ def gather_points(lane, lanes, room, points, lobes, plan, occluder, sky, envmap,
         `Sums` and `Samples`; written.
     """
     sums, samples = out
-    for i in range(lane, len(lobes.alpha2), lanes):
+    for i in range(thread, len(lobes.alpha2), stride):
         gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples)
 
 
-GATHER = Work(gather_points, (), NATIVES | {trace: Native(_TRACE, "trace_mesh", _HIT)})
+GATHER = WarpKernel(gather_points, (), NATIVES | {trace: Native(_TRACE, "trace_mesh", _HIT)})
 
 
 class DeviceGatherer(Gatherer):

@@ -1,11 +1,11 @@
-"""Kernels of the differentiable rasteriser on a device, one lane a surfel, a pixel or a surfel in a tile.
+"""Kernels of the differentiable rasteriser on a device, one thread per surfel, pixel or surfel in a tile.
 
-The functions here are translated and never run as they stand; what they call is the processor's. What they take comes
+The functions here are translated and never run as they stand; what they call is the CPU's. What they take comes
 in tuples, in the order of `projection.WorldSurfels`, `projection.Projected`, `blend.Splats` and `blend.Tiles`.
-Forwards, a lane walks the list of its pixel's tile. Backwards, a first kernel walks it again and leaves, in a rectangle
-of each surfel's own, what its pixels let through before it and how they want its strength to change; a second one takes
-a surfel in one tile and sums over these pixels, row by row: no two lanes ever write to one number, and every sum has
-one order. The results are the same bits each time.
+Forwards, a thread walks the list of its pixel's tile. Backwards, a first kernel walks it again and leaves, in a
+rectangle of each surfel's own, what its pixels let through before it and how they want its strength to change; a second
+one takes a surfel in one tile and sums over these pixels, row by row: no two threads ever write to one number, and
+every sum has one order. The results are the same bits each time.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from ...compute.warp.kernels import Room, Work
+from ...compute.warp.kernels import ScratchArray, WarpKernel
 from ...render.sampling import ONE, ZERO, F
 from ...render.surfels.blending import MIN_TRANSMITTANCE
 from ...render.surfels.raster import gaussian
 from ...render.surfels.splats import MAX_ALPHA, TILE
 from ..model.blend import strength
-from ..model.blend_backward import BEFORE, TRAVEL, slopes
+from ..model.blend_backward import BEFORE, SCREEN_GRADIENT, slopes
 from ..model.projection import (
     CUT,
     I0,
@@ -46,26 +46,26 @@ G_ALPHA, G_DEPTH, G_MEDIAN, G_DISTORTION, G_FEATURES = 0, 1, 2, 3, 4
 CHANNELS = 16
 
 
-def project_rows(lane, lanes, room, surfels, p, picture, out):  # type: ignore[no-untyped-def]
+def project_rows(thread, stride, scratch, surfels, p, picture, out):  # type: ignore[no-untyped-def]
     """`projection.project`.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
         See `compute.warp.kernels`; so of all kernels here.
     surfels, p, picture, out : tuple or array
         As of `projection.project_surfel`.
     """
-    for i in range(lane, len(surfels[0]), lanes):
+    for i in range(thread, len(surfels[0]), stride):
         project_surfel(i, surfels, p, picture, out)
 
 
-def list_pairs(lane, lanes, room, box, first, tiles_x, out):  # type: ignore[no-untyped-def]
+def list_pairs(thread, stride, scratch, box, first, tiles_x, out):  # type: ignore[no-untyped-def]
     """Tile and surfel of every pair of both, surfel by surfel, row by row of tiles.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
     box : (n, 4) int32 array
         Pixels, see `projection.Projected`.
     first : array
@@ -76,7 +76,7 @@ def list_pairs(lane, lanes, room, box, first, tiles_x, out):  # type: ignore[no-
         Tile and surfel of each pair, int32; written.
     """
     tile, surfel = out
-    for i in range(lane, len(box), lanes):
+    for i in range(thread, len(box), stride):
         pair = first[i]
         for ty in range(box[i, 1] // TILE, (box[i, 3] - 1) // TILE + 1):
             for tx in range(box[i, 0] // TILE, (box[i, 2] - 1) // TILE + 1):
@@ -85,7 +85,7 @@ def list_pairs(lane, lanes, room, box, first, tiles_x, out):  # type: ignore[no-
 
 
 def pixel_of(number: Any, tiles_x: Any) -> Any:
-    """Tile, column and row of a lane's pixel: those of a tile follow each other."""
+    """Tile, column and row of a thread's pixel: those of a tile follow each other."""
     tile, within = number // (TILE * TILE), number % (TILE * TILE)
     return tile, tile % tiles_x * TILE + within % TILE, tile // tiles_x * TILE + within // TILE
 
@@ -102,13 +102,13 @@ def meet(splat: Any, x: Any, y: Any, near: Any, far: Any) -> Any:
     return ex, ey, q, z, exact, su, sv
 
 
-def blend_pixels(lane, lanes, room, splats, tiles, out):  # type: ignore[no-untyped-def]
-    """The maps of all pixels, as `blend._blend` sums them; neighbouring lanes are of one tile.
+def blend_pixels(thread, stride, scratch, splats, tiles, out):  # type: ignore[no-untyped-def]
+    """The maps of all pixels, as `blend._blend` sums them; neighbouring threads are of one tile.
 
     Parameters
     ----------
-    lane, lanes : int64
-    room : tuple
+    thread, stride : int64
+    scratch : tuple
         Memory for sums of features, (CHANNELS,) float32.
     splats, tiles : tuple
         In the order of `blend.Splats` and `blend.Tiles`.
@@ -118,10 +118,10 @@ def blend_pixels(lane, lanes, room, splats, tiles, out):  # type: ignore[no-unty
     record, values, box, near, far = splats
     start, listed, tiles_x = tiles
     (maps,) = out
-    (sums,) = room
+    (sums,) = scratch
     height, width, channels = maps.shape[0], maps.shape[1], values.shape[1]
     half, stop = F(0.5), F(MIN_TRANSMITTANCE)
-    for number in range(lane, (len(start) - 1) * TILE * TILE, lanes):
+    for number in range(thread, (len(start) - 1) * TILE * TILE, stride):
         tile, x, y = pixel_of(number, tiles_x)
         if x >= width or y >= height:
             continue
@@ -151,12 +151,12 @@ def blend_pixels(lane, lanes, room, splats, tiles, out):  # type: ignore[no-unty
             maps[y, x, FEATURES + c] = sums[c]
 
 
-def pull_pixels(lane, lanes, room, splats, tiles, first, maps, incoming, out):  # type: ignore[no-untyped-def]
+def pull_pixels(thread, stride, scratch, splats, tiles, first, maps, incoming, out):  # type: ignore[no-untyped-def]
     """Transmittance before each surfel, and gradient of its strength, by pixels of the surfels' rectangles.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
     splats, tiles : tuple
         As of `blend_pixels`.
     first : (m,) array
@@ -173,7 +173,7 @@ def pull_pixels(lane, lanes, room, splats, tiles, first, maps, incoming, out):  
     (pulls,) = out
     height, width, channels = maps.shape[0], maps.shape[1], values.shape[1]
     stop, most = F(MIN_TRANSMITTANCE), F(MAX_ALPHA)
-    for number in range(lane, (len(start) - 1) * TILE * TILE, lanes):
+    for number in range(thread, (len(start) - 1) * TILE * TILE, stride):
         tile, x, y = pixel_of(number, tiles_x)
         if x >= width or y >= height:
             continue
@@ -205,12 +205,12 @@ def pull_pixels(lane, lanes, room, splats, tiles, first, maps, incoming, out):  
                     t = t - w
 
 
-def sum_pixels(lane, lanes, room, splats, entries, first, maps, incoming, pulls, out):  # type: ignore[no-untyped-def]
+def sum_pixels(thread, stride, scratch, splats, entries, first, maps, incoming, pulls, out):  # type: ignore[no-untyped-def]
     """Gradients of each surfel's record and features from its pixels in one tile.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
     splats : tuple
         As of `blend_pixels`.
     entries : tuple
@@ -227,7 +227,7 @@ def sum_pixels(lane, lanes, room, splats, entries, first, maps, incoming, pulls,
     (slots,) = out
     half, width, height = F(0.5), maps.shape[1], maps.shape[0]
     channels = incoming.shape[2] - G_FEATURES
-    for entry in range(lane, len(listed), lanes):
+    for entry in range(thread, len(listed), stride):
         i, tile, pair = np.int64(listed[entry]), np.int64(tiles[entry]), pairs[entry]
         left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
         x0, x1 = max(left, np.int64(box[i, 0])), min(min(left + TILE, np.int64(box[i, 2])), width)
@@ -235,7 +235,7 @@ def sum_pixels(lane, lanes, room, splats, entries, first, maps, incoming, pulls,
         across = np.int64(box[i, 2] - box[i, 0])
         splat = splat_of(record, i)
         to_x, to_y, to_ux, to_uy, to_vx, to_vy = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-        to_i, to_ix, to_iy, to_opacity, travel = ZERO, ZERO, ZERO, ZERO, ZERO
+        to_i, to_ix, to_iy, to_opacity, gradient = ZERO, ZERO, ZERO, ZERO, ZERO
         for y in range(y0, y1):
             for x in range(x0, x1):
                 at = first[i] + (y - np.int64(box[i, 1])) * across + x - np.int64(box[i, 0])
@@ -263,21 +263,21 @@ def sum_pixels(lane, lanes, room, splats, entries, first, maps, incoming, pulls,
                     to_ix += slope * ex
                     to_iy += slope * ey
                     to_opacity += pull * kernel
-                    travel += abs(g_ex) + abs(g_ey)
+                    gradient += abs(g_ex) + abs(g_ey)
                     for c in range(channels):
                         slots[pair, BEFORE + c] += w * incoming[y, x, G_FEATURES + c]
         slots[pair, RX], slots[pair, RY] = to_x, to_y
         slots[pair, UX], slots[pair, UY], slots[pair, VX], slots[pair, VY] = to_ux, to_uy, to_vx, to_vy
         slots[pair, I0], slots[pair, IX], slots[pair, IY] = to_i, to_ix, to_iy
-        slots[pair, OPACITY], slots[pair, TRAVEL] = to_opacity, travel
+        slots[pair, OPACITY], slots[pair, SCREEN_GRADIENT] = to_opacity, gradient
 
 
-def sum_tiles(lane, lanes, room, slots, first, out):  # type: ignore[no-untyped-def]
-    """Add up the gradients of each surfel's pairs, in the order of tiles; a lane a number.
+def sum_tiles(thread, stride, scratch, slots, first, out):  # type: ignore[no-untyped-def]
+    """Add up the gradients of each surfel's pairs, in the order of tiles; one thread per number.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
     slots : array
         Output of `sum_pixels`.
     first : (m + 1,) array
@@ -287,7 +287,7 @@ def sum_tiles(lane, lanes, room, slots, first, out):  # type: ignore[no-untyped-
     """
     (total,) = out
     columns = total.shape[1]
-    for number in range(lane, total.shape[0] * columns, lanes):
+    for number in range(thread, total.shape[0] * columns, stride):
         i, c = number // columns, number % columns
         found = ZERO
         for pair in range(first[i], first[i + 1]):
@@ -295,23 +295,23 @@ def sum_tiles(lane, lanes, room, slots, first, out):  # type: ignore[no-untyped-
         total[i, c] = found
 
 
-def project_rows_backward(lane, lanes, room, surfels, p, index, gradient, out):  # type: ignore[no-untyped-def]
+def project_rows_backward(thread, stride, scratch, surfels, p, index, gradient, out):  # type: ignore[no-untyped-def]
     """`projection.project_backward`.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
     surfels, p, index, gradient, out : tuple or array
         As of `projection.project_surfel_backward`.
     """
-    for k in range(lane, len(index), lanes):
+    for k in range(thread, len(index), stride):
         project_surfel_backward(k, surfels, p, index, gradient, out)
 
 
-PROJECT = Work(project_rows, (), {})
-LIST = Work(list_pairs, (), {})
-BLEND = Work(blend_pixels, (Room("float32", (CHANNELS,)),), {})
-PULL = Work(pull_pixels, (), {})
-SUM_PIXELS = Work(sum_pixels, (), {})
-SUM_TILES = Work(sum_tiles, (), {})
-PROJECT_BACKWARD = Work(project_rows_backward, (), {})
+PROJECT = WarpKernel(project_rows, (), {})
+LIST = WarpKernel(list_pairs, (), {})
+BLEND = WarpKernel(blend_pixels, (ScratchArray("float32", (CHANNELS,)),), {})
+PULL = WarpKernel(pull_pixels, (), {})
+SUM_PIXELS = WarpKernel(sum_pixels, (), {})
+SUM_TILES = WarpKernel(sum_tiles, (), {})
+PROJECT_BACKWARD = WarpKernel(project_rows_backward, (), {})

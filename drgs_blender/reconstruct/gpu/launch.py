@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from ...compute.warp.kernels import Launcher, Work
+from ...compute.warp.kernels import Launcher, WarpKernel
 from ...compute.warp.runtime import warp
 
 
@@ -30,12 +30,12 @@ class TensorLauncher(Launcher):
         super().__init__(device)
         self.place = torch.device(str(warp().device_to_torch(self.device)))
 
-    def launch(self, work: Work, pieces: int, arguments: Sequence[Any], out: Sequence[Any]) -> None:
+    def launch(self, kernel: WarpKernel, pieces: int, arguments: Sequence[Any], out: Sequence[Any]) -> None:
         """`Launcher.launch`, among torch's own work on the device; nothing where there are no pieces."""
         if not pieces:
             return
         with self._in_order():
-            super().launch(work, pieces, self._shared(tuple(arguments)), self._shared(tuple(out)))
+            super().launch(kernel, pieces, self._shared(tuple(arguments)), self._shared(tuple(out)))
 
     def _shared(self, value: Any) -> Any:
         if isinstance(value, torch.Tensor):

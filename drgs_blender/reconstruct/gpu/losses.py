@@ -12,19 +12,19 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ...compute.warp.kernels import Work
+from ...compute.warp.kernels import WarpKernel
 from ...render.sampling import ZERO
 from ..losses.photometric import C1, C2, DISSIMILARITY, SATURATED, WINDOW
 from ..losses.shape import COVERED, THIN
 from .launch import TensorLauncher
 
 
-def blur_rows(lane, lanes, room, window, pictures, out):  # type: ignore[no-untyped-def]
+def blur_rows(thread, stride, scratch, window, pictures, out):  # type: ignore[no-untyped-def]
     """Weighted means of eleven rows, as `photometric._blur_row` has them; black beyond the edges.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
         See `compute.warp.kernels`.
     window : (11,) float32 array
         Weights, symmetric, of sum 1.
@@ -35,7 +35,7 @@ def blur_rows(lane, lanes, room, window, pictures, out):  # type: ignore[no-unty
     """
     (blurred,) = out
     m, h, w = pictures.shape
-    for number in range(lane, m * h * w, lanes):
+    for number in range(thread, m * h * w, stride):
         k, y, x = number // (h * w), number // w % h, number % w
         total = ZERO
         for tap in range(11):
@@ -45,19 +45,19 @@ def blur_rows(lane, lanes, room, window, pictures, out):  # type: ignore[no-unty
         blurred[k, y, x] = total
 
 
-def blur_columns(lane, lanes, room, window, channels, pictures, out):  # type: ignore[no-untyped-def]
+def blur_columns(thread, stride, scratch, window, channels, pictures, out):  # type: ignore[no-untyped-def]
     """The same of eleven columns; a pixel has `channels` of them.
 
     Parameters
     ----------
-    lane, lanes, room, window, pictures, out : int64, tuple or array
+    thread, stride, scratch, window, pictures, out : int64, tuple or array
         As of `blur_rows`.
     channels : int
         Columns of a pixel.
     """
     (blurred,) = out
     m, h, w = pictures.shape
-    for number in range(lane, m * h * w, lanes):
+    for number in range(thread, m * h * w, stride):
         k, y, x = number // (h * w), number // w % h, number % w
         total = window[5] * pictures[k, y, x]
         for tap in range(5):
@@ -68,7 +68,7 @@ def blur_columns(lane, lanes, room, window, channels, pictures, out):  # type: i
         blurred[k, y, x] = total
 
 
-ROWS, COLUMNS = Work(blur_rows, (), {}), Work(blur_columns, (), {})
+ROWS, COLUMNS = WarpKernel(blur_rows, (), {}), WarpKernel(blur_columns, (), {})
 
 
 def blur(launcher: TensorLauncher, pictures: Tensor) -> Tensor:

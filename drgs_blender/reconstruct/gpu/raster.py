@@ -13,9 +13,9 @@ from ...core.errors import DeviceError
 from ...core.frame import Camera
 from ...render.camera import CLIP_END, CLIP_START
 from ...render.surfels.splats import TILE
-from ..model.blend_backward import BEFORE, TRAVEL
+from ..model.blend_backward import BEFORE, SCREEN_GRADIENT
 from ..model.projection import OPACITY, RECORD
-from ..model.raster import Maps, Tally, view_of
+from ..model.raster import GradientStatistics, Maps, view_of
 from .kernels import (
     BLEND,
     CHANNELS,
@@ -40,9 +40,9 @@ _MOST = 2**31 - 1
 
 def rasterise(
     launcher: TensorLauncher, centre: Tensor, tangent_u: Tensor, tangent_v: Tensor, opacity: Tensor, features: Tensor,
-    camera: Camera, tally: Tally | None = None,
+    camera: Camera, statistics: GradientStatistics | None = None,
 ) -> Maps:  # fmt: skip
-    """`raster.rasterise` of tensors on the launcher's device; so are those of the `tally`.
+    """`raster.rasterise` of tensors on the launcher's device; so are those of the `statistics`.
 
     Raises
     ------
@@ -50,14 +50,16 @@ def rasterise(
     DeviceError: the device fails, or a view needs more numbers than it counts.
     """
     parameters, size = view_of(camera)
-    return Maps(*_Rasterise.apply(centre, tangent_u, tangent_v, opacity, features, launcher, parameters, size, tally))
+    return Maps(
+        *_Rasterise.apply(centre, tangent_u, tangent_v, opacity, features, launcher, parameters, size, statistics)
+    )
 
 
 class _Rasterise(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, centre: Tensor, tangent_u: Tensor, tangent_v: Tensor, opacity: Tensor, features: Tensor,
-        launcher: TensorLauncher, parameters: Array, size: tuple[int, int], tally: Tally | None,
+        launcher: TensorLauncher, parameters: Array, size: tuple[int, int], statistics: GradientStatistics | None,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         (width, height), n = size, len(opacity)
         assert features.shape[1] <= CHANNELS
@@ -75,14 +77,14 @@ class _Rasterise(torch.autograd.Function):
         maps = new(height, width, FEATURES + values.shape[1])
         splats, tiles = (record, values, box, near, far), (pairs.start, pairs.surfel, tiles_x)
         launcher.launch(BLEND, tiles_x * tiles_y * TILE * TILE, (splats, tiles), (maps,))
-        ctx.save = (launcher, surfels, p, order, splats, tiles, pairs, maps, tally)
+        ctx.save = (launcher, surfels, p, order, splats, tiles, pairs, maps, statistics)
         ctx.set_materialize_grads(False)
         # Copies: the maps are needed as they are for the way back.
         return maps[..., FEATURES:].clone(), 1 - maps[..., T], *(maps[..., k].clone() for k in (Z, MEDIAN, DISTORTION))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Any, ...]:
-        launcher, surfels, p, order, splats, tiles, pairs, maps, tally = ctx.save
+        launcher, surfels, p, order, splats, tiles, pairs, maps, statistics = ctx.save
         _, values, box, _, _ = splats
         start, listed, tiles_x = tiles
         (m, channels), n = values.shape, len(surfels[0])
@@ -107,9 +109,9 @@ class _Rasterise(torch.autograd.Function):
         launcher.launch(PROJECT_BACKWARD, m, (surfels, p, order, total), found)
         g_values = new(n, channels)
         found[3][order], g_values[order] = total[:, OPACITY], total[:, BEFORE:]
-        if tally is not None:
-            tally.travel[order] += total[:, TRAVEL]
-            tally.views[order] += 1
+        if statistics is not None:
+            statistics.gradient[order] += total[:, SCREEN_GRADIENT]
+            statistics.views[order] += 1
         return *found, g_values, None, None, None, None
 
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ...compute.warp.kernels import Work
+from ...compute.warp.kernels import WarpKernel
 from ...core.arrays import Array
 from ...core.asset.model import Mesh
 from ...core.frame import Camera
 from ...render.scene.triangle_bvh import TriangleBVH
 from ..backend import LearningBackend
 from ..capture.training_views import Target
-from ..model.raster import Maps, Tally
+from ..model.raster import GradientStatistics, Maps
 from ..optim.adam import step_rows
 from . import appearance, losses
 from .gather import DeviceGatherer
@@ -22,12 +22,12 @@ from .launch import TensorLauncher
 from .raster import rasterise
 
 
-def descend_rows(lane, lanes, room, gradient, rate, out):  # type: ignore[no-untyped-def]
+def descend_rows(thread, stride, scratch, gradient, rate, out):  # type: ignore[no-untyped-def]
     """`adam.descend`.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
         See `compute.warp.kernels`.
     gradient, rate : array
         As of `adam.step_rows`.
@@ -35,11 +35,11 @@ def descend_rows(lane, lanes, room, gradient, rate, out):  # type: ignore[no-unt
         Value, first and second moment, (n, width) float32; changed.
     """
     value, first, second = out
-    for i in range(lane, len(value), lanes):
+    for i in range(thread, len(value), stride):
         step_rows(i, i + 1, value, gradient, first, second, rate)
 
 
-DESCEND = Work(descend_rows, (), {})
+DESCEND = WarpKernel(descend_rows, (), {})
 
 
 class WarpLearningBackend(LearningBackend):
@@ -62,15 +62,15 @@ class WarpLearningBackend(LearningBackend):
         return replace(target, photograph=target.colour.to(self.device), mask=mask)
 
     def attributes(
-        self, parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, mirrors: bool
+        self, parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, reflections: bool
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return appearance.attributes(parameters, centre, eye, bands, mirrors)
+        return appearance.attributes(parameters, centre, eye, bands, reflections)
 
     def rasterise(
         self, centre: Tensor, tangent_u: Tensor, tangent_v: Tensor, opacity: Tensor, features: Tensor, camera: Camera,
-        tally: Tally | None = None,
+        statistics: GradientStatistics | None = None,
     ) -> Maps:  # fmt: skip
-        return rasterise(self.launcher, centre, tangent_u, tangent_v, opacity, features, camera, tally)
+        return rasterise(self.launcher, centre, tangent_u, tangent_v, opacity, features, camera, statistics)
 
     def mirrored(self, features: Tensor, alpha: Tensor, rays: Tensor, texels: Tensor) -> Tensor:
         return appearance.mirrored(features, alpha, rays, texels)

@@ -17,7 +17,7 @@ from ...compute.threads import ELEMENTS, over_range
 from ...core.arrays import Array
 from ...formats.harmonics import basis
 
-#: Columns of a surfel's features: colour, normal that faces the viewer; then, where something mirrors, tint and blur.
+#: Columns of a surfel's features: colour, normal that faces the viewer; then, with reflections, tint and blur.
 COLOUR, NORMAL, TINT, BLUR = 0, 3, 6, 9
 #: Bands of harmonics -> coefficients.
 COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
@@ -69,7 +69,7 @@ class Attributes(NamedTuple):
 
 
 def attributes(
-    parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, mirrors: bool
+    parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, reflections: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Attributes that a view from `eye` (3,) blends; differentiable in the parameters of `gaussians.Gaussians`.
 
@@ -83,7 +83,7 @@ def attributes(
     eye : array
     bands : int
         Of harmonics; those beyond are left out.
-    mirrors : bool
+    reflections : bool
         Tint and blur are features.
 
     Returns
@@ -94,7 +94,7 @@ def attributes(
     features : (n, 6 or 10) float32 tensor
     """
     return _Attributes.apply(
-        centre.detach().numpy(), eye, bands, mirrors, *(parameters[name] for name in Learned._fields)
+        centre.detach().numpy(), eye, bands, reflections, *(parameters[name] for name in Learned._fields)
     )
 
 
@@ -108,7 +108,7 @@ def frames(scale: Array, rotation: Array) -> tuple[Array, Array, Array]:
 class _Attributes(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, centre: Array, eye: Array, bands: int, mirrors: bool, *parameters: Tensor
+        ctx: Any, centre: Array, eye: Array, bands: int, reflections: bool, *parameters: Tensor
     ) -> tuple[Tensor, ...]:
         raw = Learned(*(np.ascontiguousarray(p.detach().numpy(), np.float32) for p in parameters))
         n = len(centre)
@@ -117,7 +117,7 @@ class _Attributes(torch.autograd.Function):
         degree = min(bands, int(raw.sh.shape[1] ** 0.5) - 1)
         values = basis(away, degree).astype(np.float32)
         u, v, normal = frames(raw.scale, raw.rotation)
-        found = Attributes(u, v, np.empty(n, np.float32), np.empty((n, BLUR + 1 if mirrors else TINT), np.float32))
+        found = Attributes(u, v, np.empty(n, np.float32), np.empty((n, BLUR + 1 if reflections else TINT), np.float32))
         over_range(_colour, n, raw, normal, away, values, found, fewest=ELEMENTS)
         ctx.save = (raw, values, normal, found)
         return tuple(map(torch.from_numpy, found))

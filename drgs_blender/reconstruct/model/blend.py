@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compute.jit import inlined, njit
-from ...compute.threads import over_lanes
+from ...compute.threads import over_strided
 from ...render.surfels.blending import MIN_TRANSMITTANCE
 from ...render.surfels.raster import gaussian
 from ...render.surfels.splats import MAX_ALPHA, TILE
@@ -220,7 +220,7 @@ def _blend_tile(splats, tiles, tile, state, is_open, maps):  # type: ignore[no-u
 
 def blend(splats: Splats, tiles: Tiles, maps: Array) -> None:
     """Fill the maps (h, w, state rows and features)."""
-    over_lanes(_blend_tiles, len(tiles.start) - 1, splats, tiles, maps)
+    over_strided(_blend_tiles, len(tiles.start) - 1, splats, tiles, maps)
 
 
 @njit

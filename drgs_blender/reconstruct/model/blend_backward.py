@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...compute.jit import inlined, njit
-from ...compute.threads import over_lanes
+from ...compute.threads import over_strided
 from ...render.surfels.blending import MIN_TRANSMITTANCE
 from ...render.surfels.raster import gaussian
 from ...render.surfels.splats import MAX_ALPHA, TILE
@@ -32,8 +32,9 @@ Array = np.ndarray
 # squared depth of the pixel; gradients of alpha, depth, median and distortion, g and weight of the splat at hand; those
 # of the features.
 _R, _S, _A, _M, _MM, _GA, _GZ, _GM, _GD, _G, _GW, _GF = 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12
-#: Columns of a splat's gradients before the features': the record's, then its pixels' travel (see `raster.Tally`).
-TRAVEL, BEFORE = PARAMETERS, PARAMETERS + 1
+#: Columns of a splat's gradients before the features': the record's, then what
+#: `raster.GradientStatistics` counts.
+SCREEN_GRADIENT, BEFORE = PARAMETERS, PARAMETERS + 1
 
 
 @inlined
@@ -133,7 +134,7 @@ def _blend_backward(splats, i, x, y, state, base, sums):  # type: ignore[no-unty
         sums[np.uintp(IX * LANES) + lane] += slope * ex
         sums[np.uintp(IY * LANES) + lane] += slope * ey
         sums[np.uintp(OPACITY * LANES) + lane] += g_alpha * kernel if seen else zero
-        sums[np.uintp(TRAVEL * LANES) + lane] += abs(g_ex) + abs(g_ey)
+        sums[np.uintp(SCREEN_GRADIENT * LANES) + lane] += abs(g_ex) + abs(g_ey)
         state[at + np.uintp(_GW * LANES)] = w
         is_open = np.int32(is_open + np.int32(after >= stop))
         hits = np.int32(hits + np.int32(seen))
@@ -225,7 +226,7 @@ def blend_backward(splats: Splats, tiles: Tiles, maps: Array, incoming: Array, s
     slots : (entries of all tiles, BEFORE + channels) float32 array
         Written.
     """
-    over_lanes(_blend_tiles_backward, len(tiles.start) - 1, splats, tiles, maps, incoming, slots)
+    over_strided(_blend_tiles_backward, len(tiles.start) - 1, splats, tiles, maps, incoming, slots)
 
 
 @njit

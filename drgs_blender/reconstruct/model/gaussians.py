@@ -17,7 +17,7 @@ from ...geometry.normals import quaternions
 from ..backend import CPU, LearningBackend
 from ..capture.training_views import pixel_rays
 from .attributes import COEFFICIENTS, COLOUR, NORMAL, frames
-from .raster import Maps, Tally
+from .raster import GradientStatistics, Maps
 from .reflection_probe import dark_cube, pyramid
 
 #: Value of the constant harmonic.
@@ -110,17 +110,17 @@ class Gaussians:
         camera: Camera,
         background: Tensor,
         bands: int = 3,
-        tally: Tally | None = None,
+        statistics: GradientStatistics | None = None,
         rays: Tensor | None = None,
-        mirrors: bool = True,
+        reflections: bool = True,
     ) -> RenderedView:
         """Render a view over `background` (3,); `rays` are `training_views.pixel_rays` where they are at hand."""
-        mirrors = mirrors and self.light is not None
+        reflections = reflections and self.light is not None
         centre, eye = self.centres(), np.asarray(camera.matrix_world)[:3, 3]
-        u, v, opacity, features = self.backend.attributes(self.parameters, centre, eye, bands, mirrors)
-        maps = self.backend.rasterise(centre, u, v, opacity, features, camera, tally)
+        u, v, opacity, features = self.backend.attributes(self.parameters, centre, eye, bands, reflections)
+        maps = self.backend.rasterise(centre, u, v, opacity, features, camera, statistics)
         colour = maps.features[..., COLOUR : COLOUR + 3] + (1 - maps.alpha)[..., None] * background
-        if mirrors:
+        if reflections:
             assert self.light is not None
             rays = pixel_rays(camera, self.backend.device) if rays is None else rays
             colour = colour + self.backend.mirrored(maps.features, maps.alpha, rays, pyramid(self.light))

@@ -29,7 +29,7 @@ from ...core.frame import Camera, RenderSettings
 from ...render.camera import CLIP_END, CLIP_START, camera_parameters
 from ...render.surfels.splats import TILE, depth_order, list_by_tile
 from .blend import DISTORTION, FEATURES, MEDIAN, Splats, T, Tiles, Z, blend
-from .blend_backward import BEFORE, TRAVEL, blend_backward, sum_slots
+from .blend_backward import BEFORE, SCREEN_GRADIENT, blend_backward, sum_slots
 from .projection import OPACITY, RECORD, Projected, WorldSurfels, project, project_backward
 
 
@@ -45,23 +45,23 @@ class Maps:
 
 
 @dataclass(slots=True)
-class Tally:
+class GradientStatistics:
     """Gradient statistics of surfels, collected by backward passes for densification.
 
     Attributes
     ----------
-    travel : (n,) float32 tensor
+    gradient : (n,) float32 tensor
         += sum over pixels of |dL/dx| + |dL/dy| of the projected centre (Ye et al. 2024, "AbsGS": absolute values, so
         that pixels that pull in opposite directions do not cancel).
     views : (n,) int32 tensor
         += 1 where the surfel was listed in a tile.
     """
 
-    travel: Tensor
+    gradient: Tensor
     views: Tensor
 
     @classmethod
-    def of(cls, n: int, place: torch.device | None = None) -> Tally:
+    def of(cls, n: int, place: torch.device | None = None) -> GradientStatistics:
         """Empty statistics of `n` surfels."""
         return cls(torch.zeros(n, device=place), torch.zeros(n, dtype=torch.int32, device=place))
 
@@ -73,7 +73,7 @@ def rasterise(
     opacity: Tensor,
     features: Tensor,
     camera: Camera,
-    tally: Tally | None = None,
+    statistics: GradientStatistics | None = None,
 ) -> Maps:
     """Blend surfels into the maps of a view; differentiable in all tensors.
 
@@ -86,7 +86,7 @@ def rasterise(
         Of any kind.
     camera : Camera
         Perspective, the whole picture.
-    tally : Tally, optional
+    statistics : GradientStatistics, optional
         Is added to when gradients are computed.
 
     Raises
@@ -94,7 +94,7 @@ def rasterise(
     UsageError: the camera is orthographic or cannot take a picture.
     """
     parameters, size = view_of(camera)
-    return Maps(*_Rasterise.apply(centre, tangent_u, tangent_v, opacity, features, parameters, size, tally))
+    return Maps(*_Rasterise.apply(centre, tangent_u, tangent_v, opacity, features, parameters, size, statistics))
 
 
 def view_of(camera: Camera) -> tuple[Array, tuple[int, int]]:
@@ -108,7 +108,7 @@ class _Rasterise(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, centre: Tensor, tangent_u: Tensor, tangent_v: Tensor, opacity: Tensor, features: Tensor,
-        parameters: Array, size: tuple[int, int], tally: Tally | None,
+        parameters: Array, size: tuple[int, int], statistics: GradientStatistics | None,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         given = centre, tangent_u, tangent_v, opacity
         surfels = WorldSurfels(*(np.ascontiguousarray(t.detach().numpy(), np.float32) for t in given))
@@ -125,7 +125,7 @@ class _Rasterise(torch.autograd.Function):
         tiles = Tiles(start, listed, tiles_x)
         maps = np.zeros((height, width, FEATURES + values.shape[1]), np.float32)
         blend(splats, tiles, maps)
-        ctx.save = (surfels, parameters, order, splats, tiles, maps, tally)
+        ctx.save = (surfels, parameters, order, splats, tiles, maps, statistics)
         ctx.set_materialize_grads(False)
         out = torch.from_numpy(maps)
         # Copies: the maps are needed as they are for the way back.
@@ -133,7 +133,7 @@ class _Rasterise(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Any, ...]:
-        surfels, parameters, order, splats, tiles, maps, tally = ctx.save
+        surfels, parameters, order, splats, tiles, maps, statistics = ctx.save
         height, width, _ = maps.shape
         n, channels = len(surfels.opacity), splats.values.shape[1]
         incoming = np.zeros((height, width, 4 + channels), np.float32)
@@ -151,7 +151,7 @@ class _Rasterise(torch.autograd.Function):
         project_backward(surfels, parameters, order, total, found)
         g_values = np.zeros((n, channels), np.float32)
         found.opacity[order], g_values[order] = total[:, OPACITY], total[:, BEFORE:]
-        if tally is not None:
-            tally.travel.numpy()[order] += total[:, TRAVEL]
-            tally.views.numpy()[order] += 1
+        if statistics is not None:
+            statistics.gradient.numpy()[order] += total[:, SCREEN_GRADIENT]
+            statistics.views.numpy()[order] += 1
         return *(torch.from_numpy(g) for g in (*found, g_values)), None, None, None

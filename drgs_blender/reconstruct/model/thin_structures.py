@@ -35,7 +35,7 @@ def normals_of(gaussians: Gaussians) -> Normals:
 
     def shown(view: View) -> Array:
         with torch.no_grad():
-            return gaussians.render(view.camera, torch.zeros(3), 0, mirrors=False).normal.numpy(force=True)
+            return gaussians.render(view.camera, torch.zeros(3), 0, reflections=False).normal.numpy(force=True)
 
     return shown
 

@@ -14,7 +14,7 @@ import torch
 
 from ...core.arrays import Array
 from ..model.gaussians import Gaussians
-from ..model.raster import Tally
+from ..model.raster import GradientStatistics
 from .adam import Adam
 
 #: Surfels fainter than this vanish.
@@ -24,7 +24,7 @@ APART, SHORTER = 0.7, 0.65
 
 
 def densify(
-    gaussians: Gaussians, optimiser: Adam, tally: Tally, budget: int, largest: float, smallest: float
+    gaussians: Gaussians, optimiser: Adam, statistics: GradientStatistics, budget: int, largest: float, smallest: float
 ) -> tuple[Gaussians, dict[str, int]]:
     """Prune, then cut until there are `budget` surfels.
 
@@ -33,7 +33,7 @@ def densify(
     gaussians : Gaussians
     optimiser : Adam
         Its moments follow the surfels.
-    tally : Tally
+    statistics : GradientStatistics
         Gradient statistics since the last round.
     budget : int
     largest : float
@@ -50,12 +50,12 @@ def densify(
     opacity = gaussians.opacities().numpy(force=True)
     scale = np.exp(gaussians.parameters["scale"].numpy(force=True))
     finite = np.isfinite(gaussians.parameters["centre"].numpy(force=True)).all(1) & np.isfinite(scale).all(1)
-    travel, views = tally.travel.numpy(force=True), tally.views.numpy(force=True)
+    gradient, views = statistics.gradient.numpy(force=True), statistics.views.numpy(force=True)
     keep = finite & (opacity >= FAINT) & (scale.max(1) <= largest) & (views > 0)
     if not keep.any():
         keep[:] = finite
     kept = np.flatnonzero(keep)
-    pull = np.where(scale.max(1) > smallest, travel / np.maximum(views, 1), 0)[kept]
+    pull = np.where(scale.max(1) > smallest, gradient / np.maximum(views, 1), 0)[kept]
     count = min(max(budget - len(kept), 0), int((pull > 0).sum()))
     cut = np.sort(np.argsort(-pull, kind="stable")[:count])
     # The first half takes the place of the whole and keeps its moments.

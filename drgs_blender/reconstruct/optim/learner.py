@@ -15,7 +15,7 @@ from ..backend import LearningBackend
 from ..capture.training_views import Target, pixel_rays
 from ..model.attributes import TINT
 from ..model.gaussians import Gaussians, RenderedView
-from ..model.raster import Tally
+from ..model.raster import GradientStatistics
 from .adam import Adam
 from .densification import densify
 from .schedule import LIGHT_RATE, Schedule, learning_rates
@@ -27,7 +27,7 @@ MATTE, MIRRORED = 0.2, 5.0
 
 
 class Learner:
-    """Surfels and the state of their optimisation, on one processor.
+    """Surfels and the state of their optimisation, on one backend.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Learner:
     radius : float
         Of the object, metres.
     background : (3,) float32 tensor
-        On the processor of `backend`.
+        On the device of `backend`.
     backend : LearningBackend
 
     Attributes
@@ -45,7 +45,7 @@ class Learner:
     gaussians : Gaussians
     optimiser, light : Adam
         Of the surfels' parameters; of the light that they mirror.
-    tally : Tally
+    statistics : GradientStatistics
         Gradient statistics for densification.
     iteration : int
         Steps that are done.
@@ -61,7 +61,7 @@ class Learner:
         self.optimiser = Adam(self.gaussians.parameters, backend.descend)
         light = self.gaussians.light
         self.light = Adam({} if light is None else {"light": light}, backend.descend)
-        self.tally = Tally.of(len(self.gaussians), backend.device)
+        self.statistics = GradientStatistics.of(len(self.gaussians), backend.device)
         self.iteration, self.error = 0, 0.0
 
     def step(self, target: Target, part: float) -> None:
@@ -70,7 +70,7 @@ class Learner:
         Parameters
         ----------
         target : Target
-            Where the processor can read it.
+            Where the CPU can read it.
         part : float
             Fraction of the schedule that is done, 0..1.
         """
@@ -88,10 +88,10 @@ class Learner:
         """The surfels as the view sees them, and its rays."""
         schedule = self._schedule
         rays = pixel_rays(target.camera, self._backend.device)
-        tally = self.tally if part < schedule.densify[1] else None
-        mirrors = part >= schedule.mirrors < 1
+        statistics = self.statistics if part < schedule.densify[1] else None
+        reflections = part >= schedule.reflections < 1
         bands = min(schedule.bands, int(part * 8))
-        return self.gaussians.render(target.camera, self._background, bands, tally, rays, mirrors), rays
+        return self.gaussians.render(target.camera, self._background, bands, statistics, rays, reflections), rays
 
     def _optimise(self, part: float) -> None:
         parameters = self.gaussians.parameters
@@ -116,9 +116,9 @@ class Learner:
     def densify(self, budget: int) -> None:
         """Cut surfels, until there are `budget` at most."""
         self.gaussians, report = densify(
-            self.gaussians, self.optimiser, self.tally, budget, 0.5 * self._radius, 1e-3 * self._radius
+            self.gaussians, self.optimiser, self.statistics, budget, 0.5 * self._radius, 1e-3 * self._radius
         )
-        self.tally = Tally.of(len(self.gaussians), self._backend.device)
+        self.statistics = GradientStatistics.of(len(self.gaussians), self._backend.device)
         log.debug("step %d: %d surfels, %s", self.iteration, len(self.gaussians), report)
 
     def error_of(self, views: Iterable[Target]) -> float:
@@ -130,8 +130,8 @@ class Learner:
         return float(np.mean(errors))
 
     def arrays(self) -> dict[str, Array]:
-        """Surfels, light, moments and tally, by name: what `restore` needs beside the counts of steps."""
-        tensors = {"travel": self.tally.travel, "views": self.tally.views}
+        """Surfels, light, moments and statistics, by name: what `restore` needs beside the counts of steps."""
+        tensors = {"gradient": self.statistics.gradient, "views": self.statistics.views}
         tensors |= {f"first.{k}": v for k, v in self.optimiser.first.items()}
         tensors |= {f"second.{k}": v for k, v in self.optimiser.second.items()}
         if self.gaussians.light is not None:
@@ -141,7 +141,7 @@ class Learner:
         return state | {k: v.numpy(force=True) for k, v in tensors.items()}
 
     def restore(self, state: dict[str, Array]) -> None:
-        """Take the surfels of another learner, also of another processor, from its `arrays`."""
+        """Take the surfels of another learner, also of another backend, from its `arrays`."""
         there = lambda name: torch.tensor(state[name], device=self._backend.device)  # noqa: E731
         part = lambda name: {k.removeprefix(name): there(k) for k in state if k.startswith(name)}  # noqa: E731
         if self.gaussians.light is not None:
@@ -149,7 +149,7 @@ class Learner:
             self.light.first, self.light.second = {"light": there("light.first")}, {"light": there("light.second")}
         self.gaussians = self.gaussians.like(part("value."))
         self.optimiser.first, self.optimiser.second = part("first."), part("second.")
-        self.tally = Tally(there("travel"), there("views"))
+        self.statistics = GradientStatistics(there("gradient"), there("views"))
 
 
 def _squared_error(rendered: RenderedView, target: Target) -> float:

@@ -33,7 +33,7 @@ class Schedule:
         Part of the steps after which distortion and normals count.
     mask, distortion, consistency : float
         Weights of the losses.
-    mirrors : float
+    reflections : float
         Part of the steps after which reflections are learned; 1 never.
     bands : int
         Highest band of the colour's harmonics.
@@ -48,14 +48,14 @@ class Schedule:
     mask: float = 0.1
     distortion: float = 1.0
     consistency: float = 0.25
-    mirrors: float = 0.1
+    reflections: float = 0.1
     bands: int = 2
     seed: int = 0
 
     def on_mesh(self, part: float) -> Schedule:
         """For surfels that have their place: `part` of the steps, in full size, and no more surfels."""
         return replace(
-            self, iterations=max(int(part * self.iterations), 1), coarse=0.0, rounds=0, shape=0.0, mirrors=0.0
+            self, iterations=max(int(part * self.iterations), 1), coarse=0.0, rounds=0, shape=0.0, reflections=0.0
         )
 
 

@@ -169,7 +169,7 @@ class Training:
         self.time_budget.end_trial(spent)
 
     def arrays(self) -> dict[str, Array]:
-        """All that `restore` needs to go on, with any processor; with the same one bit for bit."""
+        """All that `restore` needs to go on, with any backend; with the same one bit for bit."""
         return self.attempt(self.state) | self.trial.arrays()
 
     def restore(self, state: dict[str, Array]) -> None:

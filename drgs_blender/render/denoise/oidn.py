@@ -45,7 +45,7 @@ def require() -> Callable[..., Array]:
 def denoise_oidn(
     components: Array, guides: Guides, split: bool = True, check: Callable[[], None] = lambda: None
 ) -> Array:
-    """Filter the light of a picture on the processor.
+    """Filter the light of a picture on the CPU.
 
     Parameters
     ----------

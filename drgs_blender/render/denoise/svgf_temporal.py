@@ -22,7 +22,7 @@ import numpy as np
 
 from ...compute.jit import njit
 from ...compute.threads import ROWS, over_range
-from ..film.motion_vectors import Instant, Motion
+from ..film.motion_vectors import Motion, SceneState
 from ..sampling import ONE, ZERO, F
 from .demodulation import (
     LIGHT,
@@ -77,14 +77,14 @@ class History:
     ----------
     signal : Signal, optional
         Result of `denoise_next` for the last picture; None before the first.
-    instant : Instant, optional
+    scene_state : SceneState, optional
         The scene as it was in that picture.
     still : bool
         Nothing has changed since then, save the noise.
     """
 
     signal: Signal | None = None
-    instant: Instant | None = None
+    scene_state: SceneState | None = None
     still: bool = False
 
 

@@ -23,8 +23,8 @@ from .film import SAME_SURFACE
 Array = np.ndarray
 
 
-class Instant(NamedTuple):
-    """The shapes of a scene and its camera at one time.
+class SceneState(NamedTuple):
+    """The state of a scene at one time: its shapes and camera.
 
     Attributes
     ----------
@@ -56,14 +56,14 @@ class Motion(NamedTuple):
 
 
 def previous_positions(
-    faces: Array, now: Instant, then: Instant, face: Array, instance: Array, barycentric: Array, position: Array
+    faces: Array, now: SceneState, then: SceneState, face: Array, instance: Array, barycentric: Array, position: Array
 ) -> Array:
     """World positions of surface points at another time.
 
     Parameters
     ----------
     faces : (m, 3) int32 array
-    now, then : Instant
+    now, then : SceneState
     face : (n,) int32 array
         The face each point is tied to; negative for points that are tied to nothing and do not move.
     instance : (n,) int32 array
@@ -92,11 +92,11 @@ class MotionFilm:
         (h, w) of the camera's window.
     origin : tuple of int
         (x0, y0) of it.
-    now, then : Instant
+    now, then : SceneState
         This time and the other one.
     """
 
-    def __init__(self, shape: tuple[int, int], origin: tuple[int, int], now: Instant, then: Instant) -> None:
+    def __init__(self, shape: tuple[int, int], origin: tuple[int, int], now: SceneState, then: SceneState) -> None:
         self.origin, self.now, self.then = origin, now, then
         self.displacement = np.zeros((*shape, 3), np.float32)
 

@@ -68,8 +68,8 @@ def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: 
         hits.owner[:] = -1
         return hits
     owners = scene.face_object, scene.instance_object
-    lanes = 8 * get_num_threads()
-    over_range(_trace, lanes, lanes, scene.tracer, (parameters, x0, y0), np.int32(mask), owners, hits.arrays)
+    stride = 8 * get_num_threads()
+    over_range(_trace, stride, stride, scene.tracer, (parameters, x0, y0), np.int32(mask), owners, hits.arrays)
     return hits
 
 
@@ -78,8 +78,8 @@ def shade_mesh(scene: TraceScene, hits: MeshHits, parameters: Array, x0: int, bu
     moving = scene.vertices, scene.faces, scene.instances
     view_of = parameters, x0, buffer.rows[0]
     keys, out = arrays_of(buffer)
-    lanes = 8 * get_num_threads()
-    over_range(_shade, lanes, lanes, scene.geometry, moving, view_of, layer, hits.arrays, keys, out)
+    stride = 8 * get_num_threads()
+    over_range(_shade, stride, stride, scene.geometry, moving, view_of, layer, hits.arrays, keys, out)
 
 
 def arrays_of(buffer: GBuffer) -> tuple[tuple[Array, ...], tuple[tuple[Array, ...], ...]]:
@@ -93,25 +93,25 @@ def arrays_of(buffer: GBuffer) -> tuple[tuple[Array, ...], tuple[tuple[Array, ..
 
 
 @njit
-def _trace(first, last, lanes, tracer, view_of, mask, owners, out):  # type: ignore[no-untyped-def]
-    for lane in range(first, last):
-        trace_samples(lane, lanes, None, tracer, view_of, mask, owners, out)
+def _trace(first, last, stride, tracer, view_of, mask, owners, out):  # type: ignore[no-untyped-def]
+    for thread in range(first, last):
+        trace_samples(thread, stride, None, tracer, view_of, mask, owners, out)
 
 
 @njit
-def _shade(first, last, lanes, geometry, moving, view_of, layer, hits, keys, out):  # type: ignore[no-untyped-def]
-    for lane in range(first, last):
-        shade_hits(lane, lanes, None, geometry, moving, view_of, layer, hits, keys, out)
+def _shade(first, last, stride, geometry, moving, view_of, layer, hits, keys, out):  # type: ignore[no-untyped-def]
+    for thread in range(first, last):
+        shade_hits(thread, stride, None, geometry, moving, view_of, layer, hits, keys, out)
 
 
 @njit
-def trace_samples(lane, lanes, room, tracer, view_of, mask, owners, out):  # type: ignore[no-untyped-def]
-    """Closest hits of every `lanes`-th block of sub-pixel samples, from the `lane`-th on.
+def trace_samples(thread, stride, scratch, tracer, view_of, mask, owners, out):  # type: ignore[no-untyped-def]
+    """Closest hits of every `stride`-th block of sub-pixel samples, from the `thread`-th on.
 
     Parameters
     ----------
-    lane, lanes : int64
-    room : tuple
+    thread, stride : int64
+    scratch : tuple
         Not used.
     tracer : Tracer
     view_of : tuple
@@ -119,7 +119,7 @@ def trace_samples(lane, lanes, room, tracer, view_of, mask, owners, out):  # typ
     mask : int32
         Of the camera's rays, see `ray_masks`.
     owners : tuple of array
-        Object of each face and of each place.
+        Object of each face and of each instance.
     out : tuple
         `MeshHits.arrays`.
     """
@@ -130,7 +130,7 @@ def trace_samples(lane, lanes, room, tracer, view_of, mask, owners, out):  # typ
     rows, columns, subpixels = depth.shape
     near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
     count = rows * columns * subpixels
-    for block in range(lane, (count + _BLOCK - 1) // _BLOCK, lanes):
+    for block in range(thread, (count + _BLOCK - 1) // _BLOCK, stride):
         for n in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
             x, y, k = n // subpixels % columns, n // (subpixels * columns), n % subpixels
             ox, oy, oz, dx, dy, dz = sample_ray(p, (y0 + y) * width + x0 + x, k)
@@ -147,16 +147,16 @@ def trace_samples(lane, lanes, room, tracer, view_of, mask, owners, out):  # typ
 
 
 @njit
-def shade_hits(lane, lanes, room, geometry, moving, view_of, layer, hits, keys, out):  # type: ignore[no-untyped-def]
-    """Fill every `lanes`-th block of points from their hits, from the `lane`-th on.
+def shade_hits(thread, stride, scratch, geometry, moving, view_of, layer, hits, keys, out):  # type: ignore[no-untyped-def]
+    """Fill every `stride`-th block of points from their hits, from the `thread`-th on.
 
     Parameters
     ----------
-    lane, lanes : int64
-    room : tuple
+    thread, stride : int64
+    scratch : tuple
         Not used.
     geometry, moving : tuple
-        The scene's, and its vertices, faces and places.
+        The scene's, and its vertices, faces and instances.
     view_of : tuple
         As of `trace_samples`.
     layer : int
@@ -175,7 +175,7 @@ def shade_hits(lane, lanes, room, geometry, moving, view_of, layer, hits, keys, 
     albedo, roughness, metallic = materials
     position, depth, owner, emission, out_face, out_instance, barycentric = seen
     width = np.int64(p[WIDTH])
-    for block in range(lane, (len(pixel) + _BLOCK - 1) // _BLOCK, lanes):
+    for block in range(thread, (len(pixel) + _BLOCK - 1) // _BLOCK, stride):
         for n in range(block * _BLOCK, min((block + 1) * _BLOCK, len(pixel))):
             if flags[n] & layer != layer:
                 continue

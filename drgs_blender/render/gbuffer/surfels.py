@@ -195,13 +195,13 @@ def _find(tracer, point, normal, view, ahead, window):  # type: ignore[no-untype
 
 
 @njit
-def attach_points(lane, lanes, room, tracer, rules, view_of, samples, keys, out):  # type: ignore[no-untyped-def]
-    """Fill every `lanes`-th block of shading points, from the `lane`-th on; see the module's head.
+def attach_points(thread, stride, scratch, tracer, rules, view_of, samples, keys, out):  # type: ignore[no-untyped-def]
+    """Fill every `stride`-th block of shading points, from the `thread`-th on; see the module's head.
 
     Parameters
     ----------
-    lane, lanes : int64
-    room : tuple
+    thread, stride : int64
+    scratch : tuple
         Not used.
     tracer : Tracer
     rules, view_of, samples, keys, out : tuple
@@ -216,7 +216,7 @@ def attach_points(lane, lanes, room, tracer, rules, view_of, samples, keys, out)
     albedo, roughness, metallic = materials
     position, depth, owner, tied_face, tied_place, barycentric = seen
     width = np.int64(p[WIDTH])
-    for block in range(lane, (len(pixel) + _BLOCK - 1) // _BLOCK, lanes):
+    for block in range(thread, (len(pixel) + _BLOCK - 1) // _BLOCK, stride):
         for n in range(block * _BLOCK, min((block + 1) * _BLOCK, len(pixel))):
             if flags[n] & SECOND:
                 continue
@@ -279,9 +279,9 @@ def attach_points(lane, lanes, room, tracer, rules, view_of, samples, keys, out)
 
 
 @njit
-def _attach(first, last, lanes, tracer, rules, view_of, samples, keys, out):  # type: ignore[no-untyped-def]
-    for lane in range(first, last):
-        attach_points(lane, lanes, None, tracer, rules, view_of, samples, keys, out)
+def _attach(first, last, stride, tracer, rules, view_of, samples, keys, out):  # type: ignore[no-untyped-def]
+    for thread in range(first, last):
+        attach_points(thread, stride, None, tracer, rules, view_of, samples, keys, out)
 
 
 def tie_to_mesh(scene: TraceScene, *arguments: Any) -> None:
@@ -294,11 +294,11 @@ def tie_to_mesh(scene: TraceScene, *arguments: Any) -> None:
         Whether points are tied at all, and whether there is a mesh; parameters of the camera, windows, and the first
         column and row of the samples; depth, surface and object of these; pixel, sample and flags of the points; and
         the arrays to be filled: origin, normal, geometric normal and view; albedo, roughness and metallic; position,
-        depth, object, face, place and barycentric coordinates.
+        depth, object, face, instance and barycentric coordinates.
     """
     *inwards, frames, materials, seen = arguments
-    lanes = 8 * get_num_threads()
-    over_range(_attach, lanes, lanes, scene.tracer, *inwards, (frames, materials, seen))
+    stride = 8 * get_num_threads()
+    over_range(_attach, stride, stride, scene.tracer, *inwards, (frames, materials, seen))
 
 
 class Stages(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
-from ...compute.warp.kernels import Launcher, Work
+from ...compute.warp.kernels import Launcher, WarpKernel
 from ..gbuffer import surfels
 from ..scene.trace_scene import TraceScene
 from .native_functions import NATIVES
@@ -17,7 +17,7 @@ def _constants(module: ModuleType, name: str, value: Any) -> Any:
     return 1 if module is surfels and name == "_BLOCK" else value
 
 
-ATTACH = Work(surfels.attach_points, (), NATIVES, _constants)
+ATTACH = WarpKernel(surfels.attach_points, (), NATIVES, _constants)
 
 
 def tie(launcher: Launcher, mirror: Mirror, scene: TraceScene, *arguments: Any) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...compute.warp.kernels import Launcher, Work
+from ...compute.warp.kernels import Launcher, WarpKernel
 from ...compute.warp.runtime import warp
 from ..scene.trace_scene import TraceScene
 from ..scene.triangle_bvh import DEGRADED, looseness, neighbours
@@ -19,11 +19,11 @@ Array = np.ndarray
 
 
 def place_corners(
-    lane: Any, lanes: Any, room: Any, vertices: Any, faces: Any, instances: Any, rows: Any, out: Any
+    thread: Any, stride: Any, scratch: Any, vertices: Any, faces: Any, instances: Any, rows: Any, out: Any
 ) -> None:
     """Corners of triangles where they stand, three rows each."""
     (points,) = out
-    for i in range(lane, len(rows), lanes):
+    for i in range(thread, len(rows), stride):
         face, instance = rows[i, 0], rows[i, 1]
         for c in range(3):
             v, row = faces[face, c], 3 * i + c
@@ -38,7 +38,7 @@ def place_corners(
                     points[row, a] = turned + instances[instance, a, 3]
 
 
-PLACE = Work(place_corners, (), {})
+PLACE = WarpKernel(place_corners, (), {})
 
 
 class Tree:
@@ -48,7 +48,7 @@ class Tree:
     ----------
     launcher : Launcher
     rows : (k, 2) int32 array
-        The triangles: face, and place or -1.
+        The triangles: face, and instance or -1.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Tree:
         return int(self._mesh.id)
 
     def follow(self, scene: TraceScene, arrays: tuple[Any, Any, Any]) -> None:
-        """Go where the triangles are now; `arrays` are the scene's vertices, faces and places, on the device."""
+        """Go where the triangles are now; `arrays` are the scene's vertices, faces and instances, on the device."""
         self._launcher.launch(PLACE, len(self._rows), (*arrays, self._there), (self._corners,))
         if self._mesh is None or self._looseness(scene) > DEGRADED * self._fresh:
             self._build(scene)
@@ -102,7 +102,7 @@ class Trees:
     layout : object
         The scene's.
     rows, masks : (k, 2) int32 array
-        Face and place of all triangles, and what meets each.
+        Face and instance of all triangles, and what meets each.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class Trees:
     table : (trees, 3) int64 array
         Now: each one's id, mask and first of its `rows`.
     moving : tuple
-        The scene's vertices, faces and places, on the device, now.
+        The scene's vertices, faces and instances, on the device, now.
     trees : list
         One tree per kind.
     """
@@ -135,7 +135,7 @@ class Trees:
     def follow(self, scene: TraceScene) -> Any:
         """Bring them up to date; (3 m, 3) float32 corners of the scene's faces, on the device.
 
-        They stay there until the next time; None where nothing stands in places.
+        They stay there until the next time; None where no shape has instances.
         """
         launcher = self._launcher
         if self._faces is None or self._faces[0] is not scene.faces:

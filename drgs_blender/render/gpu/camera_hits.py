@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...compute.warp.kernels import Launcher, Work
+from ...compute.warp.kernels import Launcher, WarpKernel
 from ..gbuffer import camera_hits
 from ..gbuffer.camera_hits import MeshHits, arrays_of
 from ..gbuffer.gbuffer import GBuffer
@@ -25,20 +25,20 @@ def _constants(module: ModuleType, name: str, value: Any) -> Any:
     return 1 if module is camera_hits and name == "_BLOCK" else value
 
 
-TRACE = Work(camera_hits.trace_samples, (), NATIVES, _constants)
-SHADE = Work(camera_hits.shade_hits, (), NATIVES, _constants)
+TRACE = WarpKernel(camera_hits.trace_samples, (), NATIVES, _constants)
+SHADE = WarpKernel(camera_hits.shade_hits, (), NATIVES, _constants)
 
 
 @dataclass(slots=True)
 class DeviceHits(MeshHits):
-    """`MeshHits` of which depth and owner have come back from a device; faces, places and where stay there.
+    """`MeshHits` of which depth and owner have come back from a device; the rest stays there.
 
     Attributes
     ----------
     on_device : tuple
         All arrays, on the device.
     again : callable
-        Traces them on this processor.
+        Traces them on the CPU.
     """
 
     on_device: tuple[Any, ...]

@@ -1,6 +1,6 @@
-"""SVGF on a device, one lane a pixel; what one picture leaves to the next stays there.
+"""SVGF on a device, one thread per pixel; what one picture leaves to the next stays there.
 
-Where the processor works on runs of pixels for vectors, the same is written here for one pixel; sums are taken in the
+Where the CPU works on runs of pixels for vectors, the same is written here for one pixel; sums are taken in the
 same order. The functions here are translated and never run as they stand.
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ...compute.warp.kernels import Launcher, Room, Work
+from ...compute.warp.kernels import Launcher, ScratchArray, WarpKernel
 from ..denoise.demodulation import (
     CERTAINTY,
     GUIDES,
@@ -63,21 +63,21 @@ Array = np.ndarray
 _PLANES = planes_of(True)
 
 
-def span_rows(lane: Any, lanes: Any, room: Any, coverage: Any, out: Any) -> None:
+def span_rows(thread: Any, stride: Any, scratch: Any, coverage: Any, out: Any) -> None:
     """`demodulation.find_span`."""
     (spans,) = out
-    for y in range(lane, coverage.shape[0], lanes):
+    for y in range(thread, coverage.shape[0], stride):
         find_span(y, coverage, spans)
 
 
 def demodulate_pixels(
-    lane: Any, lanes: Any, room: Any, components: Any, variance: Any, surface: Any, out: Any
+    thread: Any, stride: Any, scratch: Any, components: Any, variance: Any, surface: Any, out: Any
 ) -> None:  # fmt: skip
     """`demodulation._demodulate`."""
     guide, light = out
     coverage = surface[0]
     h, w = coverage.shape[0], coverage.shape[1]
-    for column in range(lane, h * (w + 2 * PAD), lanes):
+    for column in range(thread, h * (w + 2 * PAD), stride):
         y, c = column // (w + 2 * PAD), column % (w + 2 * PAD)
         guide[y, SOURCE, c] = F(np.nan)
         guide[y, SURFACE, c] = F(np.nan)
@@ -88,12 +88,12 @@ def demodulate_pixels(
             demodulate_pixel(y, x, components, variance, surface, guide, light)
 
 
-def clamp_pixels(lane: Any, lanes: Any, room: Any, guide: Any, spans: Any, light: Any, out: Any) -> None:
+def clamp_pixels(thread: Any, stride: Any, scratch: Any, guide: Any, spans: Any, light: Any, out: Any) -> None:
     """`svgf_spatial._clamp_fireflies`."""
     (clamped,) = out
     h, w, planes = guide.shape[0], guide.shape[2] - 2 * PAD, light.shape[1]
     width = (planes - LIGHT) // 2
-    for pixel in range(lane, h * w, lanes):
+    for pixel in range(thread, h * w, stride):
         y, x = pixel // w, pixel % w
         if x < spans[y, 0] or x >= spans[y, 1]:
             continue
@@ -126,13 +126,13 @@ def clamp_pixels(lane: Any, lanes: Any, room: Any, guide: Any, spans: Any, light
 
 
 def look_up_pixels(
-    lane: Any, lanes: Any, room: Any, guide: Any, spans: Any, vector: Any, expected: Any, other: Any, other_light: Any,
-    out: Any,
+    thread: Any, stride: Any, scratch: Any, guide: Any, spans: Any, vector: Any, expected: Any, other: Any,
+    other_light: Any, out: Any,
 ) -> None:  # fmt: skip
     """`svgf_temporal._look_up`."""
     past, source = out
     h, w = guide.shape[0], guide.shape[2] - 2 * PAD
-    for column in range(lane, h * (w + 2 * PAD), lanes):
+    for column in range(thread, h * (w + 2 * PAD), stride):
         y, c = column // (w + 2 * PAD), column % (w + 2 * PAD)
         source[y, c] = F(np.nan)
         x = c - PAD
@@ -141,13 +141,14 @@ def look_up_pixels(
 
 
 def compare_pixels(
-    lane: Any, lanes: Any, room: Any, still: Any, guide: Any, spans: Any, light: Any, past: Any, source: Any, out: Any
+    thread: Any, stride: Any, scratch: Any, still: Any, guide: Any, spans: Any, light: Any, past: Any, source: Any,
+    out: Any,
 ) -> None:  # fmt: skip
     """`svgf_temporal._compare`."""
     (change,) = out
-    (sums,) = room
+    (sums,) = scratch
     h, w = guide.shape[0], guide.shape[2] - 2 * PAD
-    for pixel in range(lane, h * w, lanes):
+    for pixel in range(thread, h * w, stride):
         y, x = pixel // w, pixel % w
         if x < spans[y, 0] or x >= spans[y, 1]:
             continue
@@ -178,22 +179,23 @@ def compare_pixels(
 
 
 def mix_pixels(
-    lane: Any, lanes: Any, room: Any, least: Any, spans: Any, light: Any, past: Any, source: Any, change: Any, out: Any
+    thread: Any, stride: Any, scratch: Any, least: Any, spans: Any, light: Any, past: Any, source: Any, change: Any,
+    out: Any,
 ) -> None:  # fmt: skip
     """`svgf_temporal._mix`."""
     guide, mixed = out
     h, w = guide.shape[0], guide.shape[2] - 2 * PAD
-    for pixel in range(lane, h * w, lanes):
+    for pixel in range(thread, h * w, stride):
         y, x = pixel // w, pixel % w
         if x >= spans[y, 0] and x < spans[y, 1]:
             mix_pixel(y, x + PAD, least, light, past, source, change, guide, mixed)
 
 
-def weigh_pixels(lane: Any, lanes: Any, room: Any, sigma: Any, guide: Any, spans: Any, out: Any) -> None:
+def weigh_pixels(thread: Any, stride: Any, scratch: Any, sigma: Any, guide: Any, spans: Any, out: Any) -> None:
     """`svgf_spatial._weigh`."""
     (light,) = out
     h, w = guide.shape[0], guide.shape[2] - 2 * PAD
-    for pixel in range(lane, h * w, lanes):
+    for pixel in range(thread, h * w, stride):
         y, x = pixel // w, pixel % w
         if x < spans[y, 0] or x >= spans[y, 1]:
             continue
@@ -218,13 +220,15 @@ def tap(k: Any) -> Any:
     return F(0.375) if k == 2 else (F(0.25) if k == 1 or k == 3 else F(0.0625))
 
 
-def a_trous_pixels(lane: Any, lanes: Any, room: Any, step: Any, guide: Any, spans: Any, light: Any, out: Any) -> None:
+def a_trous_pixels(
+    thread: Any, stride: Any, scratch: Any, step: Any, guide: Any, spans: Any, light: Any, out: Any
+) -> None:
     """`svgf_spatial._a_trous`."""
     (filtered,) = out
-    (sums,) = room
+    (sums,) = scratch
     h, w, planes = guide.shape[0], guide.shape[2] - 2 * PAD, light.shape[1]
     lobe_planes = (planes - LIGHT) // 2
-    for pixel in range(lane, h * w, lanes):
+    for pixel in range(thread, h * w, stride):
         y, x = pixel // w, pixel % w
         if x < spans[y, 0] or x >= spans[y, 1]:
             continue
@@ -277,23 +281,27 @@ def a_trous_pixels(lane: Any, lanes: Any, room: Any, step: Any, guide: Any, span
             filtered[y, LUMINANCE + lobe, c] = luminance
 
 
-def modulate_pixels(lane: Any, lanes: Any, room: Any, light: Any, surface: Any, out: Any) -> None:
+def modulate_pixels(thread: Any, stride: Any, scratch: Any, light: Any, surface: Any, out: Any) -> None:
     """`demodulation._modulate`."""
     (picture,) = out
     coverage = surface[0]
     h, w = coverage.shape[0], coverage.shape[1]
-    for pixel in range(lane, h * w, lanes):
+    for pixel in range(thread, h * w, stride):
         y, x = pixel // w, pixel % w
         if coverage[y, x] > ZERO:
             modulate_pixel(y, x, light, surface, picture)
 
 
-SPAN, DEMODULATE, CLAMP = Work(span_rows, (), {}), Work(demodulate_pixels, (), {}), Work(clamp_pixels, (), {})
-LOOK_UP, MIX = Work(look_up_pixels, (), {}), Work(mix_pixels, (), {})
-COMPARE = Work(compare_pixels, (Room("float32", (CHANGES,)),), {})
-WEIGH, MODULATE = Work(weigh_pixels, (), {}), Work(modulate_pixels, (), {})
-A_TROUS = Work(a_trous_pixels, (Room("float32", (_PLANES,)),), {})
-WORKS = (SPAN, DEMODULATE, CLAMP, LOOK_UP, COMPARE, MIX, WEIGH, A_TROUS, MODULATE)
+SPAN, DEMODULATE, CLAMP = (
+    WarpKernel(span_rows, (), {}),
+    WarpKernel(demodulate_pixels, (), {}),
+    WarpKernel(clamp_pixels, (), {}),
+)
+LOOK_UP, MIX = WarpKernel(look_up_pixels, (), {}), WarpKernel(mix_pixels, (), {})
+COMPARE = WarpKernel(compare_pixels, (ScratchArray("float32", (CHANGES,)),), {})
+WEIGH, MODULATE = WarpKernel(weigh_pixels, (), {}), WarpKernel(modulate_pixels, (), {})
+A_TROUS = WarpKernel(a_trous_pixels, (ScratchArray("float32", (_PLANES,)),), {})
+KERNELS = (SPAN, DEMODULATE, CLAMP, LOOK_UP, COMPARE, MIX, WEIGH, A_TROUS, MODULATE)
 
 
 class DeviceSignal(Signal):

@@ -1,4 +1,4 @@
-"""The integrator on a device: `integrator.integrate` with Warp's rays, one lane a point, from the same source."""
+"""The integrator on a device: `integrator.integrate` with Warp's rays, one thread per point, from the same source."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...compute.warp.kernels import Launcher, Room, Work
+from ...compute.warp.kernels import Launcher, ScratchArray, WarpKernel
 from ..integrator import direct, indirect, integrate, sample_allocation, wavefront
 from ..integrator.records import Sampler, Scene, Settings
 from ..lights.environment import EnvironmentLight
@@ -21,7 +21,7 @@ Array = np.ndarray
 
 
 def _constants(module: ModuleType, name: str, value: Any) -> Any:
-    """One ray a batch, one point a block, one lane a packet: a thread needs no more."""
+    """One ray per batch, one point per block, one lane per packet: a thread needs no more."""
     if name in ("BATCH", "_BLOCK") and module in (integrate, direct):
         return 1
     if module is wavefront and name in wavefront.IN_LANES:
@@ -30,24 +30,24 @@ def _constants(module: ModuleType, name: str, value: Any) -> Any:
 
 
 _BATCH = wavefront.Batch._make([
-    Room("float32", (wavefront.PACKET_FLOATS // wavefront.LANES,)),
-    Room("uint32", (wavefront.PACKET_INTS // wavefront.LANES,)),
+    ScratchArray("float32", (wavefront.PACKET_FLOATS // wavefront.LANES,)),
+    ScratchArray("uint32", (wavefront.PACKET_INTS // wavefront.LANES,)),
 ])  # fmt: skip
 #: As `integrate._scratch` makes it, for batches and blocks of one.
-_ROOMS = integrate.Scratch._make([
+_SCRATCH = integrate.Scratch._make([
     _BATCH,
     _BATCH,
-    Room("float32", (1, indirect.FOUND)),
-    Room("float32", (1, direct.KINDS * direct.KIND)),
-    Room("float32", (1, sample_allocation.POINT_STATE)),
-    Room("uint32", (1,)),
-    Room("int64", (1,)),
+    ScratchArray("float32", (1, indirect.FOUND)),
+    ScratchArray("float32", (1, direct.KINDS * direct.KIND)),
+    ScratchArray("float32", (1, sample_allocation.POINT_STATE)),
+    ScratchArray("uint32", (1,)),
+    ScratchArray("int64", (1,)),
 ])  # fmt: skip
-SHADE = Work(integrate.shade_points, _ROOMS, NATIVES, _constants)
+SHADE = WarpKernel(integrate.shade_points, _SCRATCH, NATIVES, _constants)
 
 
-class DeviceKernel(integrate.Kernel):
-    """`integrator.integrate.Kernel` on a device."""
+class DeviceShadingKernel(integrate.ShadingKernel):
+    """`integrator.integrate.ShadingKernel` on a device."""
 
     def __init__(self, launcher: Launcher, mirror: Mirror) -> None:
         self._launcher, self._mirror = launcher, mirror

@@ -25,7 +25,7 @@ class MeshTracer(NamedTuple):
     faces : int
         Address of (k, 2) int32, the scene's face and instance of each triangle; 0: they are the scene's faces.
     corners : int
-        Address of (m, 3, 3) float32, corners of the scene's faces; read where a shape stands in places.
+        Address of (m, 3, 3) float32, corners of the scene's faces; read where a shape has instances.
     """
 
     meshes: int

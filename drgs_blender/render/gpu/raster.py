@@ -1,7 +1,7 @@
-"""Surfels blended on a device, one lane a sample, exactly as `surfels.raster` blends them.
+"""Surfels blended on a device, one thread per sample, exactly as `surfels.raster` blends them.
 
-The functions here are translated and never run as they stand. A lane gathers the nearest contributions of its sample in
-a list that is kept in order, and blends them; while more were met than the list holds, and light still passes, it
+The functions here are translated and never run as they stand. A thread gathers the nearest contributions of its sample
+in a list that is kept in order, and blends them; while more were met than the list holds, and light still passes, it
 gathers those behind the last.
 """
 
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...compute.warp.kernels import Launcher, Room, Work
+from ...compute.warp.kernels import Launcher, ScratchArray, WarpKernel
 from ..camera import CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, lattice, pixel_shift
 from ..sampling import ONE, ZERO, F
 from ..surfel_columns import ALBEDO, METALLIC, NORMAL, OPACITY, ROUGHNESS, SAMPLE, SIZE
@@ -20,7 +20,7 @@ from ..surfels.blending import GAP, MIN_TRANSMITTANCE
 from ..surfels.raster import SurfelSamples, gaussian
 from ..surfels.splats import CUT, DIM, LOW, MAX_ALPHA, RX, RY, TILE, ZC, A, B, D, N, Splats
 
-#: Contributions that a lane gathers at once.
+#: Contributions that a thread gathers at once.
 MOST = 64
 #: Sums over a cluster of contributions: weight, and times that depth, normal, albedo, roughness, metallic and size; the
 #: weight of its heaviest one. Row 0 is the cluster at hand, row 1 the heaviest so far.
@@ -155,9 +155,9 @@ def gather(lists: Any, splats: Any, first: Any, last: Any, position: PixelPositi
     return n
 
 
-def blend_samples(lane: Any, lanes: Any, room: Any, splats: Any, p: Any, rows: Rows, out: Any) -> None:
+def blend_samples(thread: Any, stride: Any, scratch: Any, splats: Any, p: Any, rows: Rows, out: Any) -> None:
     """Blend samples as `raster._blend` does; `splats` are the arrays of `Splats`."""
-    lists_z, lists_a, lists_i, sums, owner = room
+    lists_z, lists_a, lists_i, sums, owner = scratch
     lists = lists_z, lists_a, lists_i
     _, surface, _, _, objects, tile_start, _ = splats
     x0, y0, subpixels = rows.x0, rows.y0, rows.subpixels
@@ -171,7 +171,7 @@ def blend_samples(lane: Any, lanes: Any, room: Any, splats: Any, p: Any, rows: R
     pixel = ZERO if p[ORTHOGRAPHIC] != 0.0 else slope
     pixel_base = slope if p[ORTHOGRAPHIC] != 0.0 else ZERO
     stop = F(MIN_TRANSMITTANCE)
-    for sample in range(lane, (rows.y1 - y0) * columns * subpixels, lanes):
+    for sample in range(thread, (rows.y1 - y0) * columns * subpixels, stride):
         number = sample % subpixels
         column, row = sample // subpixels % columns, sample // (subpixels * columns)
         x, y = x0 + column, y0 + row
@@ -214,14 +214,14 @@ def blend_samples(lane: Any, lanes: Any, room: Any, splats: Any, p: Any, rows: R
         out_object[row, column, number] = objects[owner[1]]
 
 
-_ROOMS = (
-    Room("float32", (MOST,)),
-    Room("float32", (MOST,)),
-    Room("int32", (MOST,)),
-    Room("float32", (2, _SUMS)),
-    Room("int32", (2,)),
+_SCRATCH = (
+    ScratchArray("float32", (MOST,)),
+    ScratchArray("float32", (MOST,)),
+    ScratchArray("int32", (MOST,)),
+    ScratchArray("float32", (2, _SUMS)),
+    ScratchArray("int32", (2,)),
 )
-BLEND = Work(blend_samples, _ROOMS, {})
+BLEND = WarpKernel(blend_samples, _SCRATCH, {})
 
 
 class DeviceSamples(SurfelSamples):

@@ -61,7 +61,7 @@ class Mirror:
         return found
 
     def owners(self, scene: TraceScene) -> tuple[Any, Any]:
-        """Objects of the scene's faces and places, as arrays; until its next update."""
+        """Objects of the scene's faces and instances, as arrays; until its next update."""
         copy = self._launcher.array
         found: tuple[Any, Any] = self._table(
             "owners", (scene, scene.version), lambda address_of: (copy(scene.face_object), copy(scene.instance_object))
@@ -69,7 +69,7 @@ class Mirror:
         return found
 
     def moving(self, scene: TraceScene) -> tuple[Any, Any, Any]:
-        """The scene's vertices, faces and places; until its next update."""
+        """The scene's vertices, faces and instances; until its next update."""
         self.tracer(scene)
         assert self._trees is not None
         return self._trees.moving
@@ -107,13 +107,13 @@ class Mirror:
         if not len(rows):
             self._trees = None
             return MeshTracer(0, 0, 0, 0)
-        # What stands in places may have come or gone, and what sees it changed, without another layout.
+        # Instances may have come or gone, and what sees them changed, without another layout.
         rays = masks & _RAYS
         if self._trees is None or not self._trees.of(scene.layout, rows, rays):
             self._trees = None  # gives the memory back before more is taken
             self._trees = Trees(self._launcher, scene.layout, rows, rays)
-        trees, placed = self._trees, len(scene.instances) > 0
+        trees, instanced = self._trees, len(scene.instances) > 0
         corners = trees.follow(scene)
-        plain = len(trees.trees) == 1 and not placed
+        plain = len(trees.trees) == 1 and not instanced
         faces = 0 if plain else int(trees.rows.ptr)
-        return MeshTracer(address_of(trees.table), len(trees.trees), faces, int(corners.ptr) if placed else 0)
+        return MeshTracer(address_of(trees.table), len(trees.trees), faces, int(corners.ptr) if instanced else 0)

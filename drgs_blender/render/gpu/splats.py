@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...compute.warp.kernels import Launcher, Work
+from ...compute.warp.kernels import Launcher, WarpKernel
 from ...compute.warp.posed_surfels import arrays_of
 from ...compute.warp.runtime import warp
 from ...compute.warp.search import first_of
@@ -44,40 +44,42 @@ class DeviceSplats(Splats):
     Attributes
     ----------
     on_cpu : callable
-        The same on the processor, made when that is asked for.
+        The same on the CPU, made when that is asked for.
     """
 
     on_cpu: Callable[[], Splats]
 
 
-def project_surfels(lane: Any, lanes: Any, room: Any, posed: Any, p: Any, window: Any, out: Any) -> None:
+def project_surfels(thread: Any, stride: Any, scratch: Any, posed: Any, p: Any, window: Any, out: Any) -> None:
     """`splats._project`, and the depths of the centres."""
     screen, box, nearest, depth = out
-    for i in range(lane, len(box), lanes):
+    for i in range(thread, len(box), stride):
         project_surfel(i, posed, p, window, screen, box, nearest)
         depth[i] = screen[i, ZC]
 
 
-def key_depths(lane: Any, lanes: Any, room: Any, bits: Any, box: Any, out: Any) -> None:
+def key_depths(thread: Any, stride: Any, scratch: Any, bits: Any, box: Any, out: Any) -> None:
     """Sort keys of surfels: depth; culled ones go last."""
     keys, order = out
-    for i in range(lane, len(box), lanes):
+    for i in range(thread, len(box), stride):
         keys[i] = depth_key(bits[i]) if box[i, 2] > box[i, 0] else np.uint32(_CULLED)
         order[i] = np.int32(i)
 
 
-def find_starts(lane: Any, lanes: Any, room: Any, keys: Any, count: Any, first: Any, out: Any) -> None:
+def find_starts(thread: Any, stride: Any, scratch: Any, keys: Any, count: Any, first: Any, out: Any) -> None:
     """Numbers of `count` sorted keys that are less than `first`, `first` + 1, ..."""
     (start,) = out
-    for t in range(lane, len(start), lanes):
+    for t in range(thread, len(start), stride):
         start[t] = first_of(keys, count, first + t)
 
 
-def gather_splats(lane: Any, lanes: Any, room: Any, order: Any, found: Any, posed: Any, owner: Any, out: Any) -> None:
+def gather_splats(
+    thread: Any, stride: Any, scratch: Any, order: Any, found: Any, posed: Any, owner: Any, out: Any
+) -> None:
     """Records of surfels in order of depth, and the number of tiles of each."""
     screen, box, nearest = found
     out_screen, out_surface, out_box, out_nearest, out_owner, tiles = out
-    for k in range(lane, len(out_box), lanes):
+    for k in range(thread, len(out_box), stride):
         i = np.int64(order[k])
         for c in range(RECORD):
             out_screen[k, c] = screen[i, c]
@@ -89,11 +91,11 @@ def gather_splats(lane: Any, lanes: Any, room: Any, order: Any, found: Any, pose
         tiles[k] = (x1 - x0) * (y1 - y0)
 
 
-def list_tiles(lane: Any, lanes: Any, room: Any, box: Any, ends: Any, grid: Any, out: Any) -> None:
+def list_tiles(thread: Any, stride: Any, scratch: Any, box: Any, ends: Any, grid: Any, out: Any) -> None:
     """Every splat's tiles, splat by splat; `ends` are those of their rows."""
     first_x, first_y, columns = grid
     keys, splat = out
-    for k in range(lane, len(box), lanes):
+    for k in range(thread, len(box), stride):
         x0, y0, x1, y1 = tiles_of(box, k)
         row = ends[k] - (x1 - x0) * (y1 - y0)
         for y in range(y0 - first_y, y1 - first_y):
@@ -102,11 +104,11 @@ def list_tiles(lane: Any, lanes: Any, room: Any, box: Any, ends: Any, grid: Any,
                 row += 1
 
 
-PROJECT = Work(project_surfels, (), {})
-KEY = Work(key_depths, (), {})
-FIND = Work(find_starts, (), {})
-GATHER = Work(gather_splats, (), {})
-LIST = Work(list_tiles, (), {})
+PROJECT = WarpKernel(project_surfels, (), {})
+KEY = WarpKernel(key_depths, (), {})
+FIND = WarpKernel(find_starts, (), {})
+GATHER = WarpKernel(gather_splats, (), {})
+LIST = WarpKernel(list_tiles, (), {})
 
 
 def prepare(
@@ -117,7 +119,7 @@ def prepare(
     Parameters
     ----------
     on_cpu : callable
-        Makes the same on the processor.
+        Makes the same on the CPU.
     launcher : Launcher
     posed : PosedSurfels
     camera : Camera

@@ -27,7 +27,7 @@ from ..surfels.surfel_bvh import SurfelBVH
 from .attach import tie
 from .camera_hits import DeviceHits, shade, trace
 from .denoise import denoise
-from .integrate import DeviceKernel
+from .integrate import DeviceShadingKernel
 from .raster import DeviceSamples, rasterise
 from .scene_mirror import Mirror
 from .splats import DeviceSplats, prepare
@@ -48,7 +48,7 @@ class WarpRenderBackend(RenderBackend):
         self.launcher: Launcher = Launcher(device)
         self.mirror = Mirror(self.launcher)
         self._samples: DeviceSamples | None = None
-        self._kernel = DeviceKernel(self.launcher, self.mirror)
+        self._kernel = DeviceShadingKernel(self.launcher, self.mirror)
 
     def integrate(self, *arguments: Any, surfels: SurfelBVH | None = None) -> Radiance:
         on_cpu = super().integrate

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...compute.jit import njit
-from ...compute.threads import over_lanes
+from ...compute.threads import over_strided
 from ...core.color import LUMINANCE
 from ...core.errors import UsageError
 from ...core.frame import RenderSettings
@@ -45,7 +45,7 @@ _BLOCK = 64
 _LEAST_SHARE = 0.1
 
 
-class Kernel:
+class ShadingKernel:
     """The kernel that shades points, with its scene: on all CPU threads; `render.gpu` has the same for a card."""
 
     def tables(self, scene: TraceScene, environment: EnvironmentLight, lights: Lights) -> tuple[Any, Any, Any, Any]:
@@ -57,7 +57,7 @@ class Kernel:
     ) -> None:
         """Shade all points; see `shade_points`."""
         blocks = -(-len(points.pixel) // _BLOCK)
-        over_lanes(_kernel, blocks, points, scene, settings, sampler, out)
+        over_strided(_kernel, blocks, points, scene, settings, sampler, out)
 
 
 def integrate(
@@ -70,7 +70,7 @@ def integrate(
     part: tuple[int, int] = (0, 1),
     *,
     surfels: SurfelBVH | None = None,
-    kernel: Kernel | None = None,
+    kernel: ShadingKernel | None = None,
 ) -> Radiance:
     """Light that leaves `points` towards the camera.
 
@@ -92,7 +92,7 @@ def integrate(
         (i, n): only the i-th of n equal parts of each sub-sample's samples; the mean over all parts is the whole.
     surfels : SurfelBVH, optional
         Surfels of DR-GS objects, traced next to the meshes; then `points` say which surfels are their own.
-    kernel : Kernel, optional
+    kernel : ShadingKernel, optional
         None: that of the CPU.
 
     Returns
@@ -124,7 +124,7 @@ def integrate(
     share = environment_share(environment, lights)
     # Where neither shines, nothing is drawn by its light, though surfaces may emit some.
     environment_part, lights_part = share * (not environment.black), (1.0 - share) * (lights.count > 0)
-    kernel = kernel or Kernel()
+    kernel = kernel or ShadingKernel()
     tracer, geometry, envmap, light_tables = kernel.tables(scene, environment, lights)
     if surfels is not None:
         tracer = tracer._replace(**tracer_of(surfels)._asdict())
@@ -205,12 +205,12 @@ class Scratch(NamedTuple):
 
 
 @njit
-def shade_points(lane, lanes, scratch, points, scene, settings, sampler, out):  # type: ignore[no-untyped-def]
-    """Shade every `lanes`-th block of points, from the `lane`-th on.
+def shade_points(thread, stride, scratch, points, scene, settings, sampler, out):  # type: ignore[no-untyped-def]
+    """Shade every `stride`-th block of points, from the `thread`-th on.
 
     Parameters
     ----------
-    lane, lanes : int64
+    thread, stride : int64
     scratch : Scratch
     points : PointArrays
     scene : Scene
@@ -226,7 +226,7 @@ def shade_points(lane, lanes, scratch, points, scene, settings, sampler, out):  
     ints, part, parts = rays.ints, sampler.part, sampler.parts
     # Samples of a sub-sample's part lie next to each other among those of the pixel.
     rate = ONE / F(sampler.subpixels * parts)
-    for block in range(lane, blocks, lanes):
+    for block in range(thread, blocks, stride):
         start = block * _BLOCK
         end = min(n, start + _BLOCK)
         sums[:] = ZERO
@@ -284,8 +284,8 @@ def _scratch() -> Any:
 
 
 @njit
-def _kernel(first, last, lanes, points, scene, settings, sampler, out):  # type: ignore[no-untyped-def]
-    # A lane is every n-th block: none has all the costly ones.
+def _kernel(first, last, stride, points, scene, settings, sampler, out):  # type: ignore[no-untyped-def]
+    # Every n-th block: none has all the costly ones.
     scratch = _scratch()
-    for lane in range(first, last):
-        shade_points(lane, lanes, scratch, points, scene, settings, sampler, out)
+    for thread in range(first, last):
+        shade_points(thread, stride, scratch, points, scene, settings, sampler, out)

@@ -46,7 +46,7 @@ class MixedTracer(NamedTuple):
 
 
 class MixedHit(NamedTuple):
-    """`Hit` of a mesh, or of surfels as one blended surface: then face and place are -1, and the rest describes it.
+    """`Hit` of a mesh, or of surfels as one blended surface: then face and instance are -1, and the rest describes it.
 
     Attributes
     ----------

@@ -191,7 +191,7 @@ class Emitters:
             shut = shut or (emitter.mesh.faces, _is_closed(emitter.mesh.faces))
             self._shut.append(shut)
             bits |= CLOSED * shut[1]
-            # Normals look outwards where the surface is closed; a mirrored place turns the order of the corners.
+            # Normals look outwards where the surface is closed; a mirrored instance turns the order of the corners.
             inwards = shut[1] and _volume(scene.vertices, scene.faces[emitter.shape]) < 0.0
             turned = (np.linalg.det(matrices[:, :, :3]) < 0.0) != inwards
             luminance = _luminance(emitter, scene)
@@ -265,7 +265,7 @@ def _volume(vertices, faces):  # type: ignore[no-untyped-def]
 
 @njit
 def _fill(own, vertices, faces, matrices, luminance, bits, turned, rows):  # type: ignore[no-untyped-def]
-    """Rows of faces in (k, 3, 4) places; where (k,) `turned`, the normals look the other way."""
+    """Rows of faces of (k, 3, 4) instances; where (k,) `turned`, the normals look the other way."""
     corners, edges = np.empty((3, 3)), np.empty((2, 3))
     for j in range(len(own) * len(matrices)):
         m, face = matrices[j // len(own)], own[j % len(own)]

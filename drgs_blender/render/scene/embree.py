@@ -179,7 +179,7 @@ def trace(typing, address, scene, ray):  # type: ignore[no-untyped-def]
     primitive : int32
         Face, from the group's first one on.
     instance : int32
-        Of the group's places; -1 for a group that stands in the world as it is.
+        Number among the group's instances; -1 for a group without instances, in world space.
     u, v : float32
         Barycentric coordinates: the hit is (1 - u - v) v0 + u v1 + v v2.
     gx, gy, gz : float32

@@ -1,8 +1,8 @@
 """Surface interactions, for compiled code: from a hit to shading normal, material, emission and object.
 
 Two kinds of faces lie in one numbering. DR-GS faces come first; they carry materials at their vertices. Those of
-ordinary meshes follow; they refer to materials, with textures. Faces of shapes that stand in several places are in
-object space, and the hit says in which place it is.
+ordinary meshes follow; they refer to materials, with textures. Faces of shapes that have instances are in object space,
+and the hit names the instance.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Tracer(NamedTuple):
     first_face : int
         Address of (groups,) int32, the first face of each group.
     first_instance : int
-        Address of (groups,) int32, the first row of each group's places in ``Geometry.place_*``.
+        Address of (groups,) int32, the first row of each group's instances in ``Geometry.instance_*``.
     """
 
     intersect: int
@@ -52,9 +52,9 @@ class Geometry(NamedTuple):
     shading : int
         (k, 8) float32: unit normal, albedo, roughness, metallic.
     normals : int
-        (r, 3) float32 unit; object space for faces of shapes in places.
+        (r, 3) float32 unit; object space for faces of instances.
     face_object : int
-        (m,) int32, object of each face; not used for faces of shapes in places.
+        (m,) int32, object of each face; not used for faces of instances.
     vertex_faces : int
         How many faces carry materials at their vertices.
     material : int
@@ -140,7 +140,7 @@ def _turned(matrices, instance, x, y, z):  # type: ignore[no-untyped-def]
 
 @njit
 def _normal_of_instance(normals, i, j, k, w, u, v, matrices, instance):  # type: ignore[no-untyped-def]
-    """Each corner's normal is turned before they are blended, as it is for a mesh in a single place."""
+    """Each corner's normal is turned before they are blended, as it is for a mesh without instances."""
     ax, ay, az = _turned(
         matrices, instance, load_float(normals, i), load_float(normals, i + 1), load_float(normals, i + 2)
     )

@@ -41,7 +41,7 @@ class Group:
         int32 bits; a ray meets the group when it has one of them.
     instances : array, optional
         None when the vertices are in world space; else (k, 3, 4) float32 object-to-world matrices, invertible: the
-        group's faces stand in k places and share one tree.
+        group's faces have k instances that share one tree.
     """
 
     first: int
@@ -324,7 +324,7 @@ class TriangleBVH:
         moved : iterable of int, optional
             The groups whose vertices moved, or None: all.
         instances : mapping of int to array, optional
-            group -> new (k, 3, 4) matrices, for groups that were built with places.
+            group -> new (k, 3, 4) matrices, for groups that were built with instances.
         """
         if vertices is not None:
             self.vertices[:] = vertices
@@ -351,7 +351,7 @@ class TriangleBVH:
     def hits(
         self, origins: Array, directions: Array, tnear: float = 0.0, tfar: float = math.inf, mask: int = ALL
     ) -> tuple[Array, Array, Array, Array, Array]:
-        """As `intersect`, with the place of the face's group between face and u: (n,) int32 or -1."""
+        """As `intersect`, with the instance of the face's group between face and u: (n,) int32 or -1."""
         t, u, v = np.empty((3, len(origins)), np.float32)
         face, instance = np.empty((2, len(origins)), np.int32)
         rays = Rays.of(origins, directions, tnear, tfar, mask)

@@ -12,7 +12,7 @@ import numpy as np
 from ...compute.jit import njit
 from ..surfel_columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
 
-#: Samples that vector code works on at a time; a tile's side and the room for contributions are multiples of it.
+#: Samples that vector code works on at a time; a tile's side and the capacity of `Contributions` are multiples of it.
 LANES = 16
 #: Contributions beyond which sorting by merging is faster than by counting.
 MANY = 128
@@ -29,17 +29,17 @@ class Contributions(NamedTuple):
 
     Attributes
     ----------
-    room : int
+    capacity : int
         Places in each list.
-    depth : (LANES * room,) float32 array
+    depth : (LANES * capacity,) float32 array
         Metres along the view axis.
-    strength : (LANES * room,) float32 array
+    strength : (LANES * capacity,) float32 array
         Opacity times kernel.
-    splat : (LANES * room,) int32 array
+    splat : (LANES * capacity,) int32 array
         Its number.
     """
 
-    room: int
+    capacity: int
     depth: Array
     strength: Array
     splat: Array
@@ -51,9 +51,9 @@ class Scratch(NamedTuple):
     Attributes
     ----------
     rank : (LANES,) int32 array
-    order : (room,) int32 array
+    order : (capacity,) int32 array
         Of the contributions, front to back.
-    weights : (room,) float32 array
+    weights : (capacity,) float32 array
         Of the contributions in that order.
     """
 
@@ -71,11 +71,11 @@ def merge_sort(z, base, n, order):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    z : (LANES * room,) float32 array
+    z : (LANES * capacity,) float32 array
         Depths, `Contributions.depth`.
     base, n : int64
         First entry of the sample, and how many.
-    order : (room,) int32 array
+    order : (capacity,) int32 array
         `n` entries are written: places from `base` on, nearest first.
     """
     by_depth = np.argsort(z[base : base + n], kind="mergesort")
@@ -89,13 +89,13 @@ def rank_sort(z, base, n, rank, order):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    z : (LANES * room,) float32 array
+    z : (LANES * capacity,) float32 array
         Depths, `Contributions.depth`; entries beyond the sample's up to a multiple of LANES are set to infinity.
     base, n : int64
         First entry of the sample, and how many.
     rank : (LANES,) int32 array
         Scratch.
-    order : (room,) int32 array
+    order : (capacity,) int32 array
         `n` entries are written: places from `base` on, nearest first.
     """
     for k in range(n, (n + LANES - 1) // LANES * LANES):
@@ -182,36 +182,36 @@ def prune(lists, base, n, scratch):  # type: ignore[no-untyped-def]
 
 
 @njit
-def contributions(room):  # type: ignore[no-untyped-def]
+def contributions(capacity):  # type: ignore[no-untyped-def]
     """Lists for the contributions of a block, not filled.
 
     Parameters
     ----------
-    room : int64
+    capacity : int64
         Places per sample, a multiple of LANES.
 
     Returns
     -------
     Contributions
     """
-    size = LANES * room
-    return Contributions(room, np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.int32))
+    size = LANES * capacity
+    return Contributions(capacity, np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.int32))
 
 
 @njit
-def scratch_for(room):  # type: ignore[no-untyped-def]
-    """Scratch memory for lists with so much room.
+def scratch_for(capacity):  # type: ignore[no-untyped-def]
+    """Scratch memory for lists of this capacity.
 
     Parameters
     ----------
-    room : int64
+    capacity : int64
         As of `contributions`.
 
     Returns
     -------
     Scratch
     """
-    return Scratch(np.empty(LANES, np.int32), np.empty(room, np.int32), np.empty(room, np.float32))
+    return Scratch(np.empty(LANES, np.int32), np.empty(capacity, np.int32), np.empty(capacity, np.float32))
 
 
 @njit
@@ -226,10 +226,10 @@ def widen(lists):  # type: ignore[no-untyped-def]
     -------
     Contributions
     """
-    room, wider = lists.room, contributions(2 * lists.room)
+    capacity, wider = lists.capacity, contributions(2 * lists.capacity)
     for lane in range(LANES):
-        old, new = room * lane, 2 * room * lane
-        for k in range(room):  # assigning slices would take a second to compile
+        old, new = capacity * lane, 2 * capacity * lane
+        for k in range(capacity):  # assigning slices would take a second to compile
             wider.depth[new + k] = lists.depth[old + k]
             wider.strength[new + k] = lists.strength[old + k]
             wider.splat[new + k] = lists.splat[old + k]

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compute.jit import inlined, njit
-from ...compute.threads import over_lanes
+from ...compute.threads import over_strided
 from ..camera import CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, lattice, pixel_shift
 from ..surfel_columns import OPACITY, SAMPLE, SPLAT
 from .blending import GAP, LANES, MIN_TRANSMITTANCE, contributions, mean, prune, scratch_for, sort, weigh, widen
@@ -158,7 +158,7 @@ def rasterise(splats: Splats, y0: int, y1: int) -> SurfelSamples:
         np.empty(shape, np.int32),
     )
     if splats.number:
-        over_lanes(_blend, len(splats.tile_start) - 1, splats, y0, y1, samples)
+        over_strided(_blend, len(splats.tile_start) - 1, splats, y0, y1, samples)
     return samples
 
 
@@ -311,7 +311,7 @@ def _gather(own, binned, begin, end, first, view, state, count, lists):  # type:
 
     Returns the splat to go on with: it is less than `end` when a sample's list is full.
     """
-    screen, span, room, near, far = own.screen, own.span, lists.room, view.near, view.far
+    screen, span, capacity, near, far = own.screen, own.span, lists.capacity, view.near, view.far
     depth, strength, splat = lists.depth, lists.strength, lists.splat
     limit = np.float32(1e30)
     for entry in range(begin, end):
@@ -330,12 +330,12 @@ def _gather(own, binned, begin, end, first, view, state, count, lists):  # type:
         for lane in range(LANES):
             k = np.uintp(lane)
             n = count[k]
-            to = k * np.uintp(room) + np.uintp(n)
+            to = k * np.uintp(capacity) + np.uintp(n)
             depth[to], strength[to], splat[to] = state[_DEPTH + k], state[_ALPHA + k], i
             n += np.int32(state[_ALPHA + k] > np.float32(0.0))
             count[k] = n
             most = max(most, n)
-        if most == room:
+        if most == capacity:
             return entry + 1
     return end
 
@@ -347,7 +347,7 @@ def _finish(own, lists, count, scratch, view, y, x, first, samples):  # type: ig
         n = np.int64(count[lane])
         if n == 0:
             continue
-        base = lane * lists.room
+        base = lane * lists.capacity
         sort(lists, base, n, scratch)
         column, k = x + (first + lane) // view.subpixels, (first + lane) % view.subpixels
         t, total, depth, owner, begin, end = weigh(own.surface, lists, base, n, scratch, view.pixel_base, view.pixel)
@@ -412,13 +412,13 @@ def _blend(first_part, last_part, parts, splats, y0, y1, samples):  # type: igno
                     break
                 most = 0
                 for lane in range(LANES):
-                    if count[lane] == lists.room:
-                        kept = prune(lists, lane * lists.room, lists.room, scratch)
-                        if kept < lists.room:
-                            state[_FARTHEST + np.uintp(lane)] = lists.depth[lane * lists.room + kept - 1]
+                    if count[lane] == lists.capacity:
+                        kept = prune(lists, lane * lists.capacity, lists.capacity, scratch)
+                        if kept < lists.capacity:
+                            state[_FARTHEST + np.uintp(lane)] = lists.depth[lane * lists.capacity + kept - 1]
                         count[lane] = kept
                     most = max(most, count[lane])
-                if most > lists.room // 2:
+                if most > lists.capacity // 2:
                     lists = widen(lists)
-                    scratch = scratch_for(lists.room)
+                    scratch = scratch_for(lists.capacity)
             _finish(own, lists, count, scratch, view, y - y0, tile.x - x0, first, samples)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...compute.warp.kernels import Work
+from ...compute.warp.kernels import WarpKernel
 from ...compute.warp.search import first_of
 from ...compute.warp.translate import Native
 from ..grid_blocks import block_of
@@ -34,12 +34,12 @@ def add_to(counts: wp.array(dtype=wp.int64), at: wp.int64, by: wp.int64):
 _NATIVES = {add_to: Native(_ADD, "add_to", "int64")}
 
 
-def number_particles(lane, lanes, room, x, origin, scale, bx, by, bz, out):  # type: ignore[no-untyped-def]
+def number_particles(thread, stride, scratch, x, origin, scale, bx, by, bz, out):  # type: ignore[no-untyped-def]
     """Key of each particle, and its own number beside it; counts those outside or not finite.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
         See `compute.warp.kernels`; so of all kernels here.
     x : (n, 3) float64 array
         Positions, world, m.
@@ -53,7 +53,7 @@ def number_particles(lane, lanes, room, x, origin, scale, bx, by, bz, out):  # t
         Keys, numbers of the particles, and `found` (LOST is added to); written.
     """
     keys, order, found = out
-    for p in range(lane, len(x), lanes):
+    for p in range(thread, len(x), stride):
         gx, gy, gz = (x[p, 0] - origin[0]) * scale, (x[p, 1] - origin[1]) * scale, (x[p, 2] - origin[2]) * scale
         block, cell = block_of(gx, gy, gz, bx, by, bz), 0
         if block >= 0:
@@ -64,12 +64,12 @@ def number_particles(lane, lanes, room, x, origin, scale, bx, by, bz, out):  # t
         order[p] = np.int32(p)
 
 
-def list_blocks(lane, lanes, room, n, keys, out):  # type: ignore[no-untyped-def]
+def list_blocks(thread, stride, scratch, n, keys, out):  # type: ignore[no-untyped-def]
     """Blocks with particles, once each, in any order.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
     n : int
         Particles.
     keys : array
@@ -78,7 +78,7 @@ def list_blocks(lane, lanes, room, n, keys, out):  # type: ignore[no-untyped-def
         `found`: OCCUPIED is added to, and BLOCKS on written.
     """
     (found,) = out
-    for p in range(lane, n, lanes):
+    for p in range(thread, n, stride):
         first = True
         if p > 0:
             first = keys[p] >> 6 != keys[p - 1] >> 6
@@ -86,12 +86,12 @@ def list_blocks(lane, lanes, room, n, keys, out):  # type: ignore[no-untyped-def
             found[BLOCKS + add_to(found, OCCUPIED, 1)] = keys[p] >> 6
 
 
-def index_blocks(lane, lanes, room, n, keys, numbers, sizes, out):  # type: ignore[no-untyped-def]
+def index_blocks(thread, stride, scratch, n, keys, numbers, sizes, out):  # type: ignore[no-untyped-def]
     """Tables of the active blocks: their places, those around them, and where particles of their cells begin.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
     n : int
         Particles.
     keys : array
@@ -105,7 +105,7 @@ def index_blocks(lane, lanes, room, n, keys, numbers, sizes, out):  # type: igno
     """
     active, neighbour, first = out
     by, bz = sizes[1], sizes[2]
-    for task in range(lane, sizes[0] * (27 + STARTS), lanes):
+    for task in range(thread, sizes[0] * (27 + STARTS), stride):
         s, e = task // (27 + STARTS), task % (27 + STARTS)
         number = numbers[s]
         if e < 27:
@@ -121,26 +121,26 @@ def index_blocks(lane, lanes, room, n, keys, numbers, sizes, out):  # type: igno
             active[s, 0], active[s, 1], active[s, 2] = number // (by * bz), number // bz % by, number % bz
 
 
-def find_home_blocks(lane, lanes, room, n, keys, numbers, sizes, out):  # type: ignore[no-untyped-def]
+def find_home_blocks(thread, stride, scratch, n, keys, numbers, sizes, out):  # type: ignore[no-untyped-def]
     """Active block of each particle, sorted.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
     n, keys, numbers, sizes : int or array
         As of `index_blocks`.
     out : tuple of array
         Slot of each sorted particle, (n,) int32; written.
     """
     (home,) = out
-    for p in range(lane, n, lanes):
+    for p in range(thread, n, stride):
         home[p] = np.int32(first_of(numbers, sizes[0], keys[p] >> 6))
 
 
-NUMBER = Work(number_particles, (), _NATIVES)
-LIST = Work(list_blocks, (), _NATIVES)
-INDEX = Work(index_blocks, (), {})
-FIND_HOMES = Work(find_home_blocks, (), {})
+NUMBER = WarpKernel(number_particles, (), _NATIVES)
+LIST = WarpKernel(list_blocks, (), _NATIVES)
+INDEX = WarpKernel(index_blocks, (), {})
+FIND_HOMES = WarpKernel(find_home_blocks, (), {})
 
 
 def around(occupied: np.ndarray, blocks: tuple[int, int, int]) -> np.ndarray:

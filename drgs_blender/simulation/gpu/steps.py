@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ...compute.warp.kernels import Work
+from ...compute.warp.kernels import WarpKernel
 from ...compute.warp.translate import Native
 from ...compute.warp.types import Array
 from ..constitutive import respond
@@ -99,13 +99,13 @@ NATIVES = {
 
 
 def prepare_particles(  # type: ignore[no-untyped-def]
-    lane, lanes, room, order, particles, properties, grid, time, out
+    thread, stride, scratch, order, particles, properties, grid, time, out
 ):
     """P2G contribution of each particle to the nodes around it.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
         See `compute.warp.kernels`; so of all kernels here.
     order : array
         Particles, sorted by cells.
@@ -128,7 +128,7 @@ def prepare_particles(  # type: ignore[no-untyped-def]
     dt = times[int(clock[STEP]), DT]
     scale = 1.0 / spacing
     h, factor = F(spacing), F(4.0 * dt * scale * scale)
-    for at in range(lane, len(mass), lanes):
+    for at in range(thread, len(mass), stride):
         p = np.int64(order[at])
         m = mass[p]
         if m == ZERO:
@@ -225,13 +225,13 @@ def bounded_by(v: Any, place: Any, spacing: Any, planes: Any, q: Any) -> Any:
     return vx, vy, vz
 
 
-def solve_nodes(lane, lanes, room, blocks, given, grid, time, obstacles, forces, out):  # type: ignore[no-untyped-def]
+def solve_nodes(thread, stride, scratch, blocks, given, grid, time, obstacles, forces, out):  # type: ignore[no-untyped-def]
     """Particles to grid, and the grid's own step: velocities of all nodes of active blocks.
 
     Parameters
     ----------
-    lane, lanes : int
-    room : object
+    thread, stride : int
+    scratch : object
         Not used.
     blocks : tuple
     given : tuple of array
@@ -255,7 +255,7 @@ def solve_nodes(lane, lanes, room, blocks, given, grid, time, obstacles, forces,
         return
     step = int(clock[STEP])
     dt = times[step, DT]
-    for at in range(lane, sizes[0] * 64, lanes):
+    for at in range(thread, sizes[0] * 64, stride):
         s, n = at // 64, at % 64
         i, j, k = 4 * active[s, 0] + n // 16, 4 * active[s, 1] + n // 4 % 4, 4 * active[s, 2] + n % 4
         px, py, pz, m, hx, hy, hz, held = gathered(i, j, k, s, (first, neighbour), given, (pin_velocity, pinned))
@@ -290,7 +290,7 @@ def solve_nodes(lane, lanes, room, blocks, given, grid, time, obstacles, forces,
 
 
 def carried(nodes: Any, neighbour: Any, b: Any, i: Any, j: Any, k: Any, wx: Any, wy: Any, wz: Any) -> Any:
-    """Velocity that matter gives to a rider, and the weight of the nodes it comes from, as `p2g_g2p._carried`."""
+    """Velocity that matter gives to a marker, and the weight of the nodes it comes from, as `p2g_g2p._carried`."""
     heaviest = ZERO
     for e in range(27):
         s, n, _ = node_of(neighbour, b, i + e // 9, j + e // 3 % 3, k + e % 3)
@@ -307,12 +307,12 @@ def carried(nodes: Any, neighbour: Any, b: Any, i: Any, j: Any, k: Any, wx: Any,
     return x, y, z, weight
 
 
-def move_particles(lane, lanes, room, blocks, nodes, properties, pins, grid, time, out):  # type: ignore[no-untyped-def]
+def move_particles(thread, stride, scratch, blocks, nodes, properties, pins, grid, time, out):  # type: ignore[no-untyped-def]
     """Grid to particles: move them, deform them, and find their stress, as `p2g_g2p.g2p`.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
     blocks : tuple of array
         Order of the particles, slot of each in that order, places of the slots and slots around them.
     nodes : (slots * 64, 4) float32 array
@@ -338,14 +338,14 @@ def move_particles(lane, lanes, room, blocks, nodes, properties, pins, grid, tim
     scale = 1.0 / spacing
     to_gradient, length = F(4.0 * scale), F(dt)
     top = ZERO
-    for at in range(lane, len(mass), lanes):
+    for at in range(thread, len(mass), stride):
         p, b = np.int64(order[at]), np.int64(home[at])
         i, j, k, fx, fy, fz = cell_of(x, p, origin, scale)
         i, j, k = i - 4 * active[b, 0] + 1, j - 4 * active[b, 1] + 1, k - 4 * active[b, 2] + 1
         wx, wy, wz = weights_of(fx), weights_of(fy), weights_of(fz)
         vx, vy, vz = ZERO, ZERO, ZERO
-        rider = mass[p] == ZERO
-        if rider:
+        marker = mass[p] == ZERO
+        if marker:
             vx, vy, vz, weight = carried(nodes, neighbour, b, i, j, k, wx, wy, wz)
             if weight <= ZERO:
                 vx, vy, vz = v[p, 0], v[p, 1], v[p, 2]
@@ -383,15 +383,15 @@ def move_particles(lane, lanes, room, blocks, nodes, properties, pins, grid, tim
         x[p, 0] += dt * vx
         x[p, 1] += dt * vy
         x[p, 2] += dt * vz
-    raise_to(fastest, lane % SLOTS, top)
+    raise_to(fastest, thread % SLOTS, top)
 
 
-def end_step(lane, lanes, room, spacing, times, out):  # type: ignore[no-untyped-def]
+def end_step(thread, stride, scratch, spacing, times, out):  # type: ignore[no-untyped-def]
     """End a step: note the highest speed, and see whether the next one is still as it was planned.
 
     Parameters
     ----------
-    lane, lanes, room : int64 or tuple
+    thread, stride, scratch : int64 or tuple
     spacing : float
         Metres.
     times : array
@@ -416,7 +416,7 @@ def end_step(lane, lanes, room, spacing, times, out):  # type: ignore[no-untyped
         clock[STOPPED] = 1.0
 
 
-PREPARE = Work(prepare_particles, (), NATIVES)
-SOLVE = Work(solve_nodes, (), NATIVES)
-MOVE = Work(move_particles, (), NATIVES)
-END_STEP = Work(end_step, (), NATIVES)
+PREPARE = WarpKernel(prepare_particles, (), NATIVES)
+SOLVE = WarpKernel(solve_nodes, (), NATIVES)
+MOVE = WarpKernel(move_particles, (), NATIVES)
+END_STEP = WarpKernel(end_step, (), NATIVES)
