@@ -3,8 +3,8 @@
     python bench/bench_earlier.py COMMIT ["frame" "deform" "simulate --part throughput" ...] [--pairs 3]
 
 Each is a program's name with its options. It runs in a clone of either commit, in an environment with this one's
-packages, and writes the clone's own docs/benchmarks.md; the first numbers of the lines of its tables are compared, one
-line after the other. Needs `make env`; `viewport` needs DRGS_UI_BLENDER.
+packages, and writes the clone's own docs/benchmarks.md; the numbers of its tables are compared cell by cell. Those that
+are the same in all runs, as counts and errors are, are left out. Needs `make env`; `viewport` needs DRGS_UI_BLENDER.
 """
 
 from __future__ import annotations
@@ -13,20 +13,21 @@ import argparse
 import os
 import re
 import shlex
-import statistics
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
+import numpy as np
 from report import ROOT, table, write_section
 
 sys.path.insert(0, str(ROOT / "tools"))
 from environments import blender, borrowing
 
 PROGRAMS = ("frame", "deform", "simulate --part throughput")
-COLUMNS = ["benchmark", "line", "earlier", "now", "now / earlier", "least and most"]
-Lines = dict[str, float]
+COLUMNS = ["benchmark", "line", "column", "earlier", "now", "now / earlier", "quartiles"]
+#: (line, column) of a table -> its number.
+Cells = dict[tuple[str, str], float]
 
 
 class Checkout:
@@ -51,8 +52,8 @@ class Checkout:
         own = {"PYTHONPATH": str(self.root), "DRGS_ENGINE": str(python), "DRGS_SHIPPED": "0"}
         self._environment = os.environ | own | {"DRGS_CACHE_DIR": str(folder / "kernels")}
 
-    def lines(self, program: str) -> Lines:
-        """Run a benchmark: the first number of each line of the tables that it writes, by the line's first cell."""
+    def cells(self, program: str) -> Cells:
+        """Run a benchmark: the numbers in the tables that it writes."""
         name, *options = shlex.split(program)
         document = self.root / "docs" / "benchmarks.md"
         document.unlink(missing_ok=True)
@@ -60,29 +61,32 @@ class Checkout:
         done = subprocess.run(command, cwd=self.root, env=self._environment, capture_output=True, text=True)
         if done.returncode:
             raise SystemExit(f"{program} of {self.root} failed:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
-        found: Lines = {}
+        found: Cells = {}
+        columns: list[str] = []
         for line in document.read_text(encoding="utf-8").splitlines():
-            name, *cells = [cell.strip() for cell in line.strip("|").split("|")]
-            numbers = [float(cell) for cell in cells if re.fullmatch(r"[\d.]+(e[-+]\d+)?", cell)]
-            if line.startswith("|") and numbers:
-                found[name if name not in found else f"{name} ({len(found)})"] = numbers[0]
+            parts = [part.strip() for part in line.strip("|").split("|")] if line.startswith("|") else []
+            for column, part in zip(columns, parts, strict=False):
+                if re.fullmatch(r"[\d.]+(e[-+]\d+)?", part):
+                    found[parts[0], column] = float(part)
+            columns = columns or parts if parts else []
         return found
 
 
 def compare(program: str, earlier: Checkout, now: Checkout, pairs: int) -> list[list[object]]:
     """Rows of `COLUMNS` of a program; the first run of either compiles and is not counted."""
     for checkout in (earlier, now):
-        checkout.lines(program)
-    runs = [(earlier.lines(program), now.lines(program)) for _ in range(pairs)]
+        checkout.cells(program)
+    runs = [(list(earlier.cells(program).values()), now.cells(program)) for _ in range(pairs)]
     if len({len(found) for pair in runs for found in pair}) > 1:
-        raise SystemExit(f"{program} has other lines now than it had: its commits cannot be compared")
+        raise SystemExit(f"{program} has other tables now than it had: its commits cannot be compared")
     rows: list[list[object]] = []
-    for number, line in enumerate(runs[0][1]):
-        before, after = ([list(found.values())[number] for found in column] for column in zip(*runs, strict=True))
-        if any(before):
-            ratios = [b / a for a, b in zip(before, after, strict=True) if a]
-            median = [statistics.median(values) for values in (before, after, ratios)]
-            rows.append([program, line, *median, f"{min(ratios):.2f} to {max(ratios):.2f}"])
+    for number, cell in enumerate(runs[0][1]):
+        before, after = [old[number] for old, _ in runs], [new[cell] for _, new in runs]
+        if len({*before, *after}) > 1:
+            ratios = np.array(after) / before
+            low, high = np.quantile(ratios, [0.25, 0.75])
+            medians = [float(np.median(values)) for values in (before, after, ratios)]
+            rows.append([program, *cell, *medians, f"{low:.2f} to {high:.2f}"])
     return rows
 
 
@@ -92,7 +96,7 @@ def main() -> None:
     parser.add_argument("commit", help="the earlier one")
     parser.add_argument("programs", nargs="*", metavar="PROGRAM", help=f"by default: {', '.join(PROGRAMS)}")
     parser.add_argument("--pairs", type=int, default=3, help="runs of either that count")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     rows: list[list[object]] = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -103,8 +107,8 @@ def main() -> None:
             rows += compare(program, earlier, now, options.pairs)
             body = (
                 f"The same programs of commit {options.commit} and of this one in turn, {options.pairs} pairs after "
-                "one that compiles: medians, and the ratio of each pair. Lines are milliseconds, seconds or rates, as "
-                "in the program's own section.\n\n"
+                "one that compiles: medians, and the ratios of the pairs. Times and rates, as in the program's own "
+                "section.\n\n"
             )
             write_section("earlier", "Against an earlier commit", body + table(COLUMNS, rows))
 
