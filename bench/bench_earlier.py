@@ -10,19 +10,15 @@ are the same in all runs, as counts and errors are, are left out. Needs `make en
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import shlex
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
-from report import ROOT, table, write_section
-
-sys.path.insert(0, str(ROOT / "tools"))
-from environments import blender, borrowing
+from checkouts import Checkout
+from report import table, write_section
 
 PROGRAMS = ("frame", "deform", "simulate --part throughput")
 COLUMNS = ["benchmark", "line", "column", "earlier", "now", "now / earlier", "quartiles"]
@@ -30,53 +26,31 @@ COLUMNS = ["benchmark", "line", "column", "earlier", "now", "now / earlier", "qu
 Cells = dict[tuple[str, str], float]
 
 
-class Checkout:
-    """A clone of one commit, and how its programs are run.
-
-    Parameters
-    ----------
-    commit : str
-    folder : Path
-        Does not exist yet.
-    """
-
-    def __init__(self, commit: str, folder: Path) -> None:
-        self.root = folder / "checkout"
-        subprocess.run(["git", "clone", "--quiet", "--shared", "--no-checkout", ROOT, self.root], check=True)
-        subprocess.run(["git", "-C", self.root, "checkout", "--quiet", "--detach", commit], check=True)
-        if (ROOT.parent / "shared").is_dir():
-            (folder / "shared").symlink_to(ROOT.parent / "shared")
-        (self.root / ".venv-blender").symlink_to(blender().parent.parent)
-        python, _ = borrowing(folder / "environment", self.root)
-        self._python = python
-        own = {"PYTHONPATH": str(self.root), "DRGS_ENGINE": str(python), "DRGS_SHIPPED": "0"}
-        self._environment = os.environ | own | {"DRGS_CACHE_DIR": str(folder / "kernels")}
-
-    def cells(self, program: str) -> Cells:
-        """Run a benchmark: the numbers in the tables that it writes."""
-        name, *options = shlex.split(program)
-        document = self.root / "docs" / "benchmarks.md"
-        document.unlink(missing_ok=True)
-        command = [self._python, f"bench/bench_{name}.py", *options]
-        done = subprocess.run(command, cwd=self.root, env=self._environment, capture_output=True, text=True)
-        if done.returncode:
-            raise SystemExit(f"{program} of {self.root} failed:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
-        found: Cells = {}
-        columns: list[str] = []
-        for line in document.read_text(encoding="utf-8").splitlines():
-            parts = [part.strip() for part in line.strip("|").split("|")] if line.startswith("|") else []
-            for column, part in zip(columns, parts, strict=False):
-                if re.fullmatch(r"[\d.]+(e[-+]\d+)?", part):
-                    found[parts[0], column] = float(part)
-            columns = columns or parts if parts else []
-        return found
+def cells(checkout: Checkout, program: str) -> Cells:
+    """Run a benchmark of a checkout: the numbers in the tables that it writes."""
+    name, *options = shlex.split(program)
+    document = checkout.root / "docs" / "benchmarks.md"
+    document.unlink(missing_ok=True)
+    command = [checkout.python, f"bench/bench_{name}.py", *options]
+    done = subprocess.run(command, cwd=checkout.root, env=checkout.environment, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(f"{program} of {checkout.root} failed:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
+    found: Cells = {}
+    columns: list[str] = []
+    for line in document.read_text(encoding="utf-8").splitlines():
+        parts = [part.strip() for part in line.strip("|").split("|")] if line.startswith("|") else []
+        for column, part in zip(columns, parts, strict=False):
+            if re.fullmatch(r"[\d.]+(e[-+]\d+)?", part):
+                found[parts[0], column] = float(part)
+        columns = columns or parts if parts else []
+    return found
 
 
 def compare(program: str, earlier: Checkout, now: Checkout, pairs: int) -> list[list[object]]:
     """Rows of `COLUMNS` of a program; the first run of either compiles and is not counted."""
     for checkout in (earlier, now):
-        checkout.cells(program)
-    runs = [(list(earlier.cells(program).values()), now.cells(program)) for _ in range(pairs)]
+        cells(checkout, program)
+    runs = [(list(cells(earlier, program).values()), cells(now, program)) for _ in range(pairs)]
     if len({len(found) for pair in runs for found in pair}) > 1:
         raise SystemExit(f"{program} has other tables now than it had: its commits cannot be compared")
     rows: list[list[object]] = []
@@ -100,8 +74,6 @@ def main() -> None:
     rows: list[list[object]] = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for part in ("earlier", "now"):
-            (folder / part).mkdir()
         earlier, now = Checkout(options.commit, folder / "earlier"), Checkout("HEAD", folder / "now")
         for program in options.programs or PROGRAMS:
             rows += compare(program, earlier, now, options.pairs)

@@ -23,10 +23,8 @@ from pathlib import Path
 
 import OpenEXR
 from bench_engine import first_frame, plane_asset
+from checkouts import Checkout
 from report import DOCUMENT, ROOT, table, write_section
-
-sys.path.insert(0, str(ROOT / "tools"))
-from environments import borrowing
 
 #: The first pixel of this commit and of another one, measured in turn.
 IN_TURN = "the same, in turn with the next row", "the same of an earlier commit"
@@ -174,15 +172,9 @@ def first_pixels(commits: list[str], folder: Path, pairs: int = 9) -> list[float
     _PACE.append(pace())
     starts = []
     for number, commit in enumerate(commits):
-        checkout, environment = folder / f"checkout{number}", folder / f"environment{number}"
-        subprocess.run(["git", "clone", "--quiet", "--shared", "--no-checkout", ROOT, checkout], check=True)
-        subprocess.run(["git", "-C", checkout, "checkout", "--quiet", "--detach", commit], check=True)
-        python, _ = borrowing(environment, checkout)
-        paths = os.pathsep.join(map(str, (checkout, checkout / "bench")))
-        variables = {"PYTHONPATH": paths, "DRGS_ENGINE": str(python), "DRGS_SHIPPED": "0"}
-        variables["DRGS_CACHE_DIR"] = str(folder / f"kernels{number}")
-        command = [str(python), "-P", "-c", _FIRST_PIXEL, str(folder / f"sheet{number}.drgs")]
-        starts.append((command, os.environ | variables))
+        checkout = Checkout(commit, folder / f"commit{number}")
+        command = [str(checkout.python), "-P", "-c", _FIRST_PIXEL, str(folder / f"sheet{number}.drgs")]
+        starts.append((command, checkout.environment))
     seconds = [
         [
             float(subprocess.run(command, env=variables, check=True, capture_output=True).stdout)

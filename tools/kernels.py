@@ -136,8 +136,8 @@ def engine(folder: Path, what: str) -> None:
             client.render(frame)
             client.render(replace(frame, noise_index=2))
         elif what == "motion":
-            moment = MotionStep(camera, [Pose("cow", matrix[None].copy(), body.vertices)])
-            client.render(replace(frame, previous=moment, next=moment, passes=("Combined", "Vector")))
+            step = MotionStep(camera, [Pose("cow", matrix[None].copy(), body.vertices)])
+            client.render(replace(frame, previous=step, next=step, passes=("Combined", "Vector")))
         elif what == "viewport":
             for denoise in ("none", "svgf"):
                 seen = replace(frame, settings=replace(settings, denoise=denoise))

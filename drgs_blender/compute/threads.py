@@ -21,8 +21,6 @@ from .jit import numba
 
 #: Pieces per thread, so that threads that are done early have something to take.
 _PIECES = 8
-#: Calls per thread of `over_strided`: few, since each may make scratch memory.
-_CALLS = 4
 #: Fewest rows of a picture in a piece, because handing one over costs as much as some of them.
 ROWS = 24
 #: The same of elements of arrays: vertices, faces, surfels.
@@ -98,7 +96,7 @@ def over_range(kernel: Callable[..., Any], count: int, *arguments: Any, fewest: 
     return results
 
 
-def over_strided(kernel: Callable[..., Any], most: int, *arguments: Any) -> None:
+def over_strided(kernel: Callable[..., Any], most: int, *arguments: Any, calls: int = 4) -> None:
     """Call ``kernel(first, last, stride, *arguments)`` for pieces of 0 .. `stride`; each is every `stride`-th item.
 
     For items of which neighbours cost alike: no thread is left with all the costly ones.
@@ -111,8 +109,10 @@ def over_strided(kernel: Callable[..., Any], most: int, *arguments: Any) -> None
         Number of items: the stride is at most that.
     *arguments : object
         The same for every piece.
+    calls : int
+        Items of 0 .. `stride` per thread: few where each call makes scratch memory.
     """
-    stride = min(most, _CALLS * get_num_threads())
+    stride = min(most, calls * get_num_threads())
     over_range(kernel, stride, stride, *arguments)
 
 

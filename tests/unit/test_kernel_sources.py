@@ -45,9 +45,8 @@ def run(tmp_path):
 
     def go(*arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
         environment = {"DRGS_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path), "DRGS_SHIPPED": "0"}
-        environment["PYTHONDONTWRITEBYTECODE"] = (
-            "1"  # Python itself takes a source of the same size and time for the same
-        )
+        # Python itself takes a source of the same size and time for the same.
+        environment["PYTHONDONTWRITEBYTECODE"] = "1"
         command = [sys.executable, tmp_path / "program.py", *arguments]
         return subprocess.run(
             command, env=os.environ | environment | variables, cwd=tmp_path, capture_output=True, text=True, check=True

@@ -450,7 +450,7 @@ def test_any_number_of_threads_gives_the_same_bits(monkeypatch):
         assert results[0][name].tobytes() == results[1][name].tobytes()
 
 
-def test_riders_are_not_lost_when_sand_falls_apart():
+def test_markers_are_not_lost_when_sand_falls_apart():
     """A block of sand hits a thin plate and runs over its rim: its surface stays with the grains."""
     h = 0.05
     points = np.add(lattice((0.3, 0.3, 0.5), h / 2), [0, 0, 0.05])
@@ -469,7 +469,7 @@ def test_riders_are_not_lost_when_sand_falls_apart():
         assert np.isfinite(solver.markers).all()
 
 
-def test_riders_move_with_the_matter():
+def test_markers_move_with_the_matter():
     from drgs_blender.core.sim_materials import make_material, particle_materials
     from drgs_blender.simulation.grid_blocks import Domain
     from drgs_blender.simulation.solver import Body, Forces, Solver

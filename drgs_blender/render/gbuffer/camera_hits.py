@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...compute.jit import njit
-from ...compute.threads import get_num_threads, over_range
+from ...compute.threads import over_strided
 from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
 from ..sampling import F
 from ..scene.interaction import nearest, position_at, surface_at
@@ -68,8 +68,9 @@ def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: 
         hits.owner[:] = -1
         return hits
     owners = scene.face_object, scene.instance_object
-    stride = 8 * get_num_threads()
-    over_range(_trace, stride, stride, scene.tracer, (parameters, x0, y0), np.int32(mask), owners, hits.arrays)
+    blocks = -(-owner.size // _BLOCK)
+    view_of = parameters, x0, y0
+    over_strided(_trace, blocks, scene.tracer, view_of, np.int32(mask), owners, hits.arrays, calls=8)
     return hits
 
 
@@ -78,8 +79,8 @@ def shade_mesh(scene: TraceScene, hits: MeshHits, parameters: Array, x0: int, bu
     moving = scene.vertices, scene.faces, scene.instances
     view_of = parameters, x0, buffer.rows[0]
     keys, out = arrays_of(buffer)
-    stride = 8 * get_num_threads()
-    over_range(_shade, stride, stride, scene.geometry, moving, view_of, layer, hits.arrays, keys, out)
+    blocks = -(-len(keys[0]) // _BLOCK)
+    over_strided(_shade, blocks, scene.geometry, moving, view_of, layer, hits.arrays, keys, out, calls=8)
 
 
 def arrays_of(buffer: GBuffer) -> tuple[tuple[Array, ...], tuple[tuple[Array, ...], ...]]:

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...compute.jit import inlined, njit
-from ...compute.threads import get_num_threads, over_range
+from ...compute.threads import over_strided
 from ...core.frame import Camera
 from ..camera import WIDTH, sample_ray
 from ..sampling import F
@@ -296,9 +296,9 @@ def tie_to_mesh(scene: TraceScene, *arguments: Any) -> None:
         the arrays to be filled: origin, normal, geometric normal and view; albedo, roughness and metallic; position,
         depth, object, face, instance and barycentric coordinates.
     """
-    *inwards, frames, materials, seen = arguments
-    stride = 8 * get_num_threads()
-    over_range(_attach, stride, stride, scene.tracer, *inwards, (frames, materials, seen))
+    *inwards, keys, frames, materials, seen = arguments
+    out = frames, materials, seen
+    over_strided(_attach, -(-len(keys[0]) // _BLOCK), scene.tracer, *inwards, keys, out, calls=8)
 
 
 class Stages(NamedTuple):
