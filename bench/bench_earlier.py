@@ -4,7 +4,8 @@
 
 Each is a program's name with its options. It runs in a clone of either commit, in an environment with this one's
 packages, and writes the clone's own docs/benchmarks.md; the numbers of its tables are compared cell by cell. Those that
-are the same in all runs, as counts and errors are, are left out. Needs `make env`; `viewport` needs DRGS_UI_BLENDER.
+are the same in all runs, as counts and errors are, are left out. What is not measured keeps its rows. Needs `make env`;
+`viewport` needs DRGS_UI_BLENDER.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from checkouts import Checkout
-from report import table, write_section
+from report import DOCUMENT, table, write_section
 
 PROGRAMS = ("frame", "deform", "simulate --part throughput")
 COLUMNS = ["benchmark", "line", "column", "earlier", "now", "now / earlier", "quartiles"]
@@ -64,6 +65,15 @@ def compare(program: str, earlier: Checkout, now: Checkout, pairs: int) -> list[
     return rows
 
 
+def measured_before(commit: str, document: str) -> list[list[object]]:
+    """Rows of `COLUMNS` that docs/benchmarks.md has for the same commit."""
+    section = re.search("<!-- begin earlier -->.*?<!-- end earlier -->", document, re.DOTALL)
+    if section is None or f"of commit {commit} and" not in section[0]:
+        return []
+    lines = re.findall(r"^\| (.+) \|$", section[0], re.MULTILINE)
+    return [list(line.split(" | ")) for line in lines[1:]]
+
+
 def main() -> None:
     """Measure and write the section."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -71,16 +81,18 @@ def main() -> None:
     parser.add_argument("programs", nargs="*", metavar="PROGRAM", help=f"by default: {', '.join(PROGRAMS)}")
     parser.add_argument("--pairs", type=int, default=3, help="runs of either that count")
     options = parser.parse_intermixed_args()
-    rows: list[list[object]] = []
+    programs = options.programs or PROGRAMS
+    before = measured_before(options.commit, DOCUMENT.read_text(encoding="utf-8"))
+    rows = [row for row in before if row[0] not in programs]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         earlier, now = Checkout(options.commit, folder / "earlier"), Checkout("HEAD", folder / "now")
-        for program in options.programs or PROGRAMS:
+        for program in programs:
             rows += compare(program, earlier, now, options.pairs)
             body = (
-                f"The same programs of commit {options.commit} and of this one in turn, {options.pairs} pairs after "
-                "one that compiles: medians, and the ratios of the pairs. Times and rates, as in the program's own "
-                "section.\n\n"
+                f"The same programs of commit {options.commit} and of this one in turn, {options.pairs} pairs (of the "
+                "programs measured last) after one that compiles: medians, and the ratios of the pairs. Times and "
+                "rates, as in the program's own section.\n\n"
             )
             write_section("earlier", "Against an earlier commit", body + table(COLUMNS, rows))
 

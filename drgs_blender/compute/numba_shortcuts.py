@@ -5,6 +5,7 @@ Most of compiling is Numba's own Python, and much of that is done again and agai
 - which implementation of an operator or function takes the types at hand is searched for at each use (`_call_type`);
 - which variables live where is computed after each of some ten passes, of which the last one needs it (`_postprocess`);
 - the variables of an instruction are looked for in all it holds, its line number included (`_list_vars`);
+- each call of LLVM is an event, of which nobody wants to hear (`_start_event`);
 - each function is optimised in full before it is linked into its kernel, which is optimised in full again
   (`optimize_functions`);
 - arrays that a function only borrows have their references counted at each use (`Lowering`).
@@ -16,18 +17,21 @@ The methods of Numba are replaced while a kernel is compiled, under Numba's own 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from llvmlite import binding
-from numba.core import codegen, config, ir, postproc, transforms, types
+from numba.core import codegen, config, event, ir, postproc, transforms, types
 from numba.core.compiler_machinery import register_pass
 from numba.core.typed_passes import NativeLowering
 
 _get_call_type = types.BaseFunction.get_call_type
 _run = postproc.PostProcessor.run
+_start, _end = event.start_event, event.end_event
+#: The event of each call of LLVM.
+_CALLS = "numba:llvm_lock"
 #: What an instruction holds that is no variable.
-_NO_VARIABLES = frozenset({str, int, bool, float, type(None), ir.Loc})
+_NO_VARIABLES = frozenset({str, int, bool, float, type(None), ir.Loc, ir.Const, ir.Global, ir.FreeVar, ir.Arg})
 
 
 @contextlib.contextmanager
@@ -37,6 +41,8 @@ def shortcuts() -> Iterator[None]:
         (types.BaseFunction, "get_call_type"): _call_type,
         (postproc.PostProcessor, "run"): _postprocess,
         (ir.Inst, "_rec_list_vars"): _list_vars,
+        (event, "start_event"): _start_event,
+        (event, "end_event"): _end_event,
     }
     originals = {key: getattr(*key) for key in replaced}
     for (owner, name), method in replaced.items():
@@ -78,17 +84,39 @@ def _postprocess(self: Any, emit_dels: bool = False, extend_lifetimes: bool = Fa
 
 
 def _list_vars(self: Any, value: Any) -> list[Any]:
-    """``Inst._rec_list_vars``, by the type of what is looked at, the most frequent first."""
-    kind = type(value)
-    if kind is ir.Var:
-        return [value]
-    if kind in _NO_VARIABLES:
-        return []
-    if kind is dict:
-        return [variable for part in value.values() for variable in _list_vars(self, part)]
-    if isinstance(value, (list, tuple)):
-        return [variable for part in value for variable in _list_vars(self, part)]
-    return value.list_vars() if isinstance(value, ir.Inst) else []
+    """``Inst._rec_list_vars``, into one list, by the type of what is looked at."""
+    found: list[Any] = []
+    _gather((value,), found)
+    return found
+
+
+def _gather(parts: Iterable[Any], found: list[Any]) -> None:
+    """Append the variables among parts of an instruction to those found, in order."""
+    for part in parts:
+        kind = type(part)
+        if kind is ir.Var:
+            found.append(part)
+        elif kind in _NO_VARIABLES:
+            pass
+        elif kind is ir.Expr:
+            _gather(part._kws.values(), found)
+        elif kind is dict:
+            _gather(part.values(), found)
+        elif isinstance(part, (list, tuple)):
+            _gather(part, found)
+        elif isinstance(part, ir.Inst):
+            found.extend(part.list_vars())
+
+
+def _start_event(kind: str, data: Any = None) -> None:
+    """``event.start_event``, which tells nobody that LLVM is called: some 70,000 times for a frame's kernels."""
+    if kind != _CALLS:
+        _start(kind, data)
+
+
+def _end_event(kind: str, data: Any = None, exc_details: Any = None) -> None:
+    if kind != _CALLS:
+        _end(kind, data, exc_details)
 
 
 def optimize_functions(library: Any, module: Any) -> None:
