@@ -17,17 +17,20 @@ The methods of Numba are replaced while a kernel is compiled, under Numba's own 
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Iterable, Iterator
+from types import FunctionType
 from typing import Any
 
 from llvmlite import binding
-from numba.core import codegen, config, event, ir, postproc, transforms, types
+from numba.core import base, codegen, config, event, ir, postproc, transforms, types
 from numba.core.compiler_machinery import register_pass
 from numba.core.typed_passes import NativeLowering
 
 _get_call_type = types.BaseFunction.get_call_type
 _run = postproc.PostProcessor.run
 _start, _end = event.start_event, event.end_event
+_refresh_all, _inspect_loc = base.BaseContext.refresh, base._has_loc
 #: The event of each call of LLVM.
 _CALLS = "numba:llvm_lock"
 #: What an instruction holds that is no variable.
@@ -43,6 +46,8 @@ def shortcuts() -> Iterator[None]:
         (ir.Inst, "_rec_list_vars"): _list_vars,
         (event, "start_event"): _start_event,
         (event, "end_event"): _end_event,
+        (base.BaseContext, "refresh"): _refresh,
+        (base, "_has_loc"): _has_loc,
     }
     originals = {key: getattr(*key) for key in replaced}
     for (owner, name), method in replaced.items():
@@ -117,6 +122,23 @@ def _start_event(kind: str, data: Any = None) -> None:
 def _end_event(kind: str, data: Any = None, exc_details: Any = None) -> None:
     if kind != _CALLS:
         _end(kind, data, exc_details)
+
+
+def _refresh(self: Any) -> None:
+    """``BaseContext.refresh``, if a module was imported, or an implementation registered, since the last time."""
+    registries = (*self._registries, *self.typing_context._registries)
+    state = len(sys.modules), sum(len(part) for registry in registries for part in vars(registry).values())
+    if self.__dict__.get("_drgs_refreshed") != state:
+        _refresh_all(self)
+        self._drgs_refreshed = state
+
+
+def _has_loc(function: Any) -> bool:
+    """``_has_loc``, which tells from a function's code whether it takes ``loc``."""
+    if type(function) is not FunctionType or function.__dict__:  # it may say that it has another's signature
+        return bool(_inspect_loc(function))
+    code = function.__code__
+    return "loc" in code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
 
 
 def optimize_functions(library: Any, module: Any) -> None:

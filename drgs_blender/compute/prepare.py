@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from subprocess import Popen
 
 from ..core.errors import EXIT_CANNOT_WRITE, EXIT_INTERRUPTED, Cancelled, DrgsError
 from ..core.memory import available_memory
@@ -28,10 +29,10 @@ except DrgsError as error:  # variables of Numba
     print(f"prepare: {error}", file=sys.stderr)
     sys.exit(error.exit_code)
 from .folders import cache_folder
-from .kernel_cache import KernelCache
+from .kernel_cache import ENDING, KernelCache
 from .manifest import Kernel
 from .worker_pool import BYTES as _BYTES
-from .worker_pool import Known, Pool, target_codegen
+from .worker_pool import Known, Pool, end_process, start_process, target_codegen
 
 log = logging.getLogger(__name__)
 #: The one text for it, in Blender and on the command line.
@@ -74,10 +75,15 @@ def _compile(
 ) -> None:
     if cache_folder().path is None or cache_folder().has_failed:
         return
-    missing = _missing(manifest.needed(jobs))
-    if not missing:
-        return
-    with contextlib.closing(Pool(missing, processes())) as pool:
+    kernels = manifest.needed(jobs)
+    started = _start_early(len(kernels))
+    try:
+        missing = _missing(kernels)
+    except BaseException:
+        for process in started:
+            end_process(process)
+        raise
+    with contextlib.closing(Pool(missing, processes(), started)) as pool:
         reported = 0.0
         while pool.is_working():
             if cancelled is not None and cancelled():
@@ -86,6 +92,18 @@ def _compile(
                 reported = time.monotonic()
                 progress(f"{PHASE}, {min(pool.done + 1, len(missing))} of {len(missing)}", pool.fraction)
             pool.wait(_POLL)
+
+
+def _start_early(most: int) -> list[Popen[str]]:
+    """Processes that load Numba while it is found out what they have to compile; none where some kernels are there."""
+    folder = cache_folder().path
+    if shipped.brings_any() or folder is None or any(folder.glob(f"*/*{ENDING}")):
+        return []
+    started = []
+    with contextlib.suppress(OSError):  # the pool meets it again, and says so
+        for _ in range(min(most, processes())):
+            started.append(start_process())
+    return started
 
 
 def not_compiled(kernels: Iterable[Kernel]) -> list[Kernel]:

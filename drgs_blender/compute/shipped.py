@@ -33,6 +33,11 @@ def has(name: str) -> bool:
     return name in _names()
 
 
+def brings_any() -> bool:
+    """Whether the release brings kernels for this machine."""
+    return bool(_names())
+
+
 def read(name: str) -> bytes | None:
     """A kernel's file; None where the release does not bring it, or the archive is damaged."""
     archive = _archive()

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Iterable
 from typing import Any
 
 from ..core.memory import available_memory
@@ -56,6 +57,8 @@ class Pool:
         What is not compiled yet.
     most : int
         Of processes.
+    started : iterable of subprocess.Popen
+        By `start_process`, before it was known what is to be compiled: they are used first.
 
     Attributes
     ----------
@@ -65,8 +68,8 @@ class Pool:
         Part of the time of compiling them all that lies behind.
     """
 
-    def __init__(self, kernels: list[Known], most: int) -> None:
-        self._longest = max(kernels, key=lambda known: known[0].seconds)
+    def __init__(self, kernels: list[Known], most: int, started: Iterable[subprocess.Popen[str]] = ()) -> None:
+        self._longest = max(kernels, key=lambda known: known[0].seconds, default=None)
         self._remaining = sorted(kernels, key=lambda known: known is not self._longest)
         self._codegen = target_codegen()
         self._all = sum(kernel.seconds for kernel, _, _ in kernels)
@@ -74,6 +77,7 @@ class Pool:
         self._progress = time.monotonic()
         self._results: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._workers: list[Worker] = []
+        self._started = list(started)
         self._most = min(len(kernels), most)
         self._failures: Counter[Kernel] = Counter()
         self._deaths = 0
@@ -101,6 +105,8 @@ class Pool:
         """End all workers."""
         for worker in self._workers:
             worker.close()
+        while self._started:
+            end_process(self._started.pop())
 
     def _take(self, worker: Worker, answer: str | None) -> None:
         """Note what a worker says; None where it has ended."""
@@ -165,7 +171,7 @@ class Pool:
             self._most = len(self._workers)
             return None
         try:
-            worker = Worker(self._results, yields)
+            worker = Worker(self._results, yields, self._started.pop() if self._started else None)
         except (OSError, RuntimeError) as error:  # no process, no thread
             log.warning("kernels are compiled by %d processes: %s", len(self._workers), error)
             self._most = len(self._workers)
@@ -189,8 +195,35 @@ class Pool:
         return None
 
 
+def start_process() -> subprocess.Popen[str]:
+    """Start a process that runs `drgs_blender.compute.worker`.
+
+    Raises
+    ------
+    OSError
+    """
+    environment = os.environ | {"NUMBA_NUM_THREADS": "1"}
+    if folder := cache_folder().path:
+        environment["DRGS_CACHE_DIR"] = str(folder)
+    # the package of this very process, whatever lies in the working folder
+    flag = "-I" if sys.flags.isolated else "-P"
+    paths = [str(closure.PACKAGE.parent), *filter(None, [environment.get("PYTHONPATH")])]
+    environment["PYTHONPATH"] = os.pathsep.join(paths)
+    command = [sys.executable, flag, "-m", "drgs_blender.compute.worker"]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, encoding="utf-8")
+
+
+def end_process(process: subprocess.Popen[str]) -> None:
+    """End it at once."""
+    process.kill()
+    process.wait()
+    if process.stdin is not None:
+        with contextlib.suppress(OSError):  # what it has not read
+            process.stdin.close()
+
+
 class Worker:
-    """A process that runs `drgs_blender.compute.worker`, and the thread that waits for its answers.
+    """A process that compiles, and the thread that waits for its answers.
 
     Parameters
     ----------
@@ -198,6 +231,8 @@ class Worker:
         The queue of its answers.
     yields : bool
         Whether it yields to other programs, as all do but the one that has the longest kernel.
+    process : subprocess.Popen, optional
+        One that was started before.
 
     Raises
     ------
@@ -205,20 +240,12 @@ class Worker:
         No more processes, or threads, may be started.
     """
 
-    def __init__(self, results: queue.SimpleQueue[Answer], yields: bool) -> None:
+    def __init__(
+        self, results: queue.SimpleQueue[Answer], yields: bool, process: subprocess.Popen[str] | None = None
+    ) -> None:
         self.known: Known | None = None
         self._claim = Claim()
-        environment = os.environ | {"NUMBA_NUM_THREADS": "1"}
-        if folder := cache_folder().path:
-            environment["DRGS_CACHE_DIR"] = str(folder)
-        # the package of this very process, whatever lies in the working folder
-        flag = "-I" if sys.flags.isolated else "-P"
-        paths = [str(closure.PACKAGE.parent), *filter(None, [environment.get("PYTHONPATH")])]
-        environment["PYTHONPATH"] = os.pathsep.join(paths)
-        command = [sys.executable, flag, "-m", "drgs_blender.compute.worker"]
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, encoding="utf-8"
-        )
+        self._process = process or start_process()
         if yields and hasattr(os, "setpriority"):  # not on Windows
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, self._process.pid, os.getpriority(os.PRIO_PROCESS, 0) + _LOWER)
@@ -249,11 +276,7 @@ class Worker:
 
     def close(self) -> None:
         """End it at once: a kernel that it is compiling is lost, nothing else."""
-        self._process.kill()
-        self._process.wait()
-        if self._process.stdin is not None:
-            with contextlib.suppress(OSError):  # what it has not read
-                self._process.stdin.close()
+        end_process(self._process)
         self.end()
 
     def _listen(self, results: queue.SimpleQueue[Answer]) -> None:

@@ -58,7 +58,7 @@ def test_the_first_job_comes_first_beside_the_longest_kernel(monkeypatch) -> Non
     class Recorder:
         known = None
 
-        def __init__(self, results: object, yields: bool) -> None:
+        def __init__(self, results: object, yields: bool, process: None) -> None:
             self._yields = yields
 
         def assign(self, known: worker_pool.Known, claim: worker_pool.Claim) -> None:
@@ -71,6 +71,29 @@ def test_the_first_job_comes_first_beside_the_longest_kernel(monkeypatch) -> Non
     worker_pool.Pool(list(prepare._known(kernels)), 2)
     longest = max(kernels, key=lambda kernel: kernel.seconds)
     assert started == [(longest.name, False), (first[0].name, True)]
+
+
+def test_processes_that_were_started_early_compile_and_those_too_many_end(small) -> None:
+    started = [worker_pool.start_process() for _ in range(3)]
+    with contextlib.closing(worker_pool.Pool(small, 2, started)) as pool:
+        finish(pool)
+        assert {worker._process for worker in pool._workers} <= set(started)
+    assert pool.done == len(small) and None not in [process.poll() for process in started]
+
+
+def test_processes_are_started_early_only_into_an_empty_cache(small, monkeypatch) -> None:
+    """Where some kernels are there, likely all are: then nothing is started, and nothing waits for it."""
+    started = prepare._start_early(2)
+    assert len(started) == min(2, prepare.processes())
+    with contextlib.closing(worker_pool.Pool([], 2, started)) as pool:
+        assert not pool.is_working()
+    assert None not in [process.poll() for process in started]
+    with contextlib.closing(worker_pool.Pool(small, 2)) as pool:
+        finish(pool)
+    assert not prepare._start_early(2)
+    monkeypatch.setattr(prepare.shipped, "brings_any", lambda: True)
+    shutil.rmtree(folders.cache_folder().path)
+    assert not prepare._start_early(2)
 
 
 def test_no_process_is_started_for_what_others_compile(small) -> None:
