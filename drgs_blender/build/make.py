@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.asset.model import Asset, Environment, Mesh, Surfels
+from ..core.asset.model import Asset, Environment, Mesh, SourceVertices, Surfels
 from ..core.errors import AssetError
 from ..deform.attach import attach
 from ..deform.face_frames import Faces
@@ -123,17 +123,25 @@ def mesh_with_materials(
         file = mesh_to_z_up(file, up)
     report: dict[str, Any] = {"source_vertices": len(file.vertices), "source_faces": len(file.faces)}
     report["notes"] = list(file.notes)
-    net = _net(file, name, report)
+    net, origin = _net(file, name, report)
     materials = Materials(file.materials, coloured=file.vertex_colours is not None)
     net, values, report["rounds"], report["unresolved_edges"] = refine(net, materials, tolerance, max_triangles)
     report["vertices"], report["faces"] = len(net.vertices), len(net.faces)
-    mesh = Mesh(net.vertices, net.faces, values[:, :3], values[:, 3], values[:, 4], _groups(net, file))
+    channels = values[:, :3], values[:, 3], values[:, 4]
+    mesh = Mesh(net.vertices, net.faces, *channels, _groups(net, file), _source(net, *origin, len(file.vertices)))
     log.info("mesh of %s: %s", name, report)
     return mesh, report
 
 
-def _net(file: MeshFile, name: str, report: dict[str, Any]) -> Net:
-    """Proper faces of the file, welded; tags are (material, part)."""
+def _net(file: MeshFile, name: str, report: dict[str, Any]) -> tuple[Net, tuple[Array, Array]]:
+    """Proper faces of the file, welded, with tags (material, part, number).
+
+    Returns
+    -------
+    net : Net
+    source, faces : array
+        The file's vertex (n,) of each vertex of `net`, and the vertices (f, 3) at the corners of the numbered faces.
+    """
     m = len(file.faces)
     if not m:
         lost = [note for note in file.notes if "NaN" in note]
@@ -165,16 +173,46 @@ def _net(file: MeshFile, name: str, report: dict[str, Any]) -> Net:
     uvs = np.zeros((len(faces), 3, 2)) if file.corner_uvs is None else file.corner_uvs[proper].astype(np.float64)
     net = Net(
         file.vertices[source].astype(np.float64), point, values, welded, np.nan_to_num(uvs),
-        np.stack([material, part[proper]], -1),
+        np.stack([material, part[proper], np.arange(len(faces))], -1),
+        np.broadcast_to(np.eye(3, dtype=np.float32), (len(faces), 3, 3)),
     )  # fmt: skip
     # Welding may collapse faces that were thinner than its grid.
     keep = ~Faces.of(net.vertices, net.faces).degenerate
-    net.faces, net.uvs, net.tags = net.faces[keep], net.uvs[keep], net.tags[keep]
+    net.faces, net.uvs, net.tags, net.inside = net.faces[keep], net.uvs[keep], net.tags[keep], net.inside[keep]
     report["not_finite_faces"] = int((~finite).sum())
     report["degenerate_faces"] = removed = int((finite & ~proper).sum() + (~keep).sum())
     if removed:
         report["notes"].append(f"{removed} faces without area removed")
-    return net
+    return net, (source, welded)
+
+
+def _source(net: Net, source: Array, faces: Array, count: int) -> SourceVertices | None:
+    """Where the vertices of `net` come from; None where they are the file's own.
+
+    Parameters
+    ----------
+    net : Net
+        Divided.
+    source, faces : array
+        Of `_net`.
+    count : int
+        Of the file's vertices.
+    """
+    n, first = len(net.vertices), len(source)
+    index, weights = np.zeros((n, 3), np.int64), np.zeros((n, 3), np.float32)
+    index[:first, 0], weights[:first, 0] = source, 1
+    flat = net.faces.reshape(-1)
+    corner = np.empty(n, np.int64)  # any one of each vertex
+    corner[flat] = np.arange(len(flat))
+    new = corner[first:]
+    index[first:] = source[faces[net.tags[new // 3, 2]]]
+    weights[first:] = net.inside.reshape(-1, 3)[new]
+    order = np.argsort(-weights, axis=1, kind="stable")
+    weights, index = np.take_along_axis(weights, order, 1), np.take_along_axis(index, order, 1)
+    width = int((weights > 0).any(axis=0).sum())
+    if n == count and width == 1 and (index[:, 0] == np.arange(n)).all():
+        return None
+    return SourceVertices(index[:, :width], weights[:, :width], np.array([count]))
 
 
 def _groups(net: Net, file: MeshFile) -> dict[str, Array]:

@@ -29,6 +29,8 @@ class Net:
     uvs : (m, 3, 2) float64 array
     tags : (m, t) int64 array
         Labels of the faces, inherited.
+    inside : (m, 3, 3) float32 array
+        Barycentric coordinates of the corners in the face of which theirs is a part.
     """
 
     vertices: Array
@@ -37,12 +39,16 @@ class Net:
     faces: Array
     uvs: Array
     tags: Array
+    inside: Array
 
 
 def weld(
     vertices: Array, faces: Array, keys: Array, normals: Array | None, agree: float = 0.99
 ) -> tuple[Array, Array, Array]:
     """Merge the corners of faces into vertices by place, key and normal.
+
+    New vertices are in the order of the original ones. Where one is split, the part with its first corner takes its
+    turn and the others come after all: a mesh without vertices to merge or leave out keeps the numbers that it has.
 
     Parameters
     ----------
@@ -59,7 +65,7 @@ def weld(
     Returns
     -------
     source : (k,) array
-        An original vertex for each new one.
+        The original vertex of each new one, the first of those that are merged.
     point : (k,) array
         The place of each new vertex, numbered.
     faces : (m, 3) array
@@ -75,8 +81,15 @@ def weld(
     if normals is not None:
         label = _clusters(group, normals.reshape(-1, 3), agree)
     _, first, new = np.unique(distinct_row_indices(group, label), return_index=True, return_inverse=True)
-    point = np.unique(corner_place[first], return_inverse=True)[1].reshape(-1)
-    return corner_vertex[first], point, new.reshape(-1, 3)
+    source = np.full(len(first), len(vertices), np.int64)
+    np.minimum.at(source, new.reshape(-1), corner_vertex)
+    by_source = np.lexsort((first, source))
+    is_split = np.zeros(len(first), bool)
+    is_split[by_source[1:]] = source[by_source[1:]] == source[by_source[:-1]]
+    order = np.lexsort((first, source, is_split))
+    number = np.argsort(order)
+    point = np.unique(corner_place[first[order]], return_inverse=True)[1].reshape(-1)
+    return source[order], point, number[new].reshape(-1, 3)
 
 
 def _clusters(group: Array, normals: Array, agree: float) -> Array:
@@ -142,6 +155,7 @@ def subdivide(net: Net, edge: Array, marked: Array) -> Net:
     longest = edge_lengths(net).argmax(axis=1)[:, None]
     turn = 3 * np.arange(m)[:, None] + (longest + np.arange(3)) % 3  # start at the longest edge
     faces, uvs = net.faces.take(turn), net.uvs.reshape(-1, 2).take(turn, axis=0)
+    inside = net.inside.reshape(-1, 3).take(turn, axis=0)
     edge = edge.take(turn)
     split = marked[edge]
 
@@ -171,12 +185,17 @@ def subdivide(net: Net, edge: Array, marked: Array) -> Net:
     slots[other[twice_right]] = 3, 1, 4
     slots[other[twice_right] + 1] = 3, 4, 2
     slots += 6 * parent[:, None]
-    middle_uvs = 0.5 * (uvs + uvs[:, [1, 2, 0]])
+
+    def at_slots(corners: Array) -> Array:
+        both = np.concatenate([corners, 0.5 * (corners + corners[:, [1, 2, 0]])], 1)
+        return both.reshape(-1, corners.shape[2]).take(slots, axis=0)
+
     return Net(
         np.concatenate([net.vertices, 0.5 * (net.vertices[a] + net.vertices[b])]),
         np.concatenate([net.point, place[edge[split][first]]]),
         np.concatenate([net.values, 0.5 * (net.values[a] + net.values[b])]),
         np.concatenate([faces, middles], 1).take(slots),
-        np.concatenate([uvs, middle_uvs], 1).reshape(-1, 2).take(slots, axis=0),
+        at_slots(uvs),
         net.tags.take(parent, axis=0),
+        at_slots(inside),
     )

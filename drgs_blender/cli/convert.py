@@ -15,6 +15,7 @@ from ..core.frame_sequences import frame_path
 from ..formats.axes import UP_AXES
 from .frame_range import requested_frames
 from .output import check_writable
+from .pose_file import add_vertex_order, check_vertex_order
 from .progress import clock
 from .relight import finite, positive
 from .sampling import int_range
@@ -51,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--vertices", type=Path, metavar="V.npy", help="pose of an asset: (n, 3) array, the mesh's vertices, metres"
     )
+    add_vertex_order(parser)
     parser.add_argument(
         "--frames", nargs="?", const="",
         help="frames, one file each: #### in IN, OUT and V.npy becomes the number; 1-24, or nothing for those of IN",
@@ -71,6 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert one file, or those of all frames."""
+    check_vertex_order(args)
     frames = requested_frames(args.frames, args.input, args.output)
     if frames is None:
         convert(args)

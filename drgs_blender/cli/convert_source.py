@@ -14,8 +14,9 @@ from ..core.file_types import Held
 from ..core.frame import RenderSettings, World
 from ..formats.splats import Splats, join_splats, splats_of
 from .placed_frame import surface_frame
+from .pose_file import in_asset_order, read_vertices
 from .progress import FractionBar
-from .relight import read_environment, read_vertices, rotation_z
+from .relight import read_environment, rotation_z
 
 Array = np.ndarray
 
@@ -95,11 +96,7 @@ class AssetSource:
         self._vertices = asset.mesh.vertices
         self._posed = args.vertices is not None
         if self._posed:
-            given = read_vertices(args.vertices)
-            if given.shape != self._vertices.shape:
-                problem = f"are {len(given)}, but the mesh has {len(self._vertices)}"
-                raise UsageError("--vertices", problem, "Pose this asset")
-            self._vertices = given
+            self._vertices = in_asset_order(args, asset.mesh, read_vertices(args.vertices))
         held: dict[Held, bool] = {
             "mesh": len(asset.mesh.faces) > 0,
             "splats": len(asset.surfels) > 0,

@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -30,6 +29,7 @@ from .camera_file import read_camera
 from .frame_range import check_template, parse_frames
 from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_preview
+from .pose_file import add_vertex_order, check_vertex_order, in_asset_order, read_vertices
 from .progress import FractionBar
 
 logger = logging.getLogger(__name__)
@@ -62,6 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     pose.add_argument(
         "--vertices", type=Path, metavar="V.npy", help="pose: (n, 3) array, the mesh's vertices in object space, metres"
     )
+    add_vertex_order(parser)
     parser.add_argument("--frames", metavar="RANGE", help="of the cache: 12, 1-24, 1-24x2; default: all that are there")
     sampling.add_arguments(parser, defaults=True)
 
@@ -88,6 +89,7 @@ def run(args: argparse.Namespace) -> int:
     camera = read_camera(args.camera)
     settings = sampling.override(RenderSettings(), args)
     sampling.check_size(camera, args.passes)
+    check_vertex_order(args)
     poses, (tear, grain) = _poses(args)
     for number, _ in poses:
         check_writable(frame_path(args.out, number), (args.asset, args.camera, args.env, args.vertices))
@@ -101,6 +103,8 @@ def run(args: argparse.Namespace) -> int:
     warned = False
     for number, give_pose in poses:
         vertices = give_pose()
+        if vertices is not None and args.vertices:
+            vertices = in_asset_order(args, session.asset(key).mesh, vertices)
         shape = session.asset(key).mesh.vertices if vertices is None else vertices
         if not warned and (size := size_around(camera.matrix_world[:3, 3], shape)) is not None:
             logger.warning("the camera is inside %s (a box of %s m): move it back", args.asset.stem, size)
@@ -173,44 +177,6 @@ def _poses(
 
 def _pose(cache: ParticleCache, frame: int) -> np.ndarray:
     return cache.read(frame).vertices
-
-
-def read_vertices(path: Path) -> np.ndarray:
-    """Read a pose; only its form is checked here, its length against the asset by the engine."""
-    subject = f"--vertices {path}"
-    remedy = "Save it with numpy.save(path, vertices), an (n, 3) array of numbers"
-    try:
-        if path.exists() and not path.is_file():
-            raise UsageError(subject, "is not a regular file", remedy)
-        with open(path, "rb") as file:
-            shape, dtype = _npy_header(file)
-            available = path.stat().st_size - file.tell()
-            if dtype.kind not in "fiu":
-                raise UsageError(subject, f"holds values of type {dtype.name}, not real numbers", remedy)
-            if len(shape) != 2 or shape[1] != 3:
-                raise UsageError(subject, f"has shape {shape}, expected (n, 3) numbers", remedy)
-            needed = math.prod(shape) * dtype.itemsize
-            if needed > available:
-                problem = f"is truncated: {shape} {dtype.name} are {needed} bytes, {available} are there"
-                raise UsageError(subject, problem, remedy)
-            file.seek(0)
-            array = np.load(file, allow_pickle=False)
-    except OSError as error:
-        raise UsageError(subject, f"cannot be read ({error.strerror or error})", "Check the path") from error
-    except (ValueError, EOFError, SyntaxError, RecursionError, MemoryError) as error:
-        raise UsageError(subject, "is not a .npy file of one array of numbers", remedy) from error
-    with np.errstate(over="ignore"):
-        return np.ascontiguousarray(array, dtype=np.float32)
-
-
-def _npy_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """(shape, dtype) that a .npy file declares; ValueError where it is none."""
-    version = np.lib.format.read_magic(file)
-    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
-    if read is None:
-        raise ValueError(f"unknown version {version}")
-    shape, _, dtype = read(file)
-    return shape, dtype
 
 
 def read_environment(args: argparse.Namespace, asset: Asset) -> np.ndarray:

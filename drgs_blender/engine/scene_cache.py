@@ -27,7 +27,7 @@ from ..render.lights.mesh_lights import Emitters
 from ..render.scene.ray_masks import group_mask
 from ..render.scene.trace_scene import TraceObject, TraceScene
 from ..render.surfels.surfel_bvh import SurfelBVH
-from .scene_objects import join, material_faults, moved_vertices, posed_surfels, traced_object
+from .scene_objects import in_asset_order, join, material_faults, moved_vertices, posed_surfels, traced_object
 
 #: Surfels a vertex up to which a mesh is taken for as detailed as a coarse picture.
 _SURFELS_A_VERTEX = 16
@@ -161,6 +161,7 @@ class SceneCache:
                     "Link the object to its file again",
                 )
             _check_surface(state, loaded.asset, frame.settings)
+            state = in_asset_order(state, loaded.asset)
             known = self.objects[index] if index < len(self.objects) else None
             kept = reuse_equal(state, None if known is None else known.state)
             if known is not None and known.loaded is loaded and known.state is kept and known.traced.seen_only == met:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +21,14 @@ from ..render.scene.trace_scene import TraceObject
 Array = np.ndarray
 
 _MIRRORED = [0, 2, 1]  # order of the corners of a face whose object is mirrored
+
+
+def in_asset_order(state: ObjectState, asset: Asset) -> ObjectState:
+    """An object whose vertices are in its asset's order, also where they were given in that of the asset's source."""
+    if state.vertices is None:
+        return state
+    vertices = asset.mesh.in_own_order(state.vertices)
+    return state if vertices is state.vertices else replace(state, vertices=vertices)
 
 
 def _checked_array(state: ObjectState, name: str, shape: tuple[int, ...], what: str) -> Array | None:
@@ -50,7 +59,8 @@ def moved_vertices(state: ObjectState, asset: Asset, pose: Pose) -> Array | None
     now = asset.mesh.vertices if state.vertices is None else state.vertices
     if np.shape(pose.matrices) != (1, 4, 4):
         return None
-    vertices = now if pose.vertices is None or pose.vertices.shape != now.shape else pose.vertices
+    vertices = now if pose.vertices is None else asset.mesh.in_own_order(pose.vertices)
+    vertices = now if vertices.shape != now.shape else vertices
     with np.errstate(over="ignore", invalid="ignore"):  # what is unusable, the scene leaves where it is
         return world_vertices(vertices, np.asarray(pose.matrices[0], np.float64))
 
@@ -123,9 +133,10 @@ def traced_object(state: ObjectState, asset: Asset, seen_only: bool = False) -> 
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise UsageError(subject, "its matrix is not a finite 4 x 4 matrix", "Check its transform and its drivers")
     if state.vertices is not None and len(state.vertices) != n:
+        made_from = "" if mesh.source is None else f", the mesh it was made from {mesh.source.count[0]}"
         raise AssetError(
             subject,
-            f"its mesh has {len(state.vertices)} vertices, its asset has {n}",
+            f"its mesh has {len(state.vertices)} vertices, its asset has {n}{made_from}",
             "Remove or disable modifiers that add or remove geometry, or bind the object again",
         )
     vertices = _checked_array(state, "vertices", (n, 3), f"{n} vertices")

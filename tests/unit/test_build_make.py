@@ -35,12 +35,17 @@ def ramp(size: int = 64) -> Image:
     return Image(pixels, srgb=False, wrap=("clamp", "clamp"))
 
 
+def whole(count: int) -> np.ndarray:
+    """Where the corners of faces lie in faces that are not divided."""
+    return np.tile(np.eye(3, dtype=np.float32), (count, 1, 1))
+
+
 def torus_net(n: int = 16) -> Net:
     source = trimesh.creation.torus(1.0, 0.4, n, n)
     k = len(source.vertices)
     return Net(
         source.vertices.copy(), np.arange(k), np.zeros((k, 5)), source.faces.astype(np.int64),
-        np.zeros((len(source.faces), 3, 2)), np.zeros((len(source.faces), 2), np.int64),
+        np.zeros((len(source.faces), 3, 2)), np.zeros((len(source.faces), 2), np.int64), whole(len(source.faces)),
     )  # fmt: skip
 
 
@@ -153,7 +158,7 @@ def test_what_a_division_leaves_is_known_and_looked_up_once():
     pixels = rng.random((64, 64, 3)).astype(np.float32)
     file = plane(6, Image(pixels, srgb=False), vertex_roughness=np.linspace(0, 1, 49).astype(np.float32))
     materials = Materials(file.materials)
-    net = _net(file, "plane", {"notes": []})
+    net, _ = _net(file, "plane", {"notes": []})
     edge, count = edges(net)
     fit, known = _TextureFit(net, edge, edge_lengths(net), materials), 0
     for _ in range(5):
@@ -177,7 +182,7 @@ def test_what_a_division_leaves_is_known_and_looked_up_once():
 def test_an_edge_that_both_faces_see_alike_is_looked_up_once_and_a_seam_twice():
     rng = np.random.default_rng(5)
     file = plane(6, Image(rng.random((64, 64, 3)).astype(np.float32), srgb=False))
-    net = _net(file, "plane", {"notes": []})
+    net, _ = _net(file, "plane", {"notes": []})
     net.uvs[::5] += 0.3  # islands of their own
     edge, count = edges(net)
     materials = Materials(file.materials)
@@ -208,7 +213,8 @@ def test_no_crack_opens_between_vertices_that_share_a_place():
     cube = trimesh.creation.box()
     vertices, faces = cube.vertices[cube.faces].reshape(-1, 3), np.arange(36).reshape(-1, 3)
     source, point, welded = weld(vertices, faces, np.zeros(12, int), np.repeat(cube.face_normals[:, None], 3, axis=1))
-    net = Net(vertices[source], point, np.zeros((24, 5)), welded, np.zeros((12, 3, 2)), np.zeros((12, 2), int))
+    net = Net(vertices[source], point, np.zeros((24, 5)), welded, np.zeros((12, 3, 2)), np.zeros((12, 2), int),
+              whole(12))  # fmt: skip
     rng = np.random.default_rng(1)
     for _ in range(5):
         edge, count = edges(net)

@@ -56,7 +56,8 @@ def arrays_of(part: object) -> dict[str, np.ndarray]:
     found = {}
     for name in part.__slots__:
         value = getattr(part, name)
-        found |= {f"{name}/{k}": v for k, v in value.items()} if isinstance(value, dict) else {name: value}
+        if value is not None:
+            found |= {f"{name}/{k}": v for k, v in value.items()} if isinstance(value, dict) else {name: value}
     return found
 
 
@@ -130,7 +131,8 @@ def test_empty_and_minimal_assets(tmp_path: Path, counts: tuple[int, int, int]) 
 def test_inspect_is_json_and_right(file: Path) -> None:
     about = json.loads(json.dumps(inspect_asset(file), allow_nan=False))
     asset = make_asset()
-    assert about["counts"] == {"surfels": 40, "vertices": 12, "faces": 20, "groups": 1, "sh_coefficients": 4}
+    counts = {"surfels": 40, "vertices": 12, "source_vertices": 12, "faces": 20, "groups": 1, "sh_coefficients": 4}
+    assert about["counts"] == counts
     np.testing.assert_array_equal(
         about["bounds"]["surfels"], [asset.surfels.centre.min(0), asset.surfels.centre.max(0)]
     )

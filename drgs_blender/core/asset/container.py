@@ -17,7 +17,7 @@ import numpy as np
 from ..errors import AssetError, VersionError
 from ..version import __version__
 from .archive import read_archive, write_archive
-from .model import Asset, Binding, Environment, Mesh, Surfels
+from .model import Asset, Binding, Environment, Mesh, SourceVertices, Surfels
 from .tensors import decode, dtype_name, encode, parse_json
 
 Array = np.ndarray
@@ -51,6 +51,7 @@ TENSORS: dict[str, dict[str, str]] = {
     },
     "binding.safetensors": {"face": "I32", **dict.fromkeys(("barycentric", "offset", "normal"), "F32")},
     "environment.safetensors": {"radiance": "F32"},
+    "source.safetensors": {"index": "I32", "weights": "F32", "count": "I32"},
 }
 _REQUIRED = ("surfels.safetensors", "mesh.safetensors")
 _OPTIONAL_TENSORS = {"sh"}
@@ -158,6 +159,7 @@ def inspect_asset(path: PathLike, verify: bool = True) -> dict[str, Any]:
         "vertices": len(mesh.vertices),
         "faces": len(mesh.faces),
         "groups": len(mesh.groups),
+        "source_vertices": len(mesh.vertices) if mesh.source is None else int(mesh.source.count[0]),
         "sh_coefficients": 0 if surfels.sh is None else surfels.sh.shape[1],
     }
     ranges = {
@@ -214,6 +216,11 @@ def check_asset(asset: Asset, subject: str, values: bool = True) -> None:
                 f"has face shape {binding.face.shape} for {len(surfels)} surfels",
             )
         _check_indices(binding.face, len(mesh.faces), f"{subject}, binding face", "faces")
+    if mesh.source is not None:
+        where = f"{subject}, source index"
+        if len(mesh.source.index) != len(mesh.vertices):
+            raise AssetError(where, f"has {len(mesh.source.index)} rows for {len(mesh.vertices)} vertices", _RESTORE)
+        _check_indices(mesh.source.index, int(mesh.source.count[0]), where, "vertices of the source")
     if values:
         for member, tensors in _tensors_of(asset).items():
             for name, array in tensors.items():
@@ -283,6 +290,8 @@ def _tensors_of(asset: Asset) -> dict[str, dict[str, Array]]:
         "surfels.safetensors": _fields(asset.surfels, "extras"),
         "mesh.safetensors": _fields(asset.mesh, "groups"),
     }
+    if asset.mesh.source is not None:
+        parts["source.safetensors"] = _fields(asset.mesh.source)
     if asset.binding is not None:
         parts["binding.safetensors"] = _fields(asset.binding)
     if asset.environment is not None:
@@ -299,23 +308,24 @@ def _asset(tensors: dict[str, dict[str, Array]], provenance: dict[str, Any]) -> 
         return fields
 
     bound, lit = "binding.safetensors" in tensors, "environment.safetensors" in tensors
+    source = SourceVertices(**split("source.safetensors")) if "source.safetensors" in tensors else None
     return Asset(
         surfels=Surfels(**split("surfels.safetensors", "extras")),
-        mesh=Mesh(**split("mesh.safetensors", "groups")),
+        mesh=Mesh(**split("mesh.safetensors", "groups"), source=source),
         binding=Binding(**split("binding.safetensors")) if bound else None,
         environment=Environment(**split("environment.safetensors")) if lit else None,
         provenance=provenance,
     )
 
 
-def _fields(part: Surfels | Mesh | Binding | Environment, family: str = "") -> dict[str, Array]:
+def _fields(part: Surfels | Mesh | Binding | Environment | SourceVertices, family: str = "") -> dict[str, Array]:
     """Arrays of one part of an asset by name; those of the dictionary `family` as "family/name"."""
     fields: dict[str, Array] = {}
     for name in part.__slots__:
         value = getattr(part, name)
         if name == family:
             fields.update({f"{family}/{key}": array for key, array in value.items()})
-        elif value is not None:
+        elif isinstance(value, np.ndarray):
             fields[name] = value
     return fields
 
@@ -343,7 +353,7 @@ def _check_values(array: Array, name: str, where: str) -> None:
         squared = np.einsum("ij,ij->i", array, array)
         if np.abs(squared - 1).max() > 2 * TOLERANCE:
             wrong = "has rows that are not of unit length"
-    elif name == "barycentric" and np.abs(array.sum(axis=1) - 1).max() > TOLERANCE:
+    elif name in ("barycentric", "weights") and np.abs(array.sum(axis=1) - 1).max() > TOLERANCE:
         wrong = "has rows that do not sum to 1"
     if wrong:
         raise AssetError(where, wrong, "Import the source files again")

@@ -83,6 +83,46 @@ class Surfels:
 
 
 @dataclass(slots=True)
+class SourceVertices:
+    """The vertices of the mesh from which an asset's was made, and where each vertex of the asset is among them.
+
+    Attributes
+    ----------
+    index : (n, k) int32 array
+        Vertices of the source, k from 1 to 3 for each of the asset.
+    weights : (n, k) float32 array
+        Their weights, of sum 1.
+    count : (1,) int32 array
+        How many vertices the source has.
+    """
+
+    index: Array
+    weights: Array
+    count: Array
+
+    def __post_init__(self) -> None:
+        self.index = np.ascontiguousarray(self.index, dtype=np.int32)
+        self.count = np.ascontiguousarray(self.count, dtype=np.int32)
+        if self.index.ndim != 2 or not 1 <= self.index.shape[1] <= 3 or self.count.shape != (1,):
+            raise AssetError("source vertices", f"have an index of shape {self.index.shape}, expected (n, 1 to 3)")
+        self.weights = as_float(self.weights, self.index.shape, "source weights")
+
+    def to_asset(self, vertices: Array) -> Array:
+        """(n, 3) float32 vertices of the asset for those of the source; exact where a vertex is one of the source.
+
+        Parameters
+        ----------
+        vertices : (count, 3) array
+            A pose of the source.
+        """
+        moved = np.zeros((len(self.index), 3))
+        for index, weights in zip(self.index.T, self.weights.T, strict=True):
+            used = weights != 0  # what does not count may be infinite
+            moved[used] += weights[used, None] * vertices[index[used]].astype(np.float64)
+        return moved.astype(np.float32)
+
+
+@dataclass(slots=True)
 class Mesh:
     """Triangle mesh that carries the materials rays meet.
 
@@ -98,6 +138,8 @@ class Mesh:
         Per vertex, in [0, 1].
     groups : dict of str to (k,) int32 array
         Vertices of the named sets kept from the source (one per material or part).
+    source : SourceVertices, optional
+        Where the vertices come from; None: they are the source's own, in its order.
     """
 
     vertices: Array
@@ -106,6 +148,7 @@ class Mesh:
     roughness: Array
     metallic: Array
     groups: dict[str, Array] = field(default_factory=dict)
+    source: SourceVertices | None = None
 
     def __post_init__(self) -> None:
         self.vertices = as_float(self.vertices, (-1, 3), "mesh vertices")
@@ -118,6 +161,16 @@ class Mesh:
         self.albedo = as_float(self.albedo, (n, 3), "mesh albedo")
         self.roughness = as_float(self.roughness, (n,), "mesh roughness")
         self.metallic = as_float(self.metallic, (n,), "mesh metallic")
+
+    def in_own_order(self, vertices: Array) -> Array:
+        """A pose in the order of this mesh, if it has as many vertices as its source and not as many as itself.
+
+        Any other is returned as it is.
+        """
+        source = self.source
+        if source is None or len(vertices) == len(self.vertices) or len(vertices) != source.count[0]:
+            return vertices
+        return source.to_asset(vertices)
 
     @classmethod
     def empty(cls) -> Mesh:

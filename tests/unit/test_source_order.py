@@ -1,0 +1,209 @@
+"""Assets keep the vertices of the mesh they are made from, in its order, or know where those went."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from drgs_blender.build.make import mesh_with_materials
+from drgs_blender.cli.main import main
+from drgs_blender.core.asset.container import read_asset, write_asset
+from drgs_blender.core.asset.model import Asset, Mesh, SourceVertices
+from drgs_blender.core.errors import EXIT_BAD_ASSET, EXIT_USAGE, AssetError
+from drgs_blender.core.frame import Camera, Frame, ObjectState, Pose, RenderSettings
+from drgs_blender.deform.attach import attach
+from drgs_blender.engine.scene_objects import moved_vertices
+from drgs_blender.engine.session import Session
+from drgs_blender.formats.files import Image, MaterialFile, MeshFile
+
+
+def shuffled(mesh: trimesh.Trimesh, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a mesh in another order."""
+    order = np.random.default_rng(seed).permutation(len(mesh.vertices))
+    return mesh.vertices[order].astype(np.float32), np.argsort(order)[mesh.faces]
+
+
+def bent(vertices: np.ndarray) -> np.ndarray:
+    """The same bend wherever a vertex is numbered."""
+    x, y, z = np.asarray(vertices, np.float64).T
+    return np.stack([x + 0.3 * z * z, y * (1 + 0.2 * x), z + 0.1 * np.sin(3 * x)], axis=1).astype(np.float32)
+
+
+def flat_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    normals = trimesh.Trimesh(vertices, faces, process=False).face_normals
+    return np.repeat(normals[:, None], 3, axis=1)
+
+
+def board(size: int = 32) -> Image:
+    """A checkerboard, which asks for subdivision."""
+    pixels = np.indices((size, size)).sum(axis=0) // 4 % 2 * 200 + 20
+    return Image(np.repeat(pixels[..., None], 3, axis=2).astype(np.uint8), srgb=True)
+
+
+def checkered(seed: int = 0, n: int = 3) -> MeshFile:
+    """A square of n x n x 2 triangles with a checkerboard."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1)))
+    corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
+    a, b, c, d = corner, corner + 1, corner + n + 2, corner + n + 1
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    flat = trimesh.Trimesh(np.stack([x, y, 0 * x], 1), faces, process=False)
+    vertices, faces = shuffled(flat, seed)
+    uvs = vertices[faces][..., :2]
+    return MeshFile(vertices, faces, corner_uvs=uvs, materials=[MaterialFile("board", base_colour_image=board())])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_mesh_that_need_not_change_keeps_its_numbers(seed: int) -> None:
+    vertices, faces = shuffled(trimesh.creation.icosphere(2), seed)
+    mesh, _ = mesh_with_materials(MeshFile(vertices, faces), "ball")
+    np.testing.assert_array_equal(mesh.vertices, vertices)
+    np.testing.assert_array_equal(mesh.faces, faces)
+    assert mesh.source is None and mesh.in_own_order(vertices) is vertices
+
+
+def test_hard_edges_add_vertices_after_those_of_the_source() -> None:
+    vertices, faces = shuffled(trimesh.creation.box(), 1)
+    mesh, _ = mesh_with_materials(MeshFile(vertices, faces, flat_normals(vertices, faces)), "box")
+    assert len(mesh.vertices) == 24
+    np.testing.assert_array_equal(mesh.vertices[:8], vertices)
+    np.testing.assert_array_equal(mesh.in_own_order(bent(vertices)), bent(mesh.vertices))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_merged_vertices_take_the_pose_of_the_source(seed: int) -> None:
+    """As of glTF, which has a vertex of its own on either side of each seam."""
+    ball = trimesh.creation.icosphere(2)
+    soup = trimesh.Trimesh(ball.vertices[ball.faces].reshape(-1, 3), np.arange(960).reshape(-1, 3), process=False)
+    vertices, faces = shuffled(soup, seed)
+    mesh, _ = mesh_with_materials(MeshFile(vertices, faces), "ball")
+    assert len(mesh.vertices) == 162 and mesh.source.index.shape == (162, 1)
+    np.testing.assert_array_equal(mesh.in_own_order(vertices), mesh.vertices)
+    np.testing.assert_allclose(mesh.in_own_order(bent(vertices))[mesh.faces], bent(vertices)[faces], atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_divided_faces_follow_the_faces_of_the_source(seed: int) -> None:
+    """A new vertex lies in its face, at the place of which the checkerboard's colour is known by its UV."""
+    file = checkered(seed)
+    mesh, report = mesh_with_materials(file, "board")
+    assert report["rounds"] > 2 and len(mesh.vertices) > 200
+    np.testing.assert_array_equal(mesh.vertices[: len(file.vertices)], file.vertices)
+    np.testing.assert_array_equal(mesh.in_own_order(file.vertices), mesh.vertices)
+    pose = bent(file.vertices) + np.random.default_rng(seed).normal(0, 0.1, file.vertices.shape).astype(np.float32)
+    moved = mesh.in_own_order(pose)
+    np.testing.assert_array_equal(moved[: len(pose)], pose)
+    for face in file.faces:  # barycentric coordinates at rest place the vertex in the pose
+        a, b, c = file.vertices[face, :2].astype(np.float64)
+        part = np.linalg.solve(np.stack([b - a, c - a], 1), (mesh.vertices[:, :2] - a).T).T
+        weights = np.concatenate([1 - part.sum(1, keepdims=True), part], 1)
+        inside = (weights > -1e-6).all(axis=1)
+        np.testing.assert_allclose(moved[inside], weights[inside] @ pose[face], atol=1e-5)
+
+
+def test_what_is_left_out_does_not_shift_the_rest() -> None:
+    """Loose vertices, also ones that are not finite, faces without area and vertices that only those have."""
+    vertices, faces = shuffled(trimesh.creation.icosphere(1), 2)
+    loose = np.float32([[9, 9, 9], [np.nan, 0, 0], [3, 3, 3], [4, 4, 4]])
+    all_vertices = np.concatenate([loose[:2], vertices, loose[2:]])
+    all_faces = np.concatenate([[[44, 45, 44]], faces + 2, [[2, 2, 3]]])
+    mesh, report = mesh_with_materials(MeshFile(all_vertices, all_faces), "ball")
+    assert report["degenerate_faces"] == 2 and mesh.source.count[0] == 46
+    np.testing.assert_array_equal(mesh.in_own_order(all_vertices), vertices)
+    np.testing.assert_array_equal(mesh.vertices, vertices)
+
+
+def made(file: MeshFile) -> Asset:
+    mesh, _ = mesh_with_materials(file, "board")
+    surfels, binding, _ = attach(mesh, density=20)
+    return Asset(surfels, mesh, binding)
+
+
+def test_the_file_keeps_where_vertices_come_from(tmp_path) -> None:
+    asset = made(checkered())
+    write_asset(tmp_path / "board.drgs", asset)
+    source = read_asset(tmp_path / "board.drgs").mesh.source
+    for name in ("index", "weights", "count"):
+        np.testing.assert_array_equal(getattr(source, name), getattr(asset.mesh.source, name))
+    write_asset(tmp_path / "own.drgs", replace(asset, mesh=replace(asset.mesh, source=None)))
+    assert read_asset(tmp_path / "own.drgs").mesh.source is None
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"index": lambda a: a[:-1], "weights": lambda a: a[:-1]}, "rows for"),
+        ({"index": lambda a: a + 1000}, "refers to number"),
+        ({"index": lambda a: a - 1000}, "refers to number"),
+        ({"weights": lambda a: 2 * a}, "do not sum to 1"),
+        ({"weights": lambda a: a * np.float32(np.nan)}, "NaN"),
+        ({"count": lambda a: a - 1000}, "refers to number"),
+    ],
+)
+def test_a_source_that_fits_no_mesh_is_refused(tmp_path, change, problem: str) -> None:
+    asset = made(checkered())
+    source = asset.mesh.source
+    values = {name: getattr(source, name) for name in ("index", "weights", "count")}
+    values |= {name: alter(values[name]) for name, alter in change.items()}
+    asset.mesh.source = SourceVertices(**values)
+    with pytest.raises(AssetError, match=problem):
+        write_asset(tmp_path / "board.drgs", asset)
+
+
+def render(session: Session, key: str, vertices: np.ndarray) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, 3] = 0.5, 0.5, 3
+    camera = Camera(matrix, 24, 24, 48.0, 48.0, 12.0, 12.0)
+    state = ObjectState("board", key, vertices=vertices)
+    return session.render(Frame(1, camera, [state], settings=RenderSettings(samples=4)))["Combined"]
+
+
+def test_a_frame_takes_poses_in_either_order(tmp_path) -> None:
+    file = checkered()
+    asset = made(file)
+    write_asset(tmp_path / "board.drgs", asset)
+    session = Session()
+    key = session.load_asset(tmp_path / "board.drgs")
+    pose = bent(file.vertices)
+    own = asset.mesh.in_own_order(pose)
+    np.testing.assert_array_equal(render(session, key, pose), render(session, key, own))
+    assert not np.array_equal(render(session, key, own), render(session, key, asset.mesh.vertices))
+    moved = Pose("board", np.eye(4)[None], pose)
+    np.testing.assert_array_equal(moved_vertices(ObjectState("board", key, vertices=own), asset, moved), own)
+    with pytest.raises(AssetError, match=f"has 5 vertices, its asset has {len(own)}, the mesh it was made from 16"):
+        render(session, key, pose[:5])
+
+
+def test_the_command_line_takes_either_order_and_asks_where_both_fit(tmp_path, capsys) -> None:
+    vertices, faces = shuffled(trimesh.creation.icosphere(2), 3)
+    n = len(vertices)
+    turned = np.roll(np.arange(n), 1)
+    mesh = Mesh(vertices, faces, np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n))
+    mesh.source = SourceVertices(np.argsort(turned)[:, None], np.ones((n, 1)), np.array([n]))
+    surfels, binding, _ = attach(mesh, density=20)
+    write_asset(tmp_path / "ball.drgs", Asset(surfels, mesh, binding))
+    np.save(tmp_path / "source.npy", bent(vertices)[turned])
+    np.save(tmp_path / "own.npy", bent(vertices))
+    np.save(tmp_path / "few.npy", vertices[:7])
+    command = ["convert", str(tmp_path / "ball.drgs"), str(tmp_path / "out.glb"), "--as", "mesh", "--vertices"]
+
+    def converted(name: str, *options: str) -> bytes:
+        assert main([*command, str(tmp_path / name), *options]) == 0
+        return (tmp_path / "out.glb").read_bytes()
+
+    assert converted("source.npy", "--vertex-order", "source") == converted("own.npy", "--vertex-order", "asset")
+    for name, code, problem in (
+        ("own.npy", EXIT_USAGE, "whose orders differ"),
+        ("few.npy", EXIT_BAD_ASSET, f"7 vertices; the asset has {n}"),
+    ):
+        assert main([*command, str(tmp_path / name)]) == code
+        assert problem in capsys.readouterr().err
+    (tmp_path / "front.json").write_text(
+        json.dumps({"matrix_world": np.eye(4).tolist(), "width": 8, "height": 8, "fov_x": 30})
+    )
+    relight = ["relight", str(tmp_path / "ball.drgs"), "--camera", str(tmp_path / "front.json")]
+    assert main([*relight, "--out", str(tmp_path / "o.exr"), "--vertex-order", "source"]) == EXIT_USAGE
+    assert "there are none" in capsys.readouterr().err
