@@ -269,3 +269,21 @@ def test_addon_never_imports_operators_except_to_register_them():
         if module.split(".")[0] == "operators"
     ]
     assert not wrong, "\n".join(wrong)
+
+
+def test_long_modules_are_those_with_a_reason() -> None:
+    """Neither may another one grow beyond 400 lines, nor the table keep one that is shorter."""
+    page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    table = page.partition("## Long modules")[2].partition("\n## ")[0]
+    listed = {
+        f"drgs_blender/{name}"
+        for row in re.findall(r"^\| (`.+?) \|", table, re.M)
+        for name in re.findall(r"`(.+?)`", row)
+    }
+    code = [path for folder in ("drgs_blender", *EXTENSION) for path in (ROOT / folder).rglob("*.py")]
+    long = {
+        path.relative_to(ROOT).with_suffix("").as_posix()
+        for path in code
+        if len(path.read_text(encoding="utf-8").splitlines()) > 400
+    }
+    assert long == listed
