@@ -30,7 +30,8 @@ from numba.core.typed_passes import NativeLowering
 _get_call_type = types.BaseFunction.get_call_type
 _run = postproc.PostProcessor.run
 _start, _end = event.start_event, event.end_event
-_refresh_all, _inspect_loc = base.BaseContext.refresh, base._has_loc
+_refresh_all = base.BaseContext.refresh
+_inspect_loc: Any = getattr(base, "_has_loc", None)  # versions that were not tried may lack it, and take no shortcuts
 #: The event of each call of LLVM.
 _CALLS = "numba:llvm_lock"
 #: What an instruction holds that is no variable.

@@ -30,6 +30,7 @@ except DrgsError as error:  # variables of Numba
     sys.exit(error.exit_code)
 from .folders import cache_folder
 from .kernel_cache import ENDING, KernelCache
+from .kernel_compiler import is_tested
 from .manifest import Kernel
 from .worker_pool import BYTES as _BYTES
 from .worker_pool import Known, Pool, end_process, start_process, target_codegen
@@ -96,11 +97,13 @@ def _compile(
 
 def _start_early(most: int) -> list[Popen[str]]:
     """Processes that load Numba while it is found out what they have to compile; none where some kernels are there."""
-    folder = cache_folder().path
-    if shipped.brings_any() or folder is None or any(folder.glob(f"*/*{ENDING}")):
+    cache = cache_folder()
+    if cache.path is None or cache.trouble or shipped.brings_any() or not is_tested():
         return []
-    started = []
+    started: list[Popen[str]] = []
     with contextlib.suppress(OSError):  # the pool meets it again, and says so
+        if any(cache.path.glob(f"*/*{ENDING}")):
+            return []
         for _ in range(min(most, processes())):
             started.append(start_process())
     return started

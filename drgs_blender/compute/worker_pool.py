@@ -86,6 +86,7 @@ class Pool:
         except BaseException:
             self.close()
             raise
+        self._end_idle()
 
     def is_working(self) -> bool:
         """Whether a worker still has something to do, or will have."""
@@ -105,6 +106,10 @@ class Pool:
         """End all workers."""
         for worker in self._workers:
             worker.close()
+        self._end_idle()
+
+    def _end_idle(self) -> None:
+        """End what was started and has nothing to do."""
         while self._started:
             end_process(self._started.pop())
 

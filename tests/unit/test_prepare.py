@@ -91,9 +91,23 @@ def test_processes_are_started_early_only_into_an_empty_cache(small, monkeypatch
     with contextlib.closing(worker_pool.Pool(small, 2)) as pool:
         finish(pool)
     assert not prepare._start_early(2)
-    monkeypatch.setattr(prepare.shipped, "brings_any", lambda: True)
     shutil.rmtree(folders.cache_folder().path)
-    assert not prepare._start_early(2)
+    for owner, name, value in (
+        (prepare.shipped, "brings_any", lambda: True),
+        (prepare, "is_tested", lambda: False),
+        (folders.cache_folder(), "trouble", "sealed: its kernels lie in another folder"),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(owner, name, value)
+            assert not prepare._start_early(2)
+
+
+def test_processes_started_early_end_where_others_compile(small) -> None:
+    taken, started = claims(small), [worker_pool.start_process()]
+    with contextlib.closing(worker_pool.Pool(small, 2, started)):
+        assert started[0].poll() is not None
+    for claim in taken:
+        claim.close()
 
 
 def test_no_process_is_started_for_what_others_compile(small) -> None:

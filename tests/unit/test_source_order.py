@@ -140,7 +140,8 @@ def test_the_file_keeps_where_vertices_come_from(tmp_path) -> None:
         ({"index": lambda a: a - 1000}, "refers to number"),
         ({"weights": lambda a: 2 * a}, "do not sum to 1"),
         ({"weights": lambda a: a * np.float32(np.nan)}, "NaN"),
-        ({"count": lambda a: a - 1000}, "refers to number"),
+        ({"count": lambda a: a - 10}, "refers to number"),
+        ({"count": lambda a: a - 1000}, "have the count"),
     ],
 )
 def test_a_source_that_fits_no_mesh_is_refused(tmp_path, change, problem: str) -> None:
@@ -148,8 +149,8 @@ def test_a_source_that_fits_no_mesh_is_refused(tmp_path, change, problem: str) -
     source = asset.mesh.source
     values = {name: getattr(source, name) for name in ("index", "weights", "count")}
     values |= {name: alter(values[name]) for name, alter in change.items()}
-    asset.mesh.source = SourceVertices(**values)
     with pytest.raises(AssetError, match=problem):
+        asset.mesh.source = SourceVertices(**values)
         write_asset(tmp_path / "board.drgs", asset)
 
 
@@ -173,6 +174,9 @@ def test_a_frame_takes_poses_in_either_order(tmp_path) -> None:
     assert not np.array_equal(render(session, key, own), render(session, key, asset.mesh.vertices))
     moved = Pose("board", np.eye(4)[None], pose)
     np.testing.assert_array_equal(moved_vertices(ObjectState("board", key, vertices=own), asset, moved), own)
+    for shape in ((16,), (16, 1), (16, 4)):
+        with pytest.raises(AssetError, match="object board"):
+            render(session, key, np.zeros(shape, np.float32))
     with pytest.raises(AssetError, match=f"has 5 vertices, its asset has {len(own)}, the mesh it was made from 16"):
         render(session, key, pose[:5])
 

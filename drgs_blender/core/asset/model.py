@@ -103,8 +103,10 @@ class SourceVertices:
     def __post_init__(self) -> None:
         self.index = np.ascontiguousarray(self.index, dtype=np.int32)
         self.count = np.ascontiguousarray(self.count, dtype=np.int32)
-        if self.index.ndim != 2 or not 1 <= self.index.shape[1] <= 3 or self.count.shape != (1,):
+        if self.index.ndim != 2 or not 1 <= self.index.shape[1] <= 3:
             raise AssetError("source vertices", f"have an index of shape {self.index.shape}, expected (n, 1 to 3)")
+        if self.count.shape != (1,) or self.count[0] < 0:
+            raise AssetError("source vertices", f"have the count {self.count.tolist()}, expected one number")
         self.weights = as_float(self.weights, self.index.shape, "source weights")
 
     def to_asset(self, vertices: Array) -> Array:
@@ -116,10 +118,11 @@ class SourceVertices:
             A pose of the source.
         """
         moved = np.zeros((len(self.index), 3))
-        for index, weights in zip(self.index.T, self.weights.T, strict=True):
-            used = weights != 0  # what does not count may be infinite
-            moved[used] += weights[used, None] * vertices[index[used]].astype(np.float64)
-        return moved.astype(np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite, the scene counts and names
+            for index, weights in zip(self.index.T, self.weights.T, strict=True):
+                used = weights != 0  # what does not count may be infinite
+                moved[used] += weights[used, None] * vertices[index[used]].astype(np.float64)
+            return moved.astype(np.float32)
 
 
 @dataclass(slots=True)
@@ -168,7 +171,7 @@ class Mesh:
         Any other is returned as it is.
         """
         source = self.source
-        if source is None or len(vertices) == len(self.vertices) or len(vertices) != source.count[0]:
+        if source is None or len(vertices) == len(self.vertices) or np.shape(vertices) != (source.count[0], 3):
             return vertices
         return source.to_asset(vertices)
 
