@@ -274,7 +274,7 @@ def test_an_engine_with_a_full_disk_goes_on(full: Path, small, monkeypatch, capl
 
 @pytest.mark.slow
 def test_a_sealed_disk_that_has_all_kernels_is_ready(small_disk, tmp_path: Path) -> None:
-    disk = small_disk("size=32m")
+    disk = small_disk("size=256m")
     with contextlib.suppress(OSError):  # what tests before have compiled
         kept = folders.cache_folder().path
         shutil.copytree(kept, disk / "kernels", ignore=shutil.ignore_patterns("warp", "numba"))
