@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from checkouts import Checkout
-from report import DOCUMENT, table, write_section
+from report import DOCUMENT, section_pattern, table, write_section
 
 PROGRAMS = ("frame", "deform", "simulate --part throughput")
 COLUMNS = ["benchmark", "line", "column", "earlier", "now", "now / earlier", "quartiles"]
@@ -67,7 +67,7 @@ def compare(program: str, earlier: Checkout, now: Checkout, pairs: int) -> list[
 
 def measured_before(commit: str, document: str) -> list[list[object]]:
     """Rows of `COLUMNS` that docs/benchmarks.md has for the same commit."""
-    section = re.search("<!-- begin earlier -->.*?<!-- end earlier -->", document, re.DOTALL)
+    section = section_pattern("earlier").search(document)
     if section is None or f"of commit {commit} and" not in section[0]:
         return []
     lines = re.findall(r"^\| (.+) \|$", section[0], re.MULTILINE)

@@ -68,6 +68,11 @@ def store_row(file: Path, name: str, value: Any) -> dict[str, Any]:
     return rows
 
 
+def section_pattern(name: str) -> re.Pattern[str]:
+    """What finds section `name` in the text of docs/benchmarks.md."""
+    return re.compile(f"<!-- begin {re.escape(name)} -->.*?<!-- end {re.escape(name)} -->", re.DOTALL)
+
+
 def write_section(name: str, title: str, body: str) -> None:
     """Replace section `name` of docs/benchmarks.md (or append it) and print it."""
     text = DOCUMENT.read_text() if DOCUMENT.exists() else HEADER
@@ -75,7 +80,7 @@ def write_section(name: str, title: str, body: str) -> None:
     section = (
         f"{begin}\n## {title}\n\n{body.strip()}\n\n`{command_line()}` · {date.today().isoformat()} · {machine()}\n{end}"
     )
-    pattern = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
+    pattern = section_pattern(name)
     if pattern.search(text):
         text = pattern.sub(lambda _: section, text)
     else:

@@ -199,7 +199,10 @@ def _source(net: Net, source: Array, faces: Array, count: int) -> SourceVertices
         Of the file's vertices.
     """
     n, first = len(net.vertices), len(source)
-    index, weights = np.zeros((n, 3), np.int64), np.zeros((n, 3), np.float32)
+    if n == first:
+        own = n == count and (source == np.arange(n)).all()
+        return None if own else SourceVertices(source[:, None], np.ones((n, 1)), np.array([count]))
+    index, weights = np.zeros((n, 3), np.int32), np.zeros((n, 3), np.float32)
     index[:first, 0], weights[:first, 0] = source, 1
     flat = net.faces.reshape(-1)
     corner = np.empty(n, np.int64)  # any one of each vertex
@@ -207,12 +210,7 @@ def _source(net: Net, source: Array, faces: Array, count: int) -> SourceVertices
     new = corner[first:]
     index[first:] = source[faces[net.tags[new // 3, 2]]]
     weights[first:] = net.inside.reshape(-1, 3)[new]
-    order = np.argsort(-weights, axis=1, kind="stable")
-    weights, index = np.take_along_axis(weights, order, 1), np.take_along_axis(index, order, 1)
-    width = int((weights > 0).any(axis=0).sum())
-    if n == count and width == 1 and (index[:, 0] == np.arange(n)).all():
-        return None
-    return SourceVertices(index[:, :width], weights[:, :width], np.array([count]))
+    return SourceVertices(index, weights, np.array([count]))
 
 
 def _groups(net: Net, file: MeshFile) -> dict[str, Array]:

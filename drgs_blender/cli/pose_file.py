@@ -39,8 +39,7 @@ def in_asset_order(args: argparse.Namespace, mesh: Mesh, vertices: np.ndarray) -
         It fits both, and the order is not said.
     """
     subject, order = f"--vertices {args.vertices}", args.vertex_order
-    own, source = len(mesh.vertices), mesh.source
-    made_from = own if source is None else int(source.count[0])
+    own, source, made_from = len(mesh.vertices), mesh.source, mesh.source_count
     fitting = [name for name, count in (("asset", own), ("source", made_from)) if len(vertices) == count]
     if not fitting or (order and order not in fitting):
         there = f"the asset has {own}, the mesh it was made from {made_from}"
@@ -54,7 +53,7 @@ def in_asset_order(args: argparse.Namespace, mesh: Mesh, vertices: np.ndarray) -
 
 
 def read_vertices(path: Path) -> np.ndarray:
-    """Read a pose; only its form is checked here, its length against the asset by the engine."""
+    """Read a pose; only its form is checked here, its length by `in_asset_order`."""
     subject = f"--vertices {path}"
     remedy = "Save it with numpy.save(path, vertices), an (n, 3) array of numbers"
     try:

@@ -77,14 +77,12 @@ def _compile(
     if cache_folder().path is None or cache_folder().has_failed:
         return
     kernels = manifest.needed(jobs)
-    started = _start_early(len(kernels))
-    try:
+    with _started_early(len(kernels)) as started:
         missing = _missing(kernels)
-    except BaseException:
-        for process in started:
-            end_process(process)
-        raise
-    with contextlib.closing(Pool(missing, processes(), started)) as pool:
+        if not missing:
+            return
+        pool = Pool(missing, processes(), started)
+    with contextlib.closing(pool):
         reported = 0.0
         while pool.is_working():
             if cancelled is not None and cancelled():
@@ -95,18 +93,30 @@ def _compile(
             pool.wait(_POLL)
 
 
-def _start_early(most: int) -> list[Popen[str]]:
-    """Processes that load Numba while it is found out what they have to compile; none where some kernels are there."""
+@contextlib.contextmanager
+def _started_early(most: int) -> Iterator[list[Popen[str]]]:
+    """Processes that load Numba while it is found out what they have to compile; those not taken by then end.
+
+    There are none where some kernels are there.
+    """
+    started: list[Popen[str]] = []
+    try:
+        with contextlib.suppress(OSError):  # the pool meets it again, and says so
+            if _keeps_none():
+                for _ in range(min(most, processes())):
+                    started.append(start_process())
+        yield started
+    finally:
+        while started:  # the pool takes no ended ones
+            end_process(started.pop())
+
+
+def _keeps_none() -> bool:
+    """Whether kernels will be kept, and none is yet."""
     cache = cache_folder()
     if cache.path is None or cache.trouble or shipped.brings_any() or not is_tested():
-        return []
-    started: list[Popen[str]] = []
-    with contextlib.suppress(OSError):  # the pool meets it again, and says so
-        if any(cache.path.glob(f"*/*{ENDING}")):
-            return []
-        for _ in range(min(most, processes())):
-            started.append(start_process())
-    return started
+        return False
+    return not any(cache.path.glob(f"*/*{ENDING}"))
 
 
 def not_compiled(kernels: Iterable[Kernel]) -> list[Kernel]:

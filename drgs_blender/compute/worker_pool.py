@@ -12,7 +12,6 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable
 from typing import Any
 
 from ..core.memory import available_memory
@@ -57,8 +56,8 @@ class Pool:
         What is not compiled yet.
     most : int
         Of processes.
-    started : iterable of subprocess.Popen
-        By `start_process`, before it was known what is to be compiled: they are used first.
+    started : list of subprocess.Popen, optional
+        By `start_process`, before it was known what is to be compiled. Those that are used are taken out of the list.
 
     Attributes
     ----------
@@ -68,8 +67,8 @@ class Pool:
         Part of the time of compiling them all that lies behind.
     """
 
-    def __init__(self, kernels: list[Known], most: int, started: Iterable[subprocess.Popen[str]] = ()) -> None:
-        self._longest = max(kernels, key=lambda known: known[0].seconds, default=None)
+    def __init__(self, kernels: list[Known], most: int, started: list[subprocess.Popen[str]] | None = None) -> None:
+        self._longest = max(kernels, key=lambda known: known[0].seconds)
         self._remaining = sorted(kernels, key=lambda known: known is not self._longest)
         self._codegen = target_codegen()
         self._all = sum(kernel.seconds for kernel, _, _ in kernels)
@@ -77,7 +76,7 @@ class Pool:
         self._progress = time.monotonic()
         self._results: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._workers: list[Worker] = []
-        self._started = list(started)
+        self._started = [] if started is None else started
         self._most = min(len(kernels), most)
         self._failures: Counter[Kernel] = Counter()
         self._deaths = 0
@@ -86,7 +85,6 @@ class Pool:
         except BaseException:
             self.close()
             raise
-        self._end_idle()
 
     def is_working(self) -> bool:
         """Whether a worker still has something to do, or will have."""
@@ -106,12 +104,6 @@ class Pool:
         """End all workers."""
         for worker in self._workers:
             worker.close()
-        self._end_idle()
-
-    def _end_idle(self) -> None:
-        """End what was started and has nothing to do."""
-        while self._started:
-            end_process(self._started.pop())
 
     def _take(self, worker: Worker, answer: str | None) -> None:
         """Note what a worker says; None where it has ended."""

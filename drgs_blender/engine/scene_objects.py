@@ -133,7 +133,7 @@ def traced_object(state: ObjectState, asset: Asset, seen_only: bool = False) -> 
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise UsageError(subject, "its matrix is not a finite 4 x 4 matrix", "Check its transform and its drivers")
     if state.vertices is not None and len(state.vertices) != n:
-        made_from = "" if mesh.source is None else f", the mesh it was made from {mesh.source.count[0]}"
+        made_from = "" if mesh.source is None else f", the mesh it was made from {mesh.source_count}"
         raise AssetError(
             subject,
             f"its mesh has {len(state.vertices)} vertices, its asset has {n}{made_from}",

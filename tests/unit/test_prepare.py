@@ -73,24 +73,32 @@ def test_the_first_job_comes_first_beside_the_longest_kernel(monkeypatch) -> Non
     assert started == [(longest.name, False), (first[0].name, True)]
 
 
-def test_processes_that_were_started_early_compile_and_those_too_many_end(small) -> None:
-    started = [worker_pool.start_process() for _ in range(3)]
-    with contextlib.closing(worker_pool.Pool(small, 2, started)) as pool:
+def test_processes_that_were_started_early_compile_and_those_too_many_end(small, monkeypatch) -> None:
+    monkeypatch.setattr(prepare, "processes", lambda: 3)
+    with prepare._started_early(9) as started:
+        processes = list(started)
+        pool = worker_pool.Pool(small, 2, started)
+    assert len(processes) == 3 and [process.poll() is None for process in processes].count(True) == 2
+    with contextlib.closing(pool):
         finish(pool)
-        assert {worker._process for worker in pool._workers} <= set(started)
-    assert pool.done == len(small) and None not in [process.poll() for process in started]
+        assert {worker._process for worker in pool._workers} <= set(processes)
+    assert pool.done == len(small) and None not in [process.poll() for process in processes]
+
+
+def early() -> list[subprocess.Popen[str]]:
+    """Processes that are started early, and that have ended since."""
+    with prepare._started_early(2) as started:
+        return list(started)
 
 
 def test_processes_are_started_early_only_into_an_empty_cache(small, monkeypatch) -> None:
     """Where some kernels are there, likely all are: then nothing is started, and nothing waits for it."""
-    started = prepare._start_early(2)
+    started = early()
     assert len(started) == min(2, prepare.processes())
-    with contextlib.closing(worker_pool.Pool([], 2, started)) as pool:
-        assert not pool.is_working()
     assert None not in [process.poll() for process in started]
     with contextlib.closing(worker_pool.Pool(small, 2)) as pool:
         finish(pool)
-    assert not prepare._start_early(2)
+    assert not early()
     shutil.rmtree(folders.cache_folder().path)
     for owner, name, value in (
         (prepare.shipped, "brings_any", lambda: True),
@@ -99,15 +107,20 @@ def test_processes_are_started_early_only_into_an_empty_cache(small, monkeypatch
     ):
         with monkeypatch.context() as patched:
             patched.setattr(owner, name, value)
-            assert not prepare._start_early(2)
+            assert not early()
 
 
 def test_processes_started_early_end_where_others_compile(small) -> None:
-    taken, started = claims(small), [worker_pool.start_process()]
-    with contextlib.closing(worker_pool.Pool(small, 2, started)):
-        assert started[0].poll() is not None
-    for claim in taken:
-        claim.close()
+    taken = claims(small)
+    with prepare._started_early(1) as started:
+        processes = list(started)
+        pool = worker_pool.Pool(small, 2, started)
+    with contextlib.closing(pool):
+        assert len(processes) == 1 and processes[0].poll() is not None
+        for claim in taken:
+            claim.close()
+        finish(pool)  # by processes of its own
+        assert pool.done == len(small) and not pool._failures
 
 
 def test_no_process_is_started_for_what_others_compile(small) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from test_build_make import plane
 
 from drgs_blender.build.make import mesh_with_materials
 from drgs_blender.cli.main import main
@@ -18,7 +19,7 @@ from drgs_blender.core.frame import Camera, Frame, ObjectState, Pose, RenderSett
 from drgs_blender.deform.attach import attach
 from drgs_blender.engine.scene_objects import moved_vertices
 from drgs_blender.engine.session import Session
-from drgs_blender.formats.files import Image, MaterialFile, MeshFile
+from drgs_blender.formats.files import Image, MeshFile
 
 
 def shuffled(mesh: trimesh.Trimesh, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -44,16 +45,11 @@ def board(size: int = 32) -> Image:
     return Image(np.repeat(pixels[..., None], 3, axis=2).astype(np.uint8), srgb=True)
 
 
-def checkered(seed: int = 0, n: int = 3) -> MeshFile:
-    """A square of n x n x 2 triangles with a checkerboard."""
-    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1)))
-    corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
-    a, b, c, d = corner, corner + 1, corner + n + 2, corner + n + 1
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    flat = trimesh.Trimesh(np.stack([x, y, 0 * x], 1), faces, process=False)
-    vertices, faces = shuffled(flat, seed)
-    uvs = vertices[faces][..., :2]
-    return MeshFile(vertices, faces, corner_uvs=uvs, materials=[MaterialFile("board", base_colour_image=board())])
+def checkered(seed: int = 0) -> MeshFile:
+    """A square of 3 x 3 x 2 triangles with a checkerboard."""
+    file = plane(3, board())
+    vertices, faces = shuffled(trimesh.Trimesh(file.vertices, file.faces, process=False), seed)
+    return replace(file, vertices=vertices, faces=faces)
 
 
 @pytest.mark.parametrize("seed", range(4))

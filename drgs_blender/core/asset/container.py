@@ -159,7 +159,7 @@ def inspect_asset(path: PathLike, verify: bool = True) -> dict[str, Any]:
         "vertices": len(mesh.vertices),
         "faces": len(mesh.faces),
         "groups": len(mesh.groups),
-        "source_vertices": len(mesh.vertices) if mesh.source is None else int(mesh.source.count[0]),
+        "source_vertices": mesh.source_count,
         "sh_coefficients": 0 if surfels.sh is None else surfels.sh.shape[1],
     }
     ranges = {
@@ -220,7 +220,7 @@ def check_asset(asset: Asset, subject: str, values: bool = True) -> None:
         where = f"{subject}, source index"
         if len(mesh.source.index) != len(mesh.vertices):
             raise AssetError(where, f"has {len(mesh.source.index)} rows for {len(mesh.vertices)} vertices", _RESTORE)
-        _check_indices(mesh.source.index, int(mesh.source.count[0]), where, "vertices of the source")
+        _check_indices(mesh.source.index, mesh.source_count, where, "vertices of the source")
     if values:
         for member, tensors in _tensors_of(asset).items():
             for name, array in tensors.items():

@@ -165,13 +165,18 @@ class Mesh:
         self.roughness = as_float(self.roughness, (n,), "mesh roughness")
         self.metallic = as_float(self.metallic, (n,), "mesh metallic")
 
+    @property
+    def source_count(self) -> int:
+        """How many vertices the source has."""
+        return len(self.vertices) if self.source is None else int(self.source.count[0])
+
     def in_own_order(self, vertices: Array) -> Array:
         """A pose in the order of this mesh, if it has as many vertices as its source and not as many as itself.
 
         Any other is returned as it is.
         """
         source = self.source
-        if source is None or len(vertices) == len(self.vertices) or np.shape(vertices) != (source.count[0], 3):
+        if source is None or len(vertices) == len(self.vertices) or np.shape(vertices) != (self.source_count, 3):
             return vertices
         return source.to_asset(vertices)
 
