@@ -111,14 +111,17 @@ def rows_of(result: dict) -> list[list[object]]:
     rows: list[list[object]] = []
     for name, text in names.items():
         values = 1000 * np.array(result["latencies"][name])
-        rows.append([f"change to first picture: {text}", float(np.median(values)), float(values.max())])
+        rows.append([f"first picture, {text}", float(np.median(values)), float(values.max())])
         for stage in ("deform", "light", "render", "worker"):
             parts = [1000 * s.get(f"seconds.{stage}", 0.0) for s in result["engine"][name]]
-            rows.append([f"    of these {stage}", float(np.median(parts)), float(max(parts))])
+            rows.append([f"first picture, {text}: of these {stage}", float(np.median(parts)), float(max(parts))])
     for name in ("redraws while changing", "redraws while turning, rendered", "redraws while turning, composited"):
-        wall, work = 1000 * np.array(result[name]).T
+        wall, work, new = np.array(result[name]).T * [[1000], [1000], [1]]
         rows.append([f"{name}, wall", float(np.median(wall)), float(np.percentile(wall, 99))])
         rows.append([f"{name}, work of Blender's thread", float(np.median(work)), float(np.percentile(work, 99))])
+        for text, part in (("with a new picture", work[new > 0]), ("without one", work[new == 0])):
+            rows.append([f"{name}, work {text}", float(np.median(part)), float(np.percentile(part, 99))])
+        rows.append([f"{name}, share with a new picture", float(new.mean()), ""])
     return rows
 
 

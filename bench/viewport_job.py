@@ -31,6 +31,14 @@ class Run:
         self.job = job
         self.views = importlib.import_module(f"{PACKAGE}.addon.viewport.views")
         self.result: dict[str, object] = {"blender": bpy.app.version_string, "latencies": {}, "engine": {}}
+        self.bringing: set[int] = set()  # redraws that bring a new picture, by their place in `redraws`
+        bring = self.views.draw.strip
+
+        def noted(*arguments: object) -> object:
+            self.bringing.add(len(self.views.redraws))
+            return bring(*arguments)
+
+        self.views.draw.strip = noted
 
     def steps(self) -> Iterator[float]:
         self.build()
@@ -46,7 +54,7 @@ class Run:
         for change in changes:  # kernels of every kind of change are loaded
             yield from self.changed(change, self.job["repeats"] + 1)
             yield from self.until(self.finished)
-        self.views.redraws.clear()
+        self.begin_redraws()
         for change in changes:
             found: list[float] = []
             engine: list[dict[str, float]] = []
@@ -59,8 +67,8 @@ class Run:
             self.result["latencies"][change.__name__] = found
             self.result["engine"][change.__name__] = engine
             yield from self.until(self.finished)
-        self.result["redraws while changing"] = list(self.views.redraws)
-        self.views.redraws.clear()
+        self.result["redraws while changing"] = self.redraws()
+        self.begin_redraws()
         yield from self.turn_on("rendered")
         began = time.perf_counter()
         self.turn(1)
@@ -74,14 +82,14 @@ class Run:
 
     def turn_on(self, name: str) -> Iterator[float]:
         """Turn the view without a pause."""
-        self.views.redraws.clear()
+        self.begin_redraws()
         pictures, last, end, i = 0, None, time.perf_counter() + self.job["seconds"], 0
         while time.perf_counter() < end:
             self.turn(i := i + 1)
             yield 1 / 60
             pictures += self.shown().picture is not last
             last = self.shown().picture
-        self.result[f"redraws while turning, {name}"] = list(self.views.redraws)
+        self.result[f"redraws while turning, {name}"] = self.redraws()
         self.result[f"pictures a second, {name}"] = pictures / self.job["seconds"]
 
     def build(self) -> None:
@@ -104,6 +112,15 @@ class Run:
         space.region_3d.view_distance = 5.0
         space.region_3d.view_location = 0, 0, 1
         self.turn(0)
+
+    def begin_redraws(self) -> None:
+        """Count redraws anew."""
+        self.views.redraws.clear()
+        self.bringing.clear()
+
+    def redraws(self) -> list[tuple[float, float, bool]]:
+        """Wall seconds, those of Blender's thread, and whether a new picture was brought, per redraw."""
+        return [(*each, i in self.bringing) for i, each in enumerate(self.views.redraws)]
 
     # Changes
 
