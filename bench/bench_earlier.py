@@ -4,8 +4,8 @@
 
 Each is a program's name with its options. It runs in a clone of either commit, in an environment with this one's
 packages, and writes the clone's own docs/benchmarks.md; the numbers of its tables are compared cell by cell. Those that
-are the same in all runs, as counts and errors are, are left out. What is not measured keeps its rows. Needs `make env`;
-`viewport` needs DRGS_UI_BLENDER.
+are the same in all runs, as counts and errors are, are left out, as are those that only one commit has. What is not
+measured keeps its rows. Needs `make env`; `viewport` needs DRGS_UI_BLENDER.
 """
 
 from __future__ import annotations
@@ -51,12 +51,13 @@ def compare(program: str, earlier: Checkout, now: Checkout, pairs: int) -> list[
     """Rows of `COLUMNS` of a program; the first run of either compiles and is not counted."""
     for checkout in (earlier, now):
         cells(checkout, program)
-    runs = [(list(cells(earlier, program).values()), cells(now, program)) for _ in range(pairs)]
-    if len({len(found) for pair in runs for found in pair}) > 1:
+    runs = [(cells(earlier, program), cells(now, program)) for _ in range(pairs)]
+    same = [cell for cell in runs[0][1] if all(cell in found for pair in runs for found in pair)]
+    if not same:
         raise SystemExit(f"{program} has other tables now than it had: its commits cannot be compared")
     rows: list[list[object]] = []
-    for number, cell in enumerate(runs[0][1]):
-        before, after = [old[number] for old, _ in runs], [new[cell] for _, new in runs]
+    for cell in same:
+        before, after = [old[cell] for old, _ in runs], [new[cell] for _, new in runs]
         if len({*before, *after}) > 1:
             ratios = np.array(after) / before
             low, high = np.quantile(ratios, [0.25, 0.75])

@@ -9,10 +9,11 @@ import bpy
 import numpy as np
 
 from ..addon import assets
-from ..drgs_blender.core.errors import UsageError
+from ..drgs_blender.core.asset import Mesh
+from ..drgs_blender.core.errors import AssetError, UsageError
 from . import selection
 from .base import DrgsOperator
-from .nearest_surface import Match, Source, nearest, source_of
+from .nearest_surface import Match, Source, by_numbers, nearest, source_of
 from .shape_keys import transfer_shape_keys
 from .vertex_weights import Weights, read_weights, write_weights
 
@@ -82,7 +83,8 @@ def bind_to_rig(context: bpy.types.Context, target: bpy.types.Object, sources: l
         places = [source_of(o) for o in sources]
         matrix = np.array(target.matrix_world, np.float64)
         armature_matrix = armature.matrix_world.copy() if armature else None
-    match = nearest(selection.world_vertices(target), places)
+    points = selection.world_vertices(target)
+    match = by_numbers(points, _rest(target), places) or nearest(points, places)
     everything = np.concatenate([s.vertices for s in places])
     distance = float(match.distance.mean() / max(np.linalg.norm(np.ptp(everything, axis=0)), 1e-12))
     if distance > WRONG:
@@ -96,6 +98,14 @@ def bind_to_rig(context: bpy.types.Context, target: bpy.types.Object, sources: l
         _attach(target, armature, armature_matrix, sources)
     transfer_shape_keys(target, matrix, [(s.object, s.matrix) for s in places], match)
     return distance
+
+
+def _rest(target: bpy.types.Object) -> Mesh:
+    """The mesh of the asset; without its file one that is made of no other."""
+    try:
+        return assets.load(assets.file_of(target)).mesh
+    except AssetError:
+        return Mesh.empty()
 
 
 def armature_of(name: str, sources: list[bpy.types.Object]) -> bpy.types.Object | None:

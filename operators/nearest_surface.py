@@ -9,10 +9,15 @@ import numpy as np
 from mathutils.bvhtree import BVHTree
 
 from ..addon import mesh_arrays
+from ..drgs_blender.core.asset import Mesh
 from ..drgs_blender.core.errors import UsageError
 from . import selection
 
 Array = np.ndarray
+
+
+#: Distance, as a part of the diagonal, within which a vertex lies where another does.
+AT_PLACE = 1e-4
 
 
 @dataclass(slots=True)
@@ -66,6 +71,46 @@ def nearest(points: Array, sources: list[Source]) -> Match:
         barycentric=barycentric(found, vertices[corners]),
         distance=np.linalg.norm(found - points, axis=1),
     )
+
+
+def by_numbers(points: Array, rest: Mesh, sources: list[Source]) -> Match | None:
+    """The vertices of the sources from which those of an asset were made, by their numbers.
+
+    Exact also where surfaces touch or lie in each other, where the nearest place may be another's.
+
+    Parameters
+    ----------
+    points : (n, 3) array
+        World: the asset's vertices, undeformed.
+    rest : Mesh
+        Of the asset.
+    sources : list of Source
+        In the order in which the asset's source has them.
+
+    Returns
+    -------
+    Match or None
+        None where the sources are not the mesh that the asset was made from, or lie elsewhere.
+    """
+    vertices = np.concatenate([s.vertices for s in sources])
+    starts = np.cumsum([0, *(len(s.vertices) for s in sources)])
+    n = len(points)
+    tries = []
+    if rest.source is not None and len(vertices) == rest.source_count and n == len(rest.source.index):
+        tries.append((rest.source.index, rest.source.weights))
+    if len(vertices) == n:
+        tries.append((np.arange(n)[:, None], np.ones((n, 1))))
+    for index, weights in tries:
+        found = np.einsum("nk,nkc->nc", weights, vertices[index])
+        distance = np.linalg.norm(found - points, axis=1)
+        if distance.max(initial=0) > AT_PLACE * float(np.linalg.norm(np.ptp(vertices, axis=0))):
+            continue
+        source = np.searchsorted(starts, index[:, 0], side="right") - 1
+        corners, shares = np.repeat(index[:, :1], 3, axis=1), np.zeros((n, 3))
+        used = weights != 0
+        corners[:, : index.shape[1]][used], shares[:, : index.shape[1]] = index[used], weights
+        return Match(source, corners - starts[source][:, None], shares, distance)
+    return None
 
 
 def barycentric(points: Array, triangles: Array) -> Array:

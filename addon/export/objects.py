@@ -12,7 +12,7 @@ import numpy as np
 
 from ...drgs_blender.core.asset import MATERIAL_CHANNELS, Asset
 from ...drgs_blender.core.frame import Adjustment, ObjectState
-from .. import assets, cache_playback, mesh_arrays
+from .. import assets, cache_playback, mesh_arrays, point_caches
 from .export_cache import ExportCache, uid
 from .instances import Key, Visible
 from .topology_check import check_modifiers, check_topology
@@ -62,6 +62,7 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     editing, captured = obj.mode == "EDIT", obj.drgs.show_captured
     mesh = obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph) if editing else obj.data
     try:
+        point_caches.check(obj, asset.mesh, warn, final=depsgraph.mode == "RENDER")
         same_faces = check_topology(obj, mesh, asset.mesh, warn)
         arrays: dict[str, Any] = {
             "vertices": mesh_arrays.read_vertices(mesh),

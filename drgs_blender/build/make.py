@@ -12,7 +12,7 @@ from ..core.asset.model import Asset, Environment, Mesh, SourceVertices, Surfels
 from ..core.errors import AssetError
 from ..deform.attach import attach
 from ..deform.face_frames import Faces
-from ..formats.axes import mesh_to_z_up
+from ..formats.axes import UP_AXES, mesh_to_z_up
 from ..formats.files import MeshFile, plain_name
 from ..formats.gltf_nodes import Pose
 from ..formats.mesh import check_extent
@@ -75,9 +75,12 @@ def make_asset(
 
 def scale_mesh(mesh: Mesh, scale: float, name: str) -> None:
     """Multiply all lengths of `mesh` by `scale`. Raises UsageError where no mesh can be as small or large."""
+    if scale == 1:
+        return
     with np.errstate(all="ignore"):
         mesh.vertices = mesh.vertices * np.float32(scale)
     check_extent(mesh.vertices, name, scale)
+    mesh.source = (mesh.source or SourceVertices.identity(len(mesh.vertices))).turned(np.eye(3) * np.float32(scale))
 
 
 def read_mesh_file(source: str | Path | MeshFile, pose: Pose = "rest") -> MeshFile:
@@ -119,16 +122,21 @@ def mesh_with_materials(
         "source_vertices", "source_faces", "not_finite_faces", "degenerate_faces" (removed), "vertices", "faces",
         "rounds" of subdivision, "unresolved_edges" (detail left out by the budget or the finest edge), "notes".
     """
-    if up and file.up_axis == "unknown":
-        file = mesh_to_z_up(file, up)
+    turned = up if file.up_axis == "unknown" else None
+    if turned:
+        file = mesh_to_z_up(file, turned)
     report: dict[str, Any] = {"source_vertices": len(file.vertices), "source_faces": len(file.faces)}
     report["notes"] = list(file.notes)
-    net, origin = _net(file, name, report)
+    net, (source, corners) = _net(file, name, report)
     materials = Materials(file.materials, coloured=file.vertex_colours is not None)
     net, values, report["rounds"], report["unresolved_edges"] = refine(net, materials, tolerance, max_triangles)
     report["vertices"], report["faces"] = len(net.vertices), len(net.faces)
     channels = values[:, :3], values[:, 3], values[:, 4]
-    mesh = Mesh(net.vertices, net.faces, *channels, _groups(net, file), _source(net, *origin, len(file.vertices)))
+    count = file.file_count or len(file.vertices)
+    origin = _source(net, file.vertex_numbers[source], file.vertex_numbers[corners], count)
+    mesh = Mesh(net.vertices, net.faces, *channels, _groups(net, file), origin)
+    if turned not in (None, "z"):
+        mesh.source = (mesh.source or SourceVertices.identity(count)).turned(UP_AXES[turned])
     log.info("mesh of %s: %s", name, report)
     return mesh, report
 
@@ -139,8 +147,8 @@ def _net(file: MeshFile, name: str, report: dict[str, Any]) -> tuple[Net, tuple[
     Returns
     -------
     net : Net
-    source, faces : array
-        The file's vertex (n,) of each vertex of `net`, and the vertices (f, 3) at the corners of the numbered faces.
+    source, corners : array
+        The vertex (n,) of `file` of each vertex of `net`, and those (f, 3) at the corners of the numbered faces.
     """
     m = len(file.faces)
     if not m:
@@ -183,18 +191,18 @@ def _net(file: MeshFile, name: str, report: dict[str, Any]) -> tuple[Net, tuple[
     report["degenerate_faces"] = removed = int((finite & ~proper).sum() + (~keep).sum())
     if removed:
         report["notes"].append(f"{removed} faces without area removed")
-    return net, (source, welded)
+    return net, (source, source[welded])
 
 
-def _source(net: Net, source: Array, faces: Array, count: int) -> SourceVertices | None:
+def _source(net: Net, source: Array, corners: Array, count: int) -> SourceVertices | None:
     """Where the vertices of `net` come from; None where they are the file's own.
 
     Parameters
     ----------
     net : Net
         Divided.
-    source, faces : array
-        Of `_net`.
+    source, corners : array
+        Of `_net`, numbered as in the file.
     count : int
         Of the file's vertices.
     """
@@ -208,7 +216,7 @@ def _source(net: Net, source: Array, faces: Array, count: int) -> SourceVertices
     corner = np.empty(n, np.int64)  # any one of each vertex
     corner[flat] = np.arange(len(flat))
     new = corner[first:]
-    index[first:] = source[faces[net.tags[new // 3, 2]]]
+    index[first:] = corners[net.tags[new // 3, 2]]
     weights[first:] = net.inside.reshape(-1, 3)[new]
     return SourceVertices(index, weights, np.array([count]))
 

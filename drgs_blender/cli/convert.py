@@ -9,13 +9,16 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ..core.errors import UsageError
 from ..core.file_types import Held
 from ..core.frame_sequences import frame_path
 from ..formats.axes import UP_AXES
-from .frame_range import requested_frames
+from ..formats.point_cache import SUFFIXES as POINT_CACHES
+from .frame_range import check_template, parse_frames, requested_frames
 from .output import check_writable
-from .pose_file import add_vertex_order, check_vertex_order
+from .pose_file import add_vertex_order, check_vertex_order, in_asset_order, is_point_cache, read_poses
 from .progress import clock
 from .relight import finite, positive
 from .sampling import int_range
@@ -26,6 +29,7 @@ EXAMPLES = """examples:
   drgs convert helmet.drgs helmet.ply --env studio.hdr --env-rotation 90
   drgs convert robot.drgs robot.spz --vertices pose.npy
   drgs convert robot.drgs 'splats/####.ply' --vertices 'poses/####.npy' --frames 1-24
+  drgs convert robot.drgs robot.pc2 --vertices source.mdd
   drgs convert 'in/####.ply' 'out/####.spz' --frames
   drgs convert splats.spz splats.ply --up=-y
   drgs convert lego.drgs light.exr
@@ -50,12 +54,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--scale", type=positive, default=1.0, metavar="S", help="factor on all lengths")
     parser.add_argument(
-        "--vertices", type=Path, metavar="V.npy", help="pose of an asset: (n, 3) array, the mesh's vertices, metres"
-    )
+        "--vertices", type=Path, metavar="V",
+        help="pose of an asset: the mesh's vertices, metres, an (n, 3) array (.npy), or those of frames (.pc2, .mdd)",
+    )  # fmt: skip
     add_vertex_order(parser)
     parser.add_argument(
         "--frames", nargs="?", const="",
-        help="frames, one file each: #### in IN, OUT and V.npy becomes the number; 1-24, or nothing for those of IN",
+        help="frames, one file each: #### in IN, OUT and V becomes the number; 1-24, or nothing for those of IN or V",
     )  # fmt: skip
     splats = parser.add_argument_group("colour of splats")
     splats.add_argument(
@@ -74,14 +79,50 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Convert one file, or those of all frames."""
     check_vertex_order(args)
-    frames = requested_frames(args.frames, args.input, args.output)
+    args.frame = None
+    moving = is_point_cache(args.vertices)
+    if args.output.suffix.lower() in POINT_CACHES:
+        return convert_poses(args)
+    frames: list[int] | None
+    if moving and (args.frames == "" or (args.frames is None and "#" in args.output.name)):
+        frames = [frame for frame, _ in read_poses(args.vertices)]
+        check_template(str(args.output), frames)
+    else:
+        frames = requested_frames(args.frames, args.input, args.output)
     if frames is None:
         convert(args)
         return 0
     for frame in frames:
         paths = {name: path for name in ("input", "output", "vertices") if (path := getattr(args, name)) is not None}
         of_frame = {name: frame_path(str(path), frame) for name, path in paths.items()}
-        convert(argparse.Namespace(**(vars(args) | of_frame)))
+        convert(argparse.Namespace(**(vars(args) | of_frame | ({"frame": frame} if moving else {}))))
+    return 0
+
+
+def convert_poses(args: argparse.Namespace) -> int:
+    """Write a point cache in the order, axes and unit of an asset; of the frames that are asked for, or of all."""
+    from ..core.asset.container import read_asset
+    from ..formats.point_cache import read_point_cache, write_point_cache
+
+    if not is_point_cache(args.vertices):
+        problem = "is written of a point cache"
+        raise UsageError(str(args.output), problem, "Give an asset as IN and a .pc2 or .mdd with --vertices")
+    for option in ("kind", "up", "from_up", "env", "colour"):
+        if getattr(args, option):
+            name = {"kind": "as"}.get(option, option).replace("_", "-")
+            raise UsageError(f"--{name}", "does not go with a point cache", "Leave it out")
+    check_writable(args.output, (args.input, args.vertices))
+    with clock(args, "reading"):
+        mesh = read_asset(args.input).mesh
+        poses = read_poses(args.vertices, parse_frames(args.frames) if args.frames else None)
+    numbers = [frame for frame, _ in poses]
+    if numbers != list(range(numbers[0], numbers[0] + len(numbers))):
+        raise UsageError(f"--frames {args.frames}", "skips frames, which a point cache cannot", "Write it as 1-24")
+    scale = np.float32(args.scale)
+    moving = (in_asset_order(args, mesh, pose()) * scale for _, pose in poses)
+    fps = read_point_cache(args.vertices).fps
+    write_point_cache(args.output, moving, len(poses), len(mesh.vertices), numbers[0], fps)
+    print(f"{args.output}: {len(poses)} frames from {numbers[0]} on, {len(mesh.vertices)} vertices each")
     return 0
 
 

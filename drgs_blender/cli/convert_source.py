@@ -96,7 +96,7 @@ class AssetSource:
         self._vertices = asset.mesh.vertices
         self._posed = args.vertices is not None
         if self._posed:
-            self._vertices = in_asset_order(args, asset.mesh, read_vertices(args.vertices))
+            self._vertices = in_asset_order(args, asset.mesh, read_vertices(args.vertices, args.frame))
         held: dict[Held, bool] = {
             "mesh": len(asset.mesh.faces) > 0,
             "splats": len(asset.surfels) > 0,

@@ -1,9 +1,13 @@
-"""Poses in files: the vertices of a mesh, in the order of an asset or of the mesh that it was made from."""
+"""Poses in files: the vertices of a mesh, in the order of an asset or of the mesh that it was made from.
+
+One pose is a NumPy array (.npy), the poses of many frames are a point cache (.pc2, .mdd).
+"""
 
 from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -47,13 +51,63 @@ def in_asset_order(args: argparse.Namespace, mesh: Mesh, vertices: np.ndarray) -
     if source is None:
         return vertices
     if len(fitting) > 1 and order is None:
-        problem = f"has {own} vertices, as the asset and the mesh it was made from, whose orders differ"
+        differing = "whose axes or units differ" if source.in_order else "whose orders differ"
+        problem = f"has {own} vertices, as the asset and the mesh it was made from, {differing}"
         raise UsageError(subject, problem, "Say which with --vertex-order asset or --vertex-order source")
     return source.to_asset(vertices) if (order or fitting[0]) == "source" else vertices
 
 
-def read_vertices(path: Path) -> np.ndarray:
-    """Read a pose; only its form is checked here, its length by `in_asset_order`."""
+#: Number of a frame, and what reads its pose.
+Poses = Sequence[tuple[int, Callable[[], np.ndarray]]]
+
+
+def is_point_cache(path: Path | None) -> bool:
+    """Whether a file of poses has those of many frames."""
+    from ..formats.point_cache import SUFFIXES
+
+    return path is not None and path.suffix.lower() in SUFFIXES
+
+
+def read_poses(path: Path, frames: Sequence[int] | None = None) -> Poses:
+    """Poses of a point cache; by default of all its frames.
+
+    Raises
+    ------
+    AssetError, UsageError
+        The file is damaged, or lacks one of the frames.
+    """
+    from ..formats.point_cache import read_point_cache
+
+    subject = f"--vertices {path}"
+    if not path.is_file():
+        raise UsageError(subject, "is not a regular file" if path.exists() else "does not exist", "Check the path")
+    cache = read_point_cache(path)
+    there = range(cache.first, cache.first + len(cache.frames))
+    frames = there if frames is None else frames
+    if missing := [frame for frame in frames if frame not in there]:
+        raise UsageError("--frames", f"wants frame {missing[0]}; {path} has {there[0]} to {there[-1]}", "Choose others")
+
+    def pose(frame: int) -> Callable[[], np.ndarray]:
+        return lambda: np.ascontiguousarray(cache.frames[frame - cache.first], np.float32)
+
+    return [(frame, pose(frame)) for frame in frames]
+
+
+def read_vertices(path: Path, frame: int | None = None) -> np.ndarray:
+    """Read a pose; only its form is checked here, its length by `in_asset_order`.
+
+    Parameters
+    ----------
+    path : Path
+    frame : int, optional
+        Of a point cache; None: its only one.
+    """
+    if is_point_cache(path):
+        poses = read_poses(path, None if frame is None else [frame])
+        if len(poses) > 1:
+            problem = f"has the frames {poses[0][0]} to {poses[-1][0]}"
+            raise UsageError(f"--vertices {path}", problem, f"Say which: --frames {poses[0][0]}, or write #### in OUT")
+        return poses[0][1]()
     subject = f"--vertices {path}"
     remedy = "Save it with numpy.save(path, vertices), an (n, 3) array of numbers"
     try:

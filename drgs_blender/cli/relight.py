@@ -29,7 +29,7 @@ from .camera_file import read_camera
 from .frame_range import check_template, parse_frames
 from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_preview
-from .pose_file import add_vertex_order, check_vertex_order, in_asset_order, read_vertices
+from .pose_file import add_vertex_order, check_vertex_order, in_asset_order, is_point_cache, read_poses, read_vertices
 from .progress import FractionBar
 
 logger = logging.getLogger(__name__)
@@ -39,6 +39,7 @@ EXAMPLES = """examples:
   drgs relight helmet.drgs --env city.exr --env-rotation 90 --camera front.json --samples 128 --denoise svgf \\
       --passes all --transparent --out helmet.exr
   drgs relight robot.drgs --env city.exr --camera front.json --vertices pose.npy --out pose.png
+  drgs relight robot.drgs --env city.exr --camera front.json --vertices walk.pc2 --frames 1-24 --out 'walk/####.exr'
   drgs relight cat.drgs --env city.exr --camera front.json --cache bake --frames 1-48 --out 'cat/####.exr'
 """
 
@@ -60,10 +61,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     pose = parser.add_argument_group("pose").add_mutually_exclusive_group()
     pose.add_argument("--cache", type=Path, metavar="CACHE", help="folder that `drgs simulate` wrote")
     pose.add_argument(
-        "--vertices", type=Path, metavar="V.npy", help="pose: (n, 3) array, the mesh's vertices in object space, metres"
+        "--vertices",
+        type=Path,
+        metavar="V",
+        help="pose: the mesh's vertices in object space, metres: (n, 3) array (.npy), or of many frames (.pc2, .mdd)",
     )
     add_vertex_order(parser)
-    parser.add_argument("--frames", metavar="RANGE", help="of the cache: 12, 1-24, 1-24x2; default: all that are there")
+    parser.add_argument(
+        "--frames", metavar="RANGE", help="of CACHE or V: 12, 1-24, 1-24x2; default: all that are there"
+    )
     sampling.add_arguments(parser, defaults=True)
 
 
@@ -158,9 +164,14 @@ def _poses(
     args: argparse.Namespace,
 ) -> tuple[Sequence[tuple[int, Callable[[], np.ndarray | None]]], tuple[float, float]]:
     """Number of each picture with what gives its pose, and `tear` and `grain` of the object."""
+    if is_point_cache(args.vertices):
+        poses = read_poses(args.vertices, parse_frames(args.frames) if args.frames else None)
+        check_template(str(args.out), [frame for frame, _ in poses])
+        return poses, (0.0, 0.0)
     if args.cache is None:
         if args.frames:
-            raise UsageError("--frames", "are those of a cache", "Give one with --cache")
+            problem = "are those of a cache"
+            raise UsageError("--frames", problem, "Give one with --cache, or a .pc2 or .mdd with --vertices")
         vertices = read_vertices(args.vertices) if args.vertices else None
         return [(1, lambda: vertices)], (0.0, 0.0)
     cache = ParticleCache(args.cache)
@@ -171,8 +182,7 @@ def _poses(
     if missing := sorted(set(frames) - set(cache.frames())):
         cache.read(missing[0])  # says which are there
     check_template(str(args.out), frames)
-    poses = [(frame, partial(_pose, cache, frame)) for frame in frames]
-    return poses, (header.tear, header.grain)
+    return [(frame, partial(_pose, cache, frame)) for frame in frames], (header.tear, header.grain)
 
 
 def _pose(cache: ParticleCache, frame: int) -> np.ndarray:

@@ -115,6 +115,10 @@ class MeshFile:
         "Z" where positions are known to be Z up (glTF is converted on reading), "unknown" else.
     notes : list of str
         Conversions, losses and assumptions of the reader.
+    numbers : (n,) int64 array, optional
+        Of the vertices in the file, where the reader left some out or joined some; None: 0 to n - 1.
+    file_count : int, optional
+        How many vertices the file has; None: n.
     """
 
     vertices: Array
@@ -129,12 +133,19 @@ class MeshFile:
     vertex_metallic: Array | None = None
     up_axis: Literal["Z", "unknown"] = "unknown"
     notes: list[str] = field(default_factory=list)
+    numbers: Array | None = None
+    file_count: int | None = None
 
     def __post_init__(self) -> None:
         self.vertices = np.ascontiguousarray(self.vertices, dtype=np.float32).reshape(-1, 3)
         self.faces = np.ascontiguousarray(self.faces, dtype=np.int32).reshape(-1, 3)
         if self.face_material is None:
             self.face_material = np.full(len(self.faces), 0 if self.materials else -1, np.int32)
+
+    @property
+    def vertex_numbers(self) -> Array:
+        """(n,) int64: `numbers`, also where there are none."""
+        return np.arange(len(self.vertices)) if self.numbers is None else self.numbers
 
 
 @dataclass(slots=True)

@@ -50,6 +50,8 @@ def sanitise(mesh: MeshFile) -> MeshFile:
         )
         faces_before = np.cumsum([0, *keep])
         mesh.parts = [(n, int(faces_before[a]), int(faces_before[b])) for n, a, b in mesh.parts]
+        mesh.file_count = mesh.file_count or len(mesh.vertices)
+        mesh.numbers = mesh.vertex_numbers[finite]
         mesh.vertices = mesh.vertices[finite]
         mesh.faces = number[mesh.faces[keep]].astype(np.int32)
         for name in ("corner_normals", "corner_uvs", "face_material"):

@@ -95,21 +95,25 @@ def _joined(meshes: list[dict[str, Array]], about: list[dict[str, Any]]) -> Mesh
     """One mesh of all: corners at the same place of the same piece, with the same colour, are one vertex."""
     coloured, mapped = (any(name in mesh for mesh in meshes) for name in ("colours", "uvs"))
     smooth = all("normals" in mesh for mesh in meshes)
-    columns: dict[str, list[Array]] = {name: [] for name in ("vertices", "faces", "colours", "normals", "uvs")}
-    parts, faces, vertices = [], 0, 0
+    columns: dict[str, list[Array]] = {
+        name: [] for name in ("vertices", "faces", "colours", "normals", "uvs", "numbers")
+    }
+    parts, faces, vertices, read = [], 0, 0, 0
     for mesh, of in zip(meshes, about):
         corners, n = mesh["faces"], len(mesh["vertices"])
         colours = mesh.get("colours", np.ones((n, 3), np.float32)) if coloured else np.zeros((n, 0), np.float32)
         first, number = join_equal(mesh["vertices"], colours)
         columns["vertices"].append(mesh["vertices"][first])
         columns["colours"].append(colours[first])
+        columns["numbers"].append(first + read)
         columns["faces"].append(number[corners] + vertices)
         columns["uvs"].append(mesh.get("uvs", np.zeros((n, 2), np.float32))[corners])
         columns["normals"].append(mesh.get("normals", np.zeros((n, 3), np.float32))[corners])
         parts.append((of["name"], faces, faces + len(corners)))
-        faces, vertices = faces + len(corners), vertices + len(first)
+        faces, vertices, read = faces + len(corners), vertices + len(first), read + n
     whole = {name: np.concatenate(values) for name, values in columns.items()}
-    joined = MeshFile(whole["vertices"], whole["faces"], parts=parts, up_axis="Z")
+    numbers = None if vertices == read else whole["numbers"]
+    joined = MeshFile(whole["vertices"], whole["faces"], parts=parts, up_axis="Z", numbers=numbers, file_count=read)
     joined.corner_uvs = whole["uvs"] if mapped else None
     with np.errstate(all="ignore"):
         length = np.linalg.norm(whole["normals"], axis=2, keepdims=True)

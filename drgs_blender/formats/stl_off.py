@@ -93,7 +93,8 @@ def read_stl(path: Path) -> MeshFile:
         soup = np.concatenate(corners or [np.zeros((0, 3))]).astype(np.float32)
     first_of, number = join_equal(soup)
     notes.append(f"{len(soup)} corners of separate triangles joined to {len(first_of)} vertices, where exactly equal")
-    return MeshFile(soup[first_of], number.reshape(-1, 3), parts=parts, notes=notes)
+    faces = number.reshape(-1, 3)
+    return MeshFile(soup[first_of], faces, parts=parts, notes=notes, numbers=first_of, file_count=len(soup))
 
 
 def _coloured(data: bytes) -> int:

@@ -10,16 +10,17 @@ import pytest
 import trimesh
 from test_build_make import plane
 
-from drgs_blender.build.make import mesh_with_materials
+from drgs_blender.build.make import make_asset, mesh_with_materials
 from drgs_blender.cli.main import main
-from drgs_blender.core.asset.container import read_asset, write_asset
-from drgs_blender.core.asset.model import Asset, Mesh, SourceVertices
+from drgs_blender.core.asset.container import inspect_asset, read_asset, write_asset
+from drgs_blender.core.asset.model import Asset, Environment, Mesh, SourceVertices
 from drgs_blender.core.errors import EXIT_BAD_ASSET, EXIT_USAGE, AssetError
 from drgs_blender.core.frame import Camera, Frame, ObjectState, Pose, RenderSettings
 from drgs_blender.deform.attach import attach
 from drgs_blender.engine.scene_objects import moved_vertices
 from drgs_blender.engine.session import Session
 from drgs_blender.formats.files import Image, MeshFile
+from drgs_blender.formats.point_cache import read_point_cache, write_point_cache
 
 
 def shuffled(mesh: trimesh.Trimesh, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -39,7 +40,7 @@ def flat_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.repeat(normals[:, None], 3, axis=1)
 
 
-def board(size: int = 32) -> Image:
+def board_image(size: int = 32) -> Image:
     """A checkerboard, which asks for subdivision."""
     pixels = np.indices((size, size)).sum(axis=0) // 4 % 2 * 200 + 20
     return Image(np.repeat(pixels[..., None], 3, axis=2).astype(np.uint8), srgb=True)
@@ -47,7 +48,7 @@ def board(size: int = 32) -> Image:
 
 def checkered(seed: int = 0) -> MeshFile:
     """A square of 3 x 3 x 2 triangles with a checkerboard."""
-    file = plane(3, board())
+    file = plane(3, board_image())
     vertices, faces = shuffled(trimesh.Trimesh(file.vertices, file.faces, process=False), seed)
     return replace(file, vertices=vertices, faces=faces)
 
@@ -207,3 +208,123 @@ def test_the_command_line_takes_either_order_and_asks_where_both_fit(tmp_path, c
     relight = ["relight", str(tmp_path / "ball.drgs"), "--camera", str(tmp_path / "front.json")]
     assert main([*relight, "--out", str(tmp_path / "o.exr"), "--vertex-order", "source"]) == EXIT_USAGE
     assert "there are none" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("up", ["y", "-y", "-z"])
+def test_poses_turn_and_grow_as_the_mesh_did(tmp_path, up: str) -> None:
+    """A pose of the file is in the file's axes and unit."""
+    file = checkered()
+    trimesh.Trimesh(file.vertices, file.faces, process=False).export(tmp_path / "board.ply")
+    asset = make_asset(tmp_path / "board.ply", up=up, scale=0.3)
+    read = asset.mesh
+    np.testing.assert_array_equal(read.source.to_asset(file.vertices), read.vertices)
+    assert read.source.in_order
+    np.testing.assert_array_equal(read.in_own_order(file.vertices), file.vertices)  # one that fits both is the mesh's
+
+
+def test_vertices_that_a_reader_leaves_out_or_joins_keep_their_numbers(tmp_path) -> None:
+    ball = trimesh.creation.icosphere(1)
+    lines = [f"v {x} {y} {z}" for x, y, z in ball.vertices]
+    lines[3:3] = ["v nan 0 0", "v 0 inf 0"]
+    faces = ball.faces + np.where(ball.faces >= 3, 3, 1)
+    (tmp_path / "ball.obj").write_text("\n".join([*lines, *(f"f {a} {b} {c}" for a, b, c in faces)]))
+    read = make_asset(tmp_path / "ball.obj").mesh
+    assert read.source_count == 44
+    given = np.insert(ball.vertices, [3, 3], 0, axis=0)
+    np.testing.assert_allclose(read.in_own_order(given), read.vertices, atol=1e-6)
+
+    ball.export(tmp_path / "ball.stl")
+    read = make_asset(tmp_path / "ball.stl").mesh
+    assert (len(read.vertices), read.source_count) == (42, 240)
+    np.testing.assert_array_equal(read.in_own_order(ball.triangles.reshape(-1, 3).astype(np.float32)), read.vertices)
+
+
+def test_only_files_that_know_their_source_need_a_newer_reader(tmp_path) -> None:
+    asset = made(checkered())
+    write_asset(tmp_path / "with.drgs", asset)
+    write_asset(tmp_path / "without.drgs", replace(asset, mesh=replace(asset.mesh, source=None)))
+    assert [inspect_asset(tmp_path / f"{name}.drgs")["schema"] for name in ("with", "without")] == [2, 1]
+
+
+@pytest.fixture
+def board(tmp_path):
+    """Asset of a checkerboard in a file, and a walk of three frames of the mesh that it was made from."""
+    file = checkered()
+    asset = made(file)
+    write_asset(tmp_path / "board.drgs", asset)
+    walk = np.stack([bent(file.vertices) + np.float32(step) for step in range(3)])
+    return asset, walk
+
+
+@pytest.mark.parametrize("name", ["walk.pc2", "walk.mdd"])
+def test_point_caches_of_the_source_are_written_in_the_order_of_the_asset(tmp_path, board, name: str, capsys) -> None:
+    asset, walk = board
+    write_point_cache(tmp_path / name, iter(walk), 3, 16, 5, 25.0)
+    first = 5 if name.endswith("pc2") else 1
+    command = ["convert", str(tmp_path / "board.drgs"), str(tmp_path / "own.pc2"), "--vertices", str(tmp_path / name)]
+    assert main(command) == 0
+    read = read_point_cache(tmp_path / "own.pc2")
+    assert read.first == first
+    np.testing.assert_array_equal(read.frames, [asset.mesh.in_own_order(pose) for pose in walk])
+    assert main([*command, "--frames", f"{first + 1}-{first + 2}", "--scale", "2"]) == 0
+    read = read_point_cache(tmp_path / "own.pc2")
+    np.testing.assert_array_equal(read.frames, [2 * asset.mesh.in_own_order(pose) for pose in walk[1:]])
+    assert read.first == first + 1
+
+    meshes = ["convert", str(tmp_path / "board.drgs"), str(tmp_path / "m_##.glb"), "--vertices", str(tmp_path / name)]
+    assert main([*meshes, "--frames", str(first)]) == 0
+    np.save(tmp_path / "pose.npy", walk[0])
+    same = tmp_path / "same" / f"m_{first:02}.glb"  # the name is in the file
+    same.parent.mkdir()
+    assert main([*meshes[:2], str(same), "--vertices", str(tmp_path / "pose.npy")]) == 0
+    assert (tmp_path / same.name).read_bytes() == same.read_bytes()
+    assert main(meshes) == 0 and len(list(tmp_path.glob("m_*.glb"))) == 3
+    capsys.readouterr()
+    for bad, problem in (
+        ([*command, "--frames", "1-40"], "wants frame"),
+        ([*command, "--frames", f"{first},{first + 2}"], "skips frames"),
+        ([*command, "--up", "y"], "--up"),
+        ([*meshes[:2], str(tmp_path / "one.glb"), *meshes[3:]], "Say which"),
+        ([*command[:3], "--vertices", str(tmp_path / "pose.npy")], "is written of a point cache"),
+        ([*command[:4], str(tmp_path / "none.pc2")], "does not exist"),
+    ):
+        assert main(bad) == EXIT_USAGE
+        assert problem in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("damage", "problem"),
+    [
+        (lambda data: data[:20], "truncated in its header"),
+        (lambda data: data[:100], "is truncated: 3 frames are announced, 0 are there"),
+        (lambda data: data[:24] + np.float32(2).tobytes() + data[28:], "a sample per 2 frames"),
+        (lambda data: data[:28] + np.int32(-1).tobytes() + data[32:], "says that it has -1 frames"),
+        (lambda data: b"x" * 100, "neither PC2 nor MDD"),
+        (lambda data: data[:16] + np.int32(2**31 - 1).tobytes() + data[20:], "is truncated"),
+    ],
+)
+def test_damaged_point_caches_are_named(tmp_path, board, damage, problem: str, capsys) -> None:
+    _, walk = board
+    path = tmp_path / "walk.pc2"
+    write_point_cache(path, iter(walk), 3, 16, 5, 25.0)
+    path.write_bytes(damage(path.read_bytes()))
+    command = ["convert", str(tmp_path / "board.drgs"), str(tmp_path / "own.pc2"), "--vertices", str(path)]
+    assert main(command) == EXIT_BAD_ASSET
+    error = capsys.readouterr().err
+    assert problem in error and "walk.pc2" in error
+    assert not (tmp_path / "own.pc2").exists()
+
+
+def test_pictures_of_a_point_cache(tmp_path, board) -> None:
+    asset, walk = board
+    write_point_cache(tmp_path / "walk.pc2", iter(walk), 3, 16, 5, 25.0)
+    (tmp_path / "camera.json").write_text(
+        json.dumps({"matrix_world": np.eye(4).tolist(), "width": 4, "height": 4, "fov_x": 30})
+    )
+    asset.environment = Environment(np.ones((4, 8, 3)))
+    write_asset(tmp_path / "board.drgs", asset)
+    command = ["relight", str(tmp_path / "board.drgs"), "--camera", str(tmp_path / "camera.json"), "--samples", "1"]
+    command += ["--vertices", str(tmp_path / "walk.pc2")]
+    assert main([*command, "--frames", "6-7", "--out", str(tmp_path / "f_##.png")]) == 0
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["f_06.png", "f_07.png"]
+    assert main([*command, "--out", str(tmp_path / "one.png")]) == EXIT_USAGE

@@ -23,8 +23,8 @@ from .tensors import decode, dtype_name, encode, parse_json
 Array = np.ndarray
 PathLike = str | os.PathLike[str]
 
-#: Version of the layout. A reader refuses higher ones, because it cannot know what they mean.
-SCHEMA = 1
+#: Newest version of the layout. A reader refuses higher ones, because it cannot know what they mean.
+SCHEMA = 2
 MANIFEST = "manifest.json"
 #: Conventions of all numbers in the file; a file that states others is refused.
 CONVENTIONS = {
@@ -51,10 +51,10 @@ TENSORS: dict[str, dict[str, str]] = {
     },
     "binding.safetensors": {"face": "I32", **dict.fromkeys(("barycentric", "offset", "normal"), "F32")},
     "environment.safetensors": {"radiance": "F32"},
-    "source.safetensors": {"index": "I32", "weights": "F32", "count": "I32"},
+    "source.safetensors": {"index": "I32", "weights": "F32", "count": "I32", "transform": "F32"},
 }
 _REQUIRED = ("surfels.safetensors", "mesh.safetensors")
-_OPTIONAL_TENSORS = {"sh"}
+_OPTIONAL_TENSORS = {"sh", "transform"}
 _RESTORE = "Restore the file from a copy, or import the source files again"
 
 
@@ -85,7 +85,7 @@ def write_asset(path: PathLike, asset: Asset) -> None:
         }
     manifest = {
         "format": "drgs",
-        "schema": SCHEMA,
+        "schema": _schema(members),
         "producer": f"drgs-blender {__version__}",
         **CONVENTIONS,
         "members": members,
@@ -243,7 +243,7 @@ def _manifest(members: Mapping[str, Array], subject: str) -> dict[str, Any]:
             f"has schema {schema}, written by {manifest.get('producer')}; DR-GS {__version__} reads up to {SCHEMA}",
             "Update DR-GS",
         )
-    if schema != SCHEMA or isinstance(schema, bool):
+    if schema not in range(1, SCHEMA + 1) or isinstance(schema, bool):
         raise AssetError(where, f"has the unknown schema {schema!r}", _RESTORE)
     for key, value in CONVENTIONS.items():
         if manifest.get(key) != value:
@@ -256,8 +256,13 @@ def _manifest(members: Mapping[str, Array], subject: str) -> dict[str, Any]:
             raise AssetError(f"{subject}, {name}", "is missing", _RESTORE)
     for name in members:
         if name != MANIFEST and (name not in listed or name not in TENSORS):
-            raise AssetError(f"{subject}, {name}", f"is not a member of schema {SCHEMA}", _RESTORE)
+            raise AssetError(f"{subject}, {name}", f"is not a member of schema {schema}", _RESTORE)
     return manifest
+
+
+def _schema(members: Mapping[str, Any]) -> int:
+    """The lowest schema that has these members, so that older versions read what they know."""
+    return 2 if "source.safetensors" in members else 1
 
 
 def _tensors(
@@ -277,7 +282,7 @@ def _tensors(
     for name, array in tensors.items():
         family = name.split("/", 1)[0] + "/" if "/" in name else name
         if schema.get(family) != dtype_name(array):
-            raise AssetError(f"{where}, {name}", f"with type {array.dtype} is not part of schema {SCHEMA}", _RESTORE)
+            raise AssetError(f"{where}, {name}", f"with type {array.dtype} is not part of the schema", _RESTORE)
     for name in schema:
         if name not in tensors and not name.endswith("/") and name not in _OPTIONAL_TENSORS:
             raise AssetError(f"{where}, {name}", "is missing", _RESTORE)

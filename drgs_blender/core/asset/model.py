@@ -7,7 +7,7 @@ Asset arrays are in **object space**: the space in which the mesh object's verti
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -94,11 +94,14 @@ class SourceVertices:
         Their weights, of sum 1.
     count : (1,) int32 array
         How many vertices the source has.
+    transform : (3, 3) float32 array
+        From the source's axes and unit to the asset's: p = transform @ q.
     """
 
     index: Array
     weights: Array
     count: Array
+    transform: Array = field(default_factory=lambda: np.eye(3, dtype=np.float32))
 
     def __post_init__(self) -> None:
         self.index = np.ascontiguousarray(self.index, dtype=np.int32)
@@ -108,6 +111,22 @@ class SourceVertices:
         if self.count.shape != (1,) or self.count[0] < 0:
             raise AssetError("source vertices", f"have the count {self.count.tolist()}, expected one number")
         self.weights = as_float(self.weights, self.index.shape, "source weights")
+        self.transform = as_float(self.transform, (3, 3), "source transform")
+
+    @classmethod
+    def identity(cls, count: int) -> SourceVertices:
+        """Vertices that are those of the source, in its order."""
+        return cls(np.arange(count)[:, None], np.ones((count, 1)), np.array([count]))
+
+    @property
+    def in_order(self) -> bool:
+        """Whether the vertices are those of the source in its order."""
+        n = len(self.index)
+        return self.index.shape == (n, 1) and bool((self.index[:, 0] == np.arange(n)).all())
+
+    def turned(self, matrix: Array) -> SourceVertices:
+        """The same, of an asset whose vertices were moved by a (3, 3) matrix."""
+        return replace(self, transform=matrix @ self.transform)
 
     def to_asset(self, vertices: Array) -> Array:
         """(n, 3) float32 vertices of the asset for those of the source; exact where a vertex is one of the source.
@@ -115,13 +134,15 @@ class SourceVertices:
         Parameters
         ----------
         vertices : (count, 3) array
-            A pose of the source.
+            A pose of the source, in its axes and unit.
         """
         moved = np.zeros((len(self.index), 3))
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite, the scene counts and names
             for index, weights in zip(self.index.T, self.weights.T, strict=True):
                 used = weights != 0  # what does not count may be infinite
                 moved[used] += weights[used, None] * vertices[index[used]].astype(np.float64)
+            if not np.array_equal(self.transform, np.eye(3)):
+                moved = moved @ self.transform.T.astype(np.float64)
             return moved.astype(np.float32)
 
 
