@@ -17,6 +17,7 @@ from ..formats.files import MeshFile, plain_name
 from ..formats.gltf_nodes import Pose
 from ..formats.mesh import check_extent
 from .refine import MAX_TRIANGLES, TOLERANCE, refine
+from .surface_detail import MAX_SURFELS, CornerFrames, SurfaceDetail
 from .texture import CHANNELS, Materials
 from .topology import Net, weld
 
@@ -35,6 +36,7 @@ def make_asset(
     environment: Environment | str | Path | None = None,
     pose: Pose = "rest",
     scale: float = 1.0,
+    max_surfels: int = MAX_SURFELS,
 ) -> Asset:
     """Make an asset from a mesh with textures: glTF, GLB, OBJ, PLY, DAE and whatever else `formats` reads.
 
@@ -58,6 +60,8 @@ def make_asset(
         Of a skinned glTF file, "rest" as Blender's importer rests it or "default" as viewers show the file.
     scale : float
         Factor on all lengths.
+    max_surfels : int
+        Surfels that pieces of faces cut for detail of textures and normal maps may reach.
 
     Returns
     -------
@@ -66,9 +70,11 @@ def make_asset(
     """
     name = "mesh" if isinstance(source, MeshFile) else str(source)
     file = read_mesh_file(source, pose)
-    mesh, report = mesh_with_materials(file, name, up=up, max_triangles=max_triangles, tolerance=tolerance)
+    mesh, report, detail = detailed_mesh(file, name, up=up, max_triangles=max_triangles, tolerance=tolerance)
     scale_mesh(mesh, scale, name)
-    surfels, binding, report["surfels"] = attach(mesh, pretrained, density=density)
+    surfels, binding, report["surfels"] = attach(
+        mesh, pretrained, density=density, detail=detail if detail.any else None, most=max_surfels
+    )
     provenance = {"mesh": plain_name(name), "made": "surfels attached to the mesh", "report": report}
     return Asset(surfels, mesh, binding, read_environment_of(environment), provenance)
 
@@ -122,12 +128,20 @@ def mesh_with_materials(
         "source_vertices", "source_faces", "not_finite_faces", "degenerate_faces" (removed), "vertices", "faces",
         "rounds" of subdivision, "unresolved_edges" (detail left out by the budget or the finest edge), "notes".
     """
+    return detailed_mesh(file, name, up=up, max_triangles=max_triangles, tolerance=tolerance)[:2]
+
+
+def detailed_mesh(
+    file: MeshFile, name: str, *, up: str | None, max_triangles: int, tolerance: float
+) -> tuple[Mesh, dict[str, Any], SurfaceDetail]:
+    """As `mesh_with_materials`, with what the file shows between the vertices."""
     turned = up if file.up_axis == "unknown" else None
     if turned:
         file = mesh_to_z_up(file, turned)
     report: dict[str, Any] = {"source_vertices": len(file.vertices), "source_faces": len(file.faces)}
     report["notes"] = list(file.notes)
-    net, (source, corners) = _net(file, name, report)
+    net, (source, corners), frames = _net(file, name, report)
+    faces = len(net.faces)
     materials = Materials(file.materials, coloured=file.vertex_colours is not None)
     net, values, report["rounds"], report["unresolved_edges"] = refine(net, materials, tolerance, max_triangles)
     report["vertices"], report["faces"] = len(net.vertices), len(net.faces)
@@ -138,10 +152,10 @@ def mesh_with_materials(
     if turned not in (None, "z"):
         mesh.source = (mesh.source or SourceVertices.identity(count)).turned(UP_AXES[turned])
     log.info("mesh of %s: %s", name, report)
-    return mesh, report
+    return mesh, report, SurfaceDetail(net, materials, frames, len(net.faces) > faces)
 
 
-def _net(file: MeshFile, name: str, report: dict[str, Any]) -> tuple[Net, tuple[Array, Array]]:
+def _net(file: MeshFile, name: str, report: dict[str, Any]) -> tuple[Net, tuple[Array, Array], CornerFrames]:
     """Proper faces of the file, welded, with tags (material, part, number).
 
     Returns
@@ -149,6 +163,8 @@ def _net(file: MeshFile, name: str, report: dict[str, Any]) -> tuple[Net, tuple[
     net : Net
     source, corners : array
         The vertex (n,) of `file` of each vertex of `net`, and those (f, 3) at the corners of the numbered faces.
+    frames : CornerFrames
+        At these corners.
     """
     m = len(file.faces)
     if not m:
@@ -184,6 +200,7 @@ def _net(file: MeshFile, name: str, report: dict[str, Any]) -> tuple[Net, tuple[
         np.stack([material, part[proper], np.arange(len(faces))], -1),
         np.broadcast_to(np.eye(3, dtype=np.float32), (len(faces), 3, 3)),
     )  # fmt: skip
+    frames = CornerFrames.of(net.vertices, welded, net.uvs, normals)
     # Welding may collapse faces that were thinner than its grid.
     keep = ~Faces.of(net.vertices, net.faces).degenerate
     net.faces, net.uvs, net.tags, net.inside = net.faces[keep], net.uvs[keep], net.tags[keep], net.inside[keep]
@@ -191,7 +208,7 @@ def _net(file: MeshFile, name: str, report: dict[str, Any]) -> tuple[Net, tuple[
     report["degenerate_faces"] = removed = int((finite & ~proper).sum() + (~keep).sum())
     if removed:
         report["notes"].append(f"{removed} faces without area removed")
-    return net, (source, source[welded])
+    return net, (source, source[welded]), frames
 
 
 def _source(net: Net, source: Array, corners: Array, count: int) -> SourceVertices | None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .texture import CHANNELS, Materials
+from .texture import CHANNELS, Materials, perceived
 from .topology import Net, close_marks, edge_lengths, edges, subdivide, survivors
 
 Array = np.ndarray
@@ -183,7 +183,7 @@ class _Comparison:
 
     def __init__(self, net: Net, materials: Materials, values: Array) -> None:
         self._net, self._materials = net, materials
-        self._values = _perceived(values.T).astype(np.float64)
+        self._values = perceived(values.T).astype(np.float64)
         colours = net.values[:, :3].T
         self._colours = None if (colours == 1).all() else np.where(np.isfinite(colours), colours, 1)
         self._given = np.isfinite(net.values.T)  # channels the file gives at its vertices have no textures
@@ -234,7 +234,7 @@ class _Comparison:
         if self._colours is not None:
             texture[:3] *= _mean(weights, [self._colours.take(vertex, axis=1) for vertex in vertices])
         values = _mean(weights, [self._values.take(vertex, axis=1) for vertex in vertices])
-        difference = np.abs(_perceived(texture) - values)
+        difference = np.abs(perceived(texture) - values)
         for channel, given in zip(difference, self._given):
             if given.any():
                 channel[given[vertices[0]]] = 0
@@ -247,10 +247,3 @@ def _mean(weights: Sequence[float], values: Sequence[Array]) -> Array:
     for weight, value in zip(weights[1:], values[1:], strict=True):
         total += weight * value
     return total
-
-
-def _perceived(values: Array) -> Array:
-    """Values (CHANNELS, n) with the square root of albedo, in which equal steps look about equal."""
-    result = values.copy()
-    result[:3] = np.sqrt(np.maximum(values[:3], 0))
-    return result

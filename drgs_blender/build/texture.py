@@ -158,6 +158,7 @@ class Materials:
         plain = MaterialFile("", base_colour=(1.0, 1.0, 1.0)) if coloured else MaterialFile("")
         self._materials = [*materials, plain]  # index -1 finds the last
         self.textured = np.array([bool(self._images(m)) for m in self._materials])
+        self.bumpy = np.array([m.normal_image is not None for m in self._materials])
 
     def sample(self, material: Array, uvs: Array, scale: Array) -> Array:
         """Values (n, CHANNELS) of points, channel by channel in memory.
@@ -193,11 +194,41 @@ class Materials:
             values[columns] *= pyramid.look_up(taps[pyramid.layout], channels)
         return values
 
-    def texel_size(self) -> Array:
-        """Smallest texel of each material in texture coordinates, (materials + 1,); 1 where it has no texture."""
+    def normals(self, material: Array, uvs: Array, scale: Array) -> Array | None:
+        """Normals (n, 3) of the maps in tangent space, of length 1 at most; None where no material has any.
+
+        Parameters are those of `sample`.
+        """
+        if not self.bumpy[np.unique(material)].any():
+            return None
+        result = np.zeros((3, len(material)))
+        result[2] = 1
+        for index in np.unique(material):
+            m = self._materials[index]
+            if m.normal_image is None:
+                continue
+            rows = np.flatnonzero(material == index)
+            pyramid = self._pyramid(m.normal_image)
+            footprint = np.abs(scale[rows]) * pyramid.levels[0].shape[1::-1] * _zoom(m.normal_image)
+            texels = pyramid.texels(uvs[rows].astype(np.float64))
+            found = 2.0 * pyramid.look_up(pyramid.taps(texels, footprint.max(axis=1))) - 1
+            found[:2] *= m.normal_strength
+            found[2] = 1 + (found[2] - 1) * min(max(m.normal_strength, 0), 1)
+            result[:, rows] = found
+        return result.T
+
+    def texel_size(self, bumps: bool = False) -> Array:
+        """Smallest texel of each material in texture coordinates, (materials + 1,); 1 where it has no texture.
+
+        Parameters
+        ----------
+        bumps : bool
+            Normal maps count, too.
+        """
         sizes = np.ones(len(self._materials))
         for k, m in enumerate(self._materials):
-            for image, _, _ in self._images(m):
+            maps = [m.normal_image] if bumps and m.normal_image is not None else []
+            for image in [*maps, *(image for image, _, _ in self._images(m))]:
                 sizes[k] = min(sizes[k], 1 / (max(image.pixels.shape[:2]) * _zoom(image).max()))
         return sizes
 
@@ -251,3 +282,10 @@ def _wrap(index: Array, size: Array, mode: str) -> Array:
     else:
         index[outside] = np.mod(out, size)
     return index
+
+
+def perceived(values: Array) -> Array:
+    """Values (CHANNELS, n) with the square root of albedo, in which equal steps look about equal."""
+    result = values.copy()
+    result[:3] = np.sqrt(np.maximum(values[:3], 0))
+    return result

@@ -46,6 +46,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="budget when the mesh is divided for texture detail",
     )
     parser.add_argument(
+        "--max-surfels",
+        type=int_range(1, 10**7),
+        metavar="N",
+        help="budget when faces get smaller surfels for textures and normal maps; default 400000",
+    )
+    parser.add_argument(
         "--density", type=int_range(1, 100_000), metavar="D", help="surfels along the mesh's diagonal, at least"
     )
 
@@ -57,7 +63,8 @@ def run(args: argparse.Namespace) -> int:
 
     from ..build.make import make_asset
 
-    given = {name: value for name in ("max_triangles", "density") if (value := getattr(args, name)) is not None}
+    budgets = ("max_triangles", "max_surfels", "density")
+    given = {name: value for name in budgets if (value := getattr(args, name)) is not None}
     with clock(args, "making the asset"):
         asset = make_asset(args.mesh, up=args.up, environment=args.env, pose=args.pose, scale=args.scale, **given)
     write_and_report(args.out, asset)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -38,6 +38,8 @@ OPAQUE = 0.99
 UNSEEN = 0.1
 #: Most surfels that `density` may ask for.
 MOST = 2_000_000
+#: Pieces are not cut for detail below this part of the mesh's diagonal.
+FINEST = 1 / 2000
 
 
 @dataclass(slots=True)
@@ -46,6 +48,19 @@ class _Patches:
 
     face: Array
     weights: Array
+
+
+class Detail(Protocol):
+    """What is known of a surface between the vertices of its mesh.
+
+    Pieces are (n, 3, 3) barycentric coordinates of the corners of pieces of faces (n,).
+    """
+
+    def hidden_by(self, face: Array, pieces: Array) -> Array:
+        """(n,) how much a surfel for each piece would hide; 0 where it shows all."""
+
+    def give(self, mesh: Mesh, surfels: Surfels, binding: Binding, pieces: Array) -> None:
+        """Give the surfels of pieces, one each, what is known at their places."""
 
 
 def attach(
@@ -57,6 +72,8 @@ def attach(
     density: float = 140.0,
     spread: float = SPREAD,
     opacity: float = OPAQUE,
+    detail: Detail | None = None,
+    most: int = MOST,
 ) -> tuple[Surfels, Binding, dict[str, Any]]:
     """Make surfels on the faces of a mesh (Algorithm 1 of the paper).
 
@@ -76,6 +93,10 @@ def attach(
         Factor on fitted standard deviations.
     opacity : float
         Where no pretrained surfels are given.
+    detail : Detail, optional
+        Of the surface: pieces are cut where it wants them smaller, and surfels take from it what they show.
+    most : int
+        Surfels that pieces cut for `detail` may reach.
 
     Returns
     -------
@@ -83,7 +104,9 @@ def attach(
         Materials are those of the mesh at the surfel's centre; the shading normal is the smooth one.
     binding : Binding
     report : dict
-        "surfels", "faces", "cut_faces", "degenerate_faces" (they get no surfel); with `pretrained` also "pretrained",
+        "surfels", "faces", "cut_faces", "degenerate_faces" (they get no surfel); with `detail` "hidden_pieces" (which
+        show less than it knows, for want of surfels; -1: `density` alone asks for more than `most`); with `pretrained`
+        also "pretrained",
         "interior", "on_edges" (projected to an edge or vertex and not used), "faces_with_pretrained",
         "faces_from_neighbours", "faces_unseen".
     """
@@ -97,7 +120,10 @@ def attach(
     if scale == "fitted":
         used = np.unique(mesh.faces[proper])
         extent = mesh.vertices[used].max(axis=0) - mesh.vertices[used].min(axis=0)
-        patches = cut(patches, faces, float(np.linalg.norm(extent)) / density)
+        diagonal = float(np.linalg.norm(extent))
+        patches = cut(patches, faces, diagonal / density)
+        if detail is not None:
+            patches, report["hidden_pieces"] = cut_for_detail(patches, faces, detail, most, FINEST * diagonal)
     n = len(patches.face)
     report["surfels"] = n
     report["cut_faces"] = int((np.bincount(patches.face) > 1).sum())
@@ -131,6 +157,8 @@ def attach(
     binding = Binding(
         face=patches.face, barycentric=weights, offset=np.zeros(n), normal=np.tile([0.0, 0.0, 1.0], (n, 1))
     )
+    if detail is not None:
+        detail.give(mesh, surfels, binding, patches.weights)
     log.info("attached %d surfels to %d faces", n, len(proper))
     return surfels, binding, report
 
@@ -143,25 +171,68 @@ def cut(patches: _Patches, faces: Faces, longest: float) -> _Patches:
     while len(face):
         corners = product(weights, faces.corners[face])
         edges = lengths(corners[:, [1, 2, 0]] - corners)
-        start = edges.argmax(axis=1)  # the edge from corner `start` to the next one
         split = edges.max(axis=1) > longest
         done_face.append(face[~split])
         done_weights.append(weights[~split])
         total += int((~split).sum())
-        face, weights, start = face[split], weights[split], start[split]
+        face, weights = face[split], weights[split]
         if total + 2 * len(face) > MOST:
             log.warning("surfel density lowered: more than %d surfels would be needed", MOST)
             done_face.append(face)
             done_weights.append(weights)
             break
-        row = np.arange(len(face))
-        a, b, c = (weights[row, (start + k) % 3] for k in range(3))
-        middle = 0.5 * (a + b)
-        face = np.concatenate([face, face])
-        weights = np.concatenate([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
+        face, weights = _bisected(face, weights, faces)
     face, weights = np.concatenate(done_face), np.concatenate(done_weights)
     order = np.argsort(face, kind="stable")
     return _Patches(face[order], weights[order])
+
+
+def cut_for_detail(patches: _Patches, faces: Faces, detail: Detail, most: int, finest: float) -> tuple[_Patches, int]:
+    """Bisect the longest edge of patches that hide detail, those that hide most first, and what comes of them.
+
+    Parameters
+    ----------
+    most : int
+        Patches in the end, at most.
+    finest : float
+        Metres: patches without a longer edge are left as they are.
+
+    Returns
+    -------
+    patches : _Patches
+    left : int
+        Patches that still hide some; -1 where there were too many to begin with.
+    """
+    face, weights = patches.face, patches.weights
+    if len(face) >= most:
+        return patches, -1
+    hidden = detail.hidden_by(face, weights)
+    while True:
+        longest = lengths(np.roll(corners := product(weights, faces.corners[face]), -1, axis=1) - corners).max(axis=1)
+        wanted = np.flatnonzero((hidden > 0) & (longest > finest))
+        room = most - len(face)
+        if not len(wanted) or room <= 0:
+            return _Patches(face, weights), int((hidden > 0).sum())
+        wanted = wanted[np.argsort(-hidden[wanted], kind="stable")[:room]]
+        split = np.zeros(len(face), bool)
+        split[wanted] = True
+        new_face, new_weights = _bisected(face[split], weights[split], faces)
+        found = detail.hidden_by(new_face, new_weights)
+        face, weights = np.concatenate([face[~split], new_face]), np.concatenate([weights[~split], new_weights])
+        hidden = np.concatenate([hidden[~split], found])
+        order = np.argsort(face, kind="stable")
+        face, weights, hidden = face[order], weights[order], hidden[order]
+
+
+def _bisected(face: Array, weights: Array, faces: Faces) -> tuple[Array, Array]:
+    """Both halves of patches, the longest edge of each cut at its middle."""
+    corners = product(weights, faces.corners[face])
+    start = lengths(np.roll(corners, -1, axis=1) - corners).argmax(axis=1)  # the edge from corner `start` to the next
+    row = np.arange(len(face))
+    a, b, c = (weights[row, (start + k) % 3] for k in range(3))
+    middle = 0.5 * (a + b)
+    halves = np.concatenate([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
+    return np.concatenate([face, face]), halves
 
 
 def _face_frames(corners: Array, normal: Array) -> Array:

@@ -80,6 +80,10 @@ class MaterialFile:
         RGB(A); multiplies base_colour.
     metallic_roughness_image : Image, optional
         G is roughness, B is metallic (glTF); multiplies the factors; never sRGB.
+    normal_image : Image, optional
+        Normals in tangent space (MikkTSpace), 2 * RGB - 1, green upwards; never sRGB.
+    normal_strength : float
+        Of the normal map, as of Blender's node.
     """
 
     name: str
@@ -88,6 +92,8 @@ class MaterialFile:
     metallic: float = 0.0
     base_colour_image: Image | None = None
     metallic_roughness_image: Image | None = None
+    normal_image: Image | None = None
+    normal_strength: float = 1.0
 
 
 @dataclass(slots=True)

@@ -226,6 +226,7 @@ class _Materials:
         self.used: list[MaterialFile] = []
         self._known: dict[int | None, tuple[int, int]] = {}
         self._pixels: dict[int, Array | None] = {}
+        self._normal_set = 0  # UV set of the normal map that was read last
 
     def use(self, index: int | None) -> tuple[int, int]:
         """(number in `used`, UV set) of the glTF material `index`; None is glTF's default material."""
@@ -258,12 +259,26 @@ class _Materials:
             self.notes.append(f"{material.name}: emission ignored")
         if get(entry, "alphaMode", str, "OPAQUE") != "OPAQUE":
             self.notes.append(f"{material.name}: alpha ignored, the surface is opaque")
-        if get(entry, "normalTexture", dict):
-            self.notes.append(f"{material.name}: normal map ignored")
+        self._normal_map(entry, material, (colour_set if material.base_colour_image else other_set))
         for name in extensions:
             if name.startswith("KHR_materials_"):
                 self.notes.append(f"{material.name}: {name} ignored")
-        return colour_set if material.base_colour_image else other_set
+        if material.base_colour_image or material.metallic_roughness_image or material.normal_image is None:
+            return colour_set if material.base_colour_image else other_set
+        return self._normal_set
+
+    def _normal_map(self, entry: dict[str, Any], material: MaterialFile, uv_set: int) -> None:
+        """Read the normal map; it is left out, with a note, where it has another UV set than other textures."""
+        info = self.document.get(entry, "normalTexture", dict)
+        if info is None:
+            return
+        image, self._normal_set = self._texture(entry, "normalTexture", srgb=False)
+        others = material.base_colour_image or material.metallic_roughness_image
+        if image is not None and others and self._normal_set != uv_set:
+            self.notes.append(f"{material.name}: normal map ignored: its UV map is not that of the other textures")
+        elif image is not None:
+            material.normal_image = image
+            material.normal_strength = float(self.document.numbers(info, "scale", (1.0,))[0])
 
     def _specular_glossiness(self, material: MaterialFile, pbr: dict[str, Any]) -> int:
         """Approximate a specular-glossiness material: what is specular beyond a dielectric's 4 % is metal."""

@@ -179,11 +179,26 @@ def _read_mtl(path: Path, notes: list[str]) -> dict[str, MaterialFile]:
                 current.base_colour_image = _image(line, path, notes)
                 if current.base_colour_image is not None:
                     current.base_colour = (1.0, 1.0, 1.0)
+            elif keyword in ("norm", "map_bump", "bump"):
+                _read_normal_map(current, line, path, notes)
             elif keyword in ("map_pr", "map_pm", "map_ns"):
                 notes.append(f"{current.name}: {keyword} ignored")
         except ValueError:
             notes.append(f"{path.name}: line {line.strip()[:60]!r} not understood")
     return materials
+
+
+def _read_normal_map(material: MaterialFile, line: str, path: Path, notes: list[str]) -> None:
+    """A normal map, as Blender reads these statements; heights, which are grey, are left out with a note."""
+    image = _image(line, path, notes)
+    if image is None:
+        return
+    if image.pixels.ndim == 2 or image.pixels.shape[2] < 3 or np.ptp(image.pixels[..., :3], axis=2).max() == 0:
+        notes.append(f"{material.name}: heights of {line.split()[0]} ignored: only normal maps are read")
+        return
+    words = line.split()
+    material.normal_image = Image(image.pixels, srgb=False)
+    material.normal_strength = float(words[words.index("-bm") + 1]) if "-bm" in words[:-1] else 1.0
 
 
 def _image(line: str, path: Path, notes: list[str]) -> Image | None:

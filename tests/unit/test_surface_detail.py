@@ -1,0 +1,156 @@
+"""Surfels show what a file's textures, normals and normal maps have between the vertices of the asset's mesh."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from test_build_make import plane, ramp
+
+from drgs_blender.build.make import make_asset
+from drgs_blender.build.surface_detail import CornerFrames
+from drgs_blender.core.asset.model import Asset
+from drgs_blender.deform.face_frames import Faces, shading_frames
+from drgs_blender.formats.files import Image, MaterialFile, MeshFile
+
+
+def shading_normals(asset: Asset) -> np.ndarray:
+    """(n, 3) normals with which surfels are shaded at rest, object space."""
+    mesh, binding = asset.mesh, asset.binding
+    faces = Faces.of(mesh.vertices, mesh.faces)
+    frames = shading_frames(faces, mesh.faces, mesh.vertices, binding.face, binding.barycentric.astype(np.float64))
+    return np.einsum("nij,nj->ni", frames, binding.normal)
+
+
+def flat_map(normal: tuple[float, float, float], size: int = 8) -> Image:
+    """A normal map of one normal in tangent space."""
+    pixels = np.tile(0.5 + 0.5 * np.float32(normal) / np.linalg.norm(normal), (size, size, 1))
+    return Image(pixels.astype(np.float32), srgb=False)
+
+
+def bumped(normal: tuple[float, float, float], uvs=None, strength: float = 1.0) -> MeshFile:
+    """A unit square in the XY plane with a normal map of one normal."""
+    file = plane(3)
+    file.materials = [MaterialFile("bumps", normal_image=flat_map(normal), normal_strength=strength)]
+    return file if uvs is None else replace(file, corner_uvs=np.float32(uvs(file.corner_uvs)))
+
+
+@pytest.mark.parametrize(
+    ("uvs", "turn"),
+    [
+        (lambda uv: uv, np.eye(3)),
+        (lambda uv: 3 * uv + 0.4, np.eye(3)),
+        (lambda uv: np.stack([uv[..., 1], -uv[..., 0]], -1), np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])),
+        (lambda uv: uv * np.float32((-1, 1)), np.diag((-1, 1, 1))),  # mirrored
+        (lambda uv: uv * np.float32((1, -1)), np.diag((1, -1, 1))),
+    ],
+)
+def test_normal_maps_turn_with_their_texture_coordinates(uvs, turn: np.ndarray) -> None:
+    """The first axis of the map is where u grows, the second where v does."""
+    normal = np.array((0.5, 0.2, 0.8))
+    asset = make_asset(bumped(tuple(normal), uvs))
+    expected = np.tile(turn @ normal / np.linalg.norm(normal), (len(asset.surfels), 1))
+    np.testing.assert_allclose(shading_normals(asset), expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.5, 1.0, 2.0])
+def test_strength_is_that_of_blenders_node(strength: float) -> None:
+    """x and y grow with it, z is mixed with 1 up to a strength of 1."""
+    normal = np.array((0.5, 0.0, 0.8))
+    normal /= np.linalg.norm(normal)
+    z = 1 + (normal[2] - 1) * min(strength, 1)
+    found = shading_normals(make_asset(bumped((0.5, 0.0, 0.8), strength=strength)))
+    np.testing.assert_allclose(found[:, 0] / found[:, 2], strength * normal[0] / z, rtol=5e-3, atol=2e-3)
+
+
+def ball(subdivisions: int, image: Image | None = None) -> MeshFile:
+    """A sphere with latitude and longitude as texture coordinates."""
+    mesh = trimesh.creation.icosphere(subdivisions)
+    v = mesh.vertices[mesh.faces]
+    uvs = np.stack([0.5 + np.arctan2(v[..., 1], v[..., 0]) / (2 * np.pi), 0.5 + np.arcsin(v[..., 2]) / np.pi], -1)
+    return MeshFile(
+        mesh.vertices, mesh.faces, corner_uvs=uvs, materials=[MaterialFile("paint", base_colour_image=image)]
+    )
+
+
+def checker(size: int = 256, cells: int = 32) -> Image:
+    pixels = (np.indices((size, size)) // (size // cells)).sum(axis=0) % 2 * 0.6 + 0.2
+    return Image(np.repeat(pixels[..., None], 3, axis=2).astype(np.float32), srgb=False)
+
+
+def test_a_divided_ball_is_shaded_as_smoothly_as_its_file() -> None:
+    """Divided faces stay flat; by their own normals the ball would show its 320 faces."""
+    asset = make_asset(ball(2, checker()))
+    assert len(asset.mesh.faces) > 2000
+    radial = asset.surfels.centre / np.linalg.norm(asset.surfels.centre, axis=1, keepdims=True)
+    error = np.degrees(np.arccos(np.clip((shading_normals(asset) * radial).sum(1), -1, 1)))
+    flat = Faces.of(asset.mesh.vertices, asset.mesh.faces).normal[asset.binding.face]
+    of_faces = np.degrees(np.arccos(np.clip((flat * radial).sum(1), -1, 1)))
+    assert np.percentile(error, 99) < 0.9 and np.median(error) < 0.3
+    assert np.percentile(of_faces, 99) > 6
+
+
+def test_normals_of_the_file_shade_a_mesh_that_is_divided() -> None:
+    """Corner normals that lean, as those of a bevel do."""
+    file = plane(2, ramp())
+    lean = np.array((0.3, 0.0, 1.0)) / np.hypot(0.3, 1.0)
+    file = replace(file, corner_normals=np.tile(lean.astype(np.float32), (8, 3, 1)))
+    asset = make_asset(file)
+    assert len(asset.mesh.faces) > 8
+    np.testing.assert_allclose(shading_normals(asset), np.tile(lean, (len(asset.surfels), 1)), atol=2e-3)
+
+
+def test_surfels_show_textures_that_the_mesh_has_no_vertices_for() -> None:
+    """More surfels, less error; none where nothing is hidden, and never more than the budget."""
+    file = plane(2, checker(240, 15))  # its edges are not those of halved triangles
+
+    def error_of(asset: Asset) -> float:
+        x, y = asset.surfels.centre[:, :2].T
+        cell = (np.floor(x * 15) + np.floor((1 - y) * 15)) % 2 * 0.6 + 0.2
+        size = np.linalg.norm(asset.surfels.scale, axis=1)
+        return float((np.abs(asset.surfels.albedo[:, 0] - cell) * size**2).sum() / (size**2).sum())
+
+    coarse, fine = (make_asset(file, max_triangles=8, density=10, max_surfels=most) for most in (300, 20_000))
+    assert len(coarse.surfels) == 300 and 2000 < len(fine.surfels) <= 20_000
+    assert error_of(fine) < 0.35 * error_of(coarse)
+    assert coarse.provenance["report"]["surfels"]["hidden_pieces"] > 100
+    plain = make_asset(plane(2), max_triangles=8, density=10, max_surfels=20_000)
+    assert len(plain.surfels) == 256 and "hidden_pieces" not in plain.provenance["report"]["surfels"]
+
+
+def test_vertex_colours_multiply_and_given_roughness_replaces() -> None:
+    file = plane(2, ramp())
+    colours = np.full((9, 3), 0.5, np.float32)
+    file = replace(file, vertex_colours=colours, vertex_roughness=np.linspace(0.2, 0.8, 9, dtype=np.float32))
+    asset = make_asset(file)
+    x, y = asset.surfels.centre[:, :2].T
+    inner = (np.abs(asset.surfels.centre[:, :2] - 0.5) < 0.4).all(axis=1)
+    np.testing.assert_allclose(asset.surfels.albedo[inner, 0], 0.5 * x[inner], atol=5e-3)
+    np.testing.assert_allclose(asset.surfels.roughness, 0.2 + 0.15 * x + 0.45 * y, atol=1e-3)
+
+
+def test_tangents_are_shared_across_faces_but_not_across_mirrored_ones() -> None:
+    """Two quads bent like a book: one frame along the fold, two where the texture is mirrored there."""
+    vertices = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0.5], [1, 1, 0.5], [-1, 0, 0.5], [-1, 1, 0.5]], float)
+    faces = np.array([[0, 2, 3], [0, 3, 1], [4, 0, 1], [4, 1, 5]])
+    flat = vertices[:, :2]
+    for mirrored in (False, True):
+        uvs = flat[faces].copy()
+        if mirrored:
+            uvs[2:, :, 0] *= -1
+        frames = CornerFrames.of(vertices, faces, uvs, None)
+        right, left = frames.tangent[0, 0], frames.tangent[2, 1]  # both at vertex 0
+        assert frames.side.tolist() == [1, 1, 1 - 2 * mirrored, 1 - 2 * mirrored]
+        assert np.allclose(right, left, atol=1e-6) is not mirrored
+        np.testing.assert_allclose((frames.tangent * frames.normal).sum(-1), 0, atol=1e-6)
+
+
+def test_bad_texture_coordinates_do_no_harm() -> None:
+    """All at one place, or not finite."""
+    for uvs in (lambda uv: np.zeros_like(uv), lambda uv: np.full_like(uv, np.nan), lambda uv: uv * 1e8):
+        asset = make_asset(bumped((0.5, 0.2, 0.8), uvs))
+        found = shading_normals(asset)
+        np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-3)
+        assert (found[:, 2] > 0).all()
