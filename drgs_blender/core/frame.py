@@ -129,6 +129,9 @@ class ObjectState:
         times as long, span a tear and are left out with their surfels; 0: none.
     grain : float
         How much surfels that are stretched are grains instead, see `deform.granular`; 0: not at all.
+    captured_colours : bool
+        Whether the camera sees it unlit, in the view-dependent colours of its capture, instead of its materials. Only
+        surfels have them, see ``Surfels.sh``.
     """
 
     name: str
@@ -144,6 +147,7 @@ class ObjectState:
     adjustment: Adjustment | None = None
     tear: float = 0.0
     grain: float = 0.0
+    captured_colours: bool = False
 
 
 @dataclass(slots=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from ..ipc.protocol import Passes
 from ..render.backend import CPU, RenderBackend
 from ..render.pipeline import Progress
 from ..render.prepared_scene import PreparedScene
-from ..render.progressive import Progressive, coarse, thinned
+from ..render.progressive import Progressive, coarse, thinned_scene
 
 IsCancelled = Callable[[], bool]
 #: Makes a whole picture of a frame, and reports progress.
@@ -124,6 +123,6 @@ class View:
                 projected = time.perf_counter()
 
         pixels = frame.camera.width * frame.camera.height
-        passes = draw(frame, replace(prepared, surfels=thinned(prepared.surfels, pixels)), watch)
+        passes = draw(frame, thinned_scene(prepared, pixels), watch)
         self._pace.note(pixels, time.perf_counter() - projected)
         return passes

@@ -26,7 +26,9 @@ from ..render.lights.light_sampler import Lights
 from ..render.lights.mesh_lights import Emitters
 from ..render.scene.ray_masks import group_mask
 from ..render.scene.trace_scene import TraceObject, TraceScene
+from ..render.surfels.captured import CapturedObject
 from ..render.surfels.surfel_bvh import SurfelBVH
+from .captured_objects import Glow, captured_faults, captured_object, glow_of, glowing_mesh, shows_captured
 from .scene_objects import in_asset_order, join, material_faults, moved_vertices, posed_surfels, traced_object
 
 #: Surfels a vertex up to which a mesh is taken for as detailed as a coarse picture.
@@ -40,6 +42,7 @@ class _Loaded:
     asset: Asset
     stamp: tuple[int, int, int]
     driven: MeshDriven | None = None
+    glow: Glow | None = None
 
     def surfels_of(self, state: ObjectState) -> MeshDriven | Surfels:
         """The deformation of the asset's surfels, made when an object first needs it; the surfels without a mesh."""
@@ -53,10 +56,19 @@ class _Loaded:
             self.driven = MeshDriven(asset.mesh, asset.surfels, asset.binding)
         return self.driven
 
+    def glow_of(self, key: str) -> Glow:
+        """What its faces emit in captured colours, made when an object first needs it."""
+        if self.glow is None:
+            self.glow = glow_of(self.asset, key)
+        return self.glow
+
 
 @dataclass(slots=True)
 class CachedObject:
-    """An object as it was in the last frame, and what was made of it."""
+    """An object as it was in the last frame, and what was made of it.
+
+    One that is shown in captured colours is `captured` for the camera, and for rays `glowing`.
+    """
 
     state: ObjectState
     loaded: _Loaded
@@ -64,6 +76,9 @@ class CachedObject:
     posed: PosedSurfels | None = None
     hidden_count: int = 0
     faults: list[str] = field(default_factory=list)
+    mode: tuple[bool, bool] = (False, False)
+    captured: CapturedObject | None = None
+    glowing: MeshState | None = None
 
 
 class SceneCache:
@@ -87,6 +102,8 @@ class SceneCache:
         Of the last frame.
     lights : Lights
         Of the last frame.
+    captured : tuple of CapturedObject
+        Objects of the last frame that the camera sees in captured colours.
     """
 
     def __init__(self) -> None:
@@ -101,6 +118,7 @@ class SceneCache:
         self.world: World | None = None
         self.environment: EnvironmentLight | None = None
         self.lights = Lights([])
+        self.captured: tuple[CapturedObject, ...] = ()
         self._emitters = Emitters()
         self._deformer: Deformer | None = None
 
@@ -139,7 +157,10 @@ class SceneCache:
         """Whether the meshes of all objects are detailed enough to stand for their surfels in coarse pictures."""
         if frame.settings.rays_see != "mesh":
             return False
-        assets = [self._assets[state.asset].asset for state in frame.objects if state.asset in self._assets]
+        known = [state for state in frame.objects if state.asset in self._assets]
+        assets = [self._assets[state.asset].asset for state in known]
+        if any(shows_captured(state, asset, frame.settings) for state, asset in zip(known, assets, strict=True)):
+            return False
         return all(len(a.surfels) <= _SURFELS_A_VERTEX * len(a.mesh.vertices) for a in assets)
 
     def snapshot(self, frame: Frame) -> Frame:
@@ -160,32 +181,42 @@ class SceneCache:
                     f"its asset {state.asset} is not loaded",
                     "Link the object to its file again",
                 )
-            _check_surface(state, loaded.asset, frame.settings)
+            shown = shows_captured(state, loaded.asset, frame.settings)
+            _check_surface(state, loaded.asset, frame.settings, shown)
             state = in_asset_order(state, loaded.asset)
             known = self.objects[index] if index < len(self.objects) else None
             kept = reuse_equal(state, None if known is None else known.state)
-            if known is not None and known.loaded is loaded and known.state is kept and known.traced.seen_only == met:
+            mode = met, shown
+            if known is not None and known.loaded is loaded and known.state is kept and known.mode == mode:
                 item = known
             else:
-                item = CachedObject(kept, loaded, traced_object(kept, loaded.asset, met), faults=material_faults(kept))
+                item = _begun(kept, loaded, mode)
+                item.faults += captured_faults(kept, loaded.asset, frame.settings)
             if (seen or met) and item.posed is None:
                 given = item.state, index, loaded.surfels_of(item.state), item.traced
                 item.posed, item.hidden_count = posed_surfels(*given, self._poser(backend))
+            if shown and item.captured is None and item.posed is not None:
+                item.captured = captured_object(item.state, loaded.asset, item.posed)
             objects.append(item)
         meshes, images = reuse_equal(frame.meshes, self.meshes), reuse_equal(frame.images, self.images)
         same = len(objects) == len(self.objects) and all(a is b for a, b in zip(objects, self.objects))
         if not (self._current and same and meshes is self.meshes and images is self.images):
             self._current = False  # an update that fails half way leaves nothing to be taken for current
-            self.scene.update([item.traced for item in objects], meshes, images)
+            glowing = [item for item in objects if item.glowing is not None]
+            glows = {item.state.asset: item.loaded.glow_of(item.state.asset).image for item in glowing}
+            others = [*meshes, *(item.glowing for item in glowing if item.glowing is not None)]
+            self.scene.update([item.traced for item in objects], others, [*images, *glows.values()])
             self._current = True
         self.objects, self.meshes, self.images = objects, meshes, images
         used = {state.asset for state in frame.objects}
         for key, loaded in self._assets.items():
             if key not in used:
-                loaded.driven = None
+                loaded.driven = loaded.glow = None
         self._update_surfel_bvh(objects if met else None)
-        shown = [item for item in objects if item.state.visibility.camera] if seen else []
-        return self._joined([item.posed for item in shown if item.posed is not None], backend)
+        visible = [item for item in objects if item.state.visibility.camera] if seen else []
+        self.captured = tuple(item.captured for item in visible if item.captured is not None)
+        lit = [item.posed for item in visible if item.posed is not None and item.captured is None]
+        return self._joined(lit, backend)
 
     def _poser(self, backend: RenderBackend) -> Callable[..., PosedSurfels]:
         """Who poses surfels: `MeshDriven.pose`, or a device as long as it can."""
@@ -239,7 +270,8 @@ class SceneCache:
             None if pose is None else moved_vertices(item.state, item.loaded.asset, pose)
             for pose, item in zip(step.objects, self.objects)
         ]
-        vertices, instances = self.scene.at(moved, step.meshes)
+        glowing = sum(item.glowing is not None for item in self.objects)
+        vertices, instances = self.scene.at(moved, [*step.meshes, *[None] * glowing])
         return SceneState(vertices, instances, camera_parameters(step.camera, frame.settings, frame.noise_index))
 
     def warnings(self) -> list[str]:
@@ -248,7 +280,7 @@ class SceneCache:
         if not self.objects and not self.meshes:
             found.append("the frame has no DR-GS object; the picture shows the world alone")
         hidden_counts = [item.hidden_count for item in self.objects] + [0] * len(self.meshes)
-        for hidden, fault in zip(hidden_counts, self.scene.faults, strict=True):
+        for hidden, fault in zip(hidden_counts, self.scene.faults):  # behind these are those that glow, once more
             if fault.bad_vertices:
                 surfels = f" and {hidden} surfels" if hidden else ""
                 found.append(
@@ -296,10 +328,20 @@ class SceneCache:
         return self.lights
 
 
-def _check_surface(state: ObjectState, asset: Asset, settings: RenderSettings) -> None:
-    """Refuse an asset of which nothing would be seen, or that light would not meet."""
+def _begun(state: ObjectState, loaded: _Loaded, mode: tuple[bool, bool]) -> CachedObject:
+    """An object that is new or has changed, without its surfels."""
+    met, shown = mode
+    item = CachedObject(state, loaded, traced_object(state, loaded.asset, met or shown), mode=mode)
+    item.faults = material_faults(state)
+    if shown and not met and len(loaded.asset.mesh.faces):
+        item.glowing = glowing_mesh(state, item.traced, loaded.glow_of(state.asset))
+    return item
+
+
+def _check_surface(state: ObjectState, asset: Asset, settings: RenderSettings, captured: bool) -> None:
+    """Refuse an asset of which nothing would be seen, or that light would not meet; `captured` ones need no mesh."""
     subject, bare = f"object {state.name}", settings.camera_sees == "mesh" or settings.rays_see == "mesh"
-    if bare and not len(asset.mesh.faces):
+    if bare and not captured and not len(asset.mesh.faces):
         remedy = "Set Camera Sees and Rays See to Surfels, or import a file whose mesh has faces"
         raise AssetError(subject, f"the mesh of {state.asset} has no faces", remedy)
     if "surfels" in (settings.camera_sees, settings.rays_see) and not len(asset.surfels):

@@ -152,7 +152,7 @@ class Session:
         passes = self._draw(frame, prepared, report, cancelled, backend)
         timer("render")
         x0, y0, x1, y1 = frame.camera.window
-        passes.statistics |= self._statistics(frame, prepared.surfels, timer)
+        passes.statistics |= self._statistics(frame, prepared, timer)
         passes.statistics["samples"] = float((x1 - x0) * (y1 - y0) * frame.settings.sample_count)
         passes.warnings = self._warnings(frame.settings) + _ignored_settings(frame.settings)
         return passes
@@ -227,7 +227,7 @@ class Session:
         return self._with_statistics(view, passes, prepared, timer)
 
     def _with_statistics(self, view: View, passes: Passes, prepared: PreparedScene, timer: _StageTimer) -> Passes:
-        passes.statistics |= self._statistics(view.frame, prepared.surfels, timer)
+        passes.statistics |= self._statistics(view.frame, prepared, timer)
         passes.statistics |= {"view.fraction": view.fraction, "view.pixel": float(view.pixel)}
         passes.warnings = self._warnings(view.frame.settings)
         return passes
@@ -276,18 +276,19 @@ class Session:
         timer("deform")
         environment, lights = self._scene_cache.environment_of(frame.world), self._scene_cache.lights_of(frame.lights)
         timer("light")
-        return PreparedScene(self._scene_cache.scene, environment, posed, lights, self._scene_cache.tree)
+        scene = self._scene_cache
+        return PreparedScene(scene.scene, environment, posed, lights, scene.tree, captured=scene.captured)
 
     def _warnings(self, settings: RenderSettings) -> list[str]:
         trouble = cache_folder().trouble
         return self._scene_cache.warnings() + self._backends.warnings(settings) + ([trouble] if trouble else [])
 
-    def _statistics(self, frame: Frame, posed: PosedSurfels, timer: _StageTimer) -> dict[str, float]:
+    def _statistics(self, frame: Frame, prepared: PreparedScene, timer: _StageTimer) -> dict[str, float]:
         return timer.seconds | {
             "seconds.total": sum(timer.seconds.values()),
             "objects": float(len(frame.objects)),
             "triangles": float(len(self._scene_cache.scene.faces)),
-            "surfels": float(len(posed)),
+            "surfels": float(len(prepared.surfels) + sum(len(item.rest) for item in prepared.captured)),
         }
 
 
@@ -296,6 +297,8 @@ def jobs_of(frame: Frame) -> list[str]:
     settings, jobs = frame.settings, ["frame"]
     if settings.camera_sees == "mesh":
         jobs.append("mesh")
+    if any(state.captured_colours for state in frame.objects):
+        jobs += ["captured", "lights"]
     if settings.rays_see == "surfels":
         jobs.append("surfel rays")
     if settings.denoise == "svgf":

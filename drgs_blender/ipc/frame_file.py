@@ -26,7 +26,7 @@ Array = np.ndarray
 #: Ending of such files.
 SUFFIX = ".drgsframe"
 #: Of the description; counts up when its fields change. `_UPGRADES` reads the formats before.
-FORMAT = 2
+FORMAT = 3
 _DESCRIPTION = "description"
 #: Arrays of as many bytes have a file of their own.
 _LARGE = 1 << 16
@@ -104,8 +104,13 @@ def _named_samples(frame: dict[str, Any]) -> dict[str, Any]:
     return frame
 
 
+def _lit_objects(frame: dict[str, Any]) -> dict[str, Any]:
+    """Format 2 to 3: objects say whether they are shown in captured colours."""
+    return {**frame, "objects": [{"captured_colours": False, **state} for state in frame["objects"]]}
+
+
 #: From each format to the next, the oldest first.
-_UPGRADES = (_named_samples,)
+_UPGRADES = (_named_samples, _lit_objects)
 
 
 def _write_beside(folder: Path, array: Array) -> str:

@@ -25,11 +25,13 @@ from .film.film import COMPONENTS, Film
 from .film.motion_vectors import MotionFilm, SceneState, vector_pass
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.mesh import primary_mesh
-from .gbuffer.surfels import Stages, primary_surfels, snap_windows
+from .gbuffer.surfels import Stages, primary_surfels, show_captured, snap_windows
 from .gbuffer.visible_lights import visible_lights
 from .integrator.adaptive import part_count, sample_adaptively
+from .integrator.variance import variances
 from .prepared_scene import PreparedScene
-from .shading_points import Radiance, ShadingPoints
+from .shading_points import UNLIT, Radiance, ShadingPoints
+from .surfels import captured
 from .surfels.splats import Splats
 from .surfels.surfel_bvh import SurfelBVH
 
@@ -120,7 +122,7 @@ def render(
         buffer = visible.rows(y0, y1)
         check()
         radiance = batches.light(buffer)
-        film.add(buffer, radiance, scene.pass_index, prepared.environment)
+        film.add(buffer, radiance, prepared.pass_index, prepared.environment)
         for matte in mattes:
             matte.add(buffer)
         if lights is not None and lights.seen:
@@ -173,9 +175,12 @@ class VisibleSurfaces:
         self._scene, self._camera, self._parameters = prepared.scene, frame.camera, parameters
         self._tree, self._objects, self._backend = prepared.surfel_bvh, len(frame.objects), backend
         self._splats: Splats | None = None
+        self._captured: captured.CapturedSplats | None = None
         if frame.settings.camera_sees == "surfels":
             self._splats = backend.prepare(prepared.surfels, frame.camera, parameters)
             self._windows = snap_windows(prepared.scene, len(frame.objects))
+            if prepared.captured:
+                self._captured = captured.project(prepared.captured, frame.camera, parameters)
 
     def rows(self, y0: int, y1: int) -> GBuffer:
         """The samples of the rows ``y0 .. y1`` of the full picture."""
@@ -186,7 +191,13 @@ class VisibleSurfaces:
                 _own_surfels(buffer, self._tree, self._objects)
             return buffer
         given = self._splats, self._scene, self._windows, self._camera, y0, y1, self._tree is None
-        return primary_surfels(*given, Stages(backend.rasterise, backend.tie, backend.trace, backend.shade))
+        if self._captured is None:
+            return primary_surfels(*given, Stages(backend.rasterise, backend.tie, backend.trace, backend.shade))
+        blended = captured.blend(self._captured, self._splats, y0, y1, backend.rasterise)
+        stages = Stages(lambda *_: blended.samples, backend.tie, backend.trace, backend.shade)
+        buffer = primary_surfels(*given, stages)
+        show_captured(buffer, blended, self._camera.window[0], self._camera.width)
+        return buffer
 
 
 def strip_height(width: int, subpixels: int) -> int:
@@ -199,6 +210,17 @@ def _own_surfels(buffer: GBuffer, tree: SurfelBVH, objects: int) -> None:
     points, owner = buffer.points, buffer.object_index
     points.own = np.where(owner < objects, owner, -1).astype(np.int32)
     points.size = np.append(tree.sizes(objects), np.float32(0.0))[points.own]
+
+
+def _spread(some: Radiance, rows: Array, points: ShadingPoints) -> Radiance:
+    """Light of the `rows` of `points` as that of all; the others have none."""
+    out = Radiance.dark(len(points))
+    out.components[rows], out.moments[rows] = some.components, some.moments
+    out.variance = variances(points.pixel, out.moments)
+    if some.unshadowed is not None:
+        out.unshadowed = np.zeros(len(points), np.float32)
+        out.unshadowed[rows] = some.unshadowed
+    return out
 
 
 class Batches:
@@ -218,6 +240,10 @@ class Batches:
 
     def trace(self, points: ShadingPoints, part: tuple[int, int]) -> Radiance:
         """Light of `points`, ordered by pixel, from one part of their samples, see `integrate`."""
+        if self._prepared.captured:
+            lit = np.flatnonzero(points.flags & UNLIT == 0)
+            if len(lit) < len(points):
+                return _spread(self.trace(points[lit], part), lit, points)
         n = len(points)
         out, prepared = Radiance.dark(n), self._prepared
         first = 0

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from ..core.asset.model import PosedSurfels
 from .film.motion_vectors import SceneState
 from .lights.environment import EnvironmentLight
 from .lights.light_sampler import Lights
 from .scene.trace_scene import TraceScene
+from .surfels.captured import CapturedObject
 from .surfels.surfel_bvh import SurfelBVH
+
+Array = np.ndarray
 
 
 @dataclass(slots=True)
@@ -23,13 +28,15 @@ class PreparedScene:
     environment : EnvironmentLight
         The frame's world.
     surfels : PosedSurfels
-        Surfels of all objects; not used where ``frame.settings.camera_sees`` is "mesh".
+        Surfels of all objects but the captured ones; not used where ``frame.settings.camera_sees`` is "mesh".
     lights : Lights, optional
         All lights but the environment, emitting meshes included.
     surfel_bvh : SurfelBVH, optional
         The surfels that light meets, where ``frame.settings.rays_see`` is "surfels".
     previous, following : SceneState, optional
         The scene one frame earlier and later, for motion vectors; None: nothing moves.
+    captured : tuple of CapturedObject
+        Objects that the camera sees unlit, with the colours of their capture.
     """
 
     scene: TraceScene
@@ -39,3 +46,18 @@ class PreparedScene:
     surfel_bvh: SurfelBVH | None = None
     previous: SceneState | None = None
     following: SceneState | None = None
+    captured: tuple[CapturedObject, ...] = ()
+
+    @property
+    def pass_index(self) -> Array:
+        """(objects,) int32 pass index of all objects of the scene; -1 - index of those that are unlit.
+
+        So the denoiser, which parts objects by their pass index, brings no light of others to them.
+        """
+        index = self.scene.pass_index
+        if not self.captured:
+            return index
+        unlit = np.concatenate([item.posed.object_index[:1] for item in self.captured])
+        index = index.copy()
+        index[unlit] = -1 - index[unlit]
+        return index

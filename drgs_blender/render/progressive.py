@@ -28,7 +28,7 @@ from .integrator.adaptive import Sampling, part_count
 from .integrator.variance import variances
 from .pipeline import Batches, VisibleSurfaces, check_frame, denoised, strip_height
 from .prepared_scene import PreparedScene
-from .shading_points import Radiance, ShadingPoints
+from .shading_points import UNLIT, Radiance, ShadingPoints
 
 Array = np.ndarray
 
@@ -85,6 +85,14 @@ def coarse(frame: Frame, size: int, by_mesh: bool = False) -> Frame:
     if settings.denoise != "none" or frame.history:
         settings.denoise = "svgf"
     return replace(frame, camera=view, settings=settings, previous=None, next=None)
+
+
+def thinned_scene(prepared: PreparedScene, pixels: int) -> PreparedScene:
+    """The scene with the surfels that a picture of `pixels` can show, see `thinned`."""
+    shown = thinned(prepared.surfels, pixels)
+    step = sum(len(item.rest) for item in prepared.captured) // max(1, SURFELS_PER_PIXEL * pixels)
+    captured = prepared.captured if step < 2 else tuple(item.thinned(step) for item in prepared.captured)
+    return replace(prepared, surfels=shown, captured=captured)
 
 
 def thinned(posed: PosedSurfels, pixels: int) -> PosedSurfels:
@@ -247,7 +255,10 @@ class Progressive:
             buffer = self._samples(strip)
             check()
             exact = self._adaptive and self.fraction == 1.0
-            film.add(buffer, strip.radiance(buffer.points, exact), prepared.scene.pass_index, prepared.environment)
+            radiance = strip.radiance(buffer.points, exact)
+            if prepared.captured:  # points that have no light yet were given that of their pixel
+                radiance.components[buffer.points.flags & UNLIT != 0] = 0.0
+            film.add(buffer, radiance, prepared.pass_index, prepared.environment)
             if lights is not None and lights.seen:
                 rows = slice(strip.rows[0] - camera.window[1], strip.rows[1] - camera.window[1])
                 film.pixels.emission[rows] += visible_lights(lights, self._parameters, camera.window[0], buffer)

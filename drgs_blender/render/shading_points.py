@@ -16,8 +16,9 @@ Array = np.ndarray
 DIFFUSE_DIRECT, DIFFUSE_INDIRECT, GLOSSY_DIRECT, GLOSSY_INDIRECT = range(4)
 
 #: Bits of ``ShadingPoints.flags``. SECOND: an ordinary mesh seen next to surfels; a first point may have the same pixel
-#: and sample, so random numbers must differ. CATCHER: of a shadow catcher, see ``Radiance.unshadowed``.
-SECOND, CATCHER = 1, 2
+#: and sample, so random numbers must differ. CATCHER: of a shadow catcher, see ``Radiance.unshadowed``. UNLIT: of an
+#: object shown as captured, which emits what is seen of it and reflects nothing.
+SECOND, CATCHER, UNLIT = 1, 2, 4
 
 _WIDTHS = {
     "weight": (), "origin": (3,), "normal": (3,), "geometric_normal": (3,), "view": (3,),
@@ -67,7 +68,7 @@ class ShadingPoints:
     roughness, metallic : (n,) float32 array
         In [0, 1].
     flags : (n,) uint8 array
-        SECOND, CATCHER; 0 when not given.
+        SECOND, CATCHER, UNLIT; 0 when not given.
     own : (n,) int32 array
         Object whose surfels the point lies on, so that those near it do not shade it; -1: none. For rays that meet
         surfels; empty where they meet meshes alone.

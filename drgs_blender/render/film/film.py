@@ -49,7 +49,7 @@ class Pixels(NamedTuple):
     coverage, roughness, metallic : (h, w) array
         In [0, 1].
     pass_index : (h, w) array
-        Of the nearest sample's object, Blender's IndexOB.
+        Of the nearest sample's object, Blender's IndexOB; -1 - index where that is unlit.
     depth : (h, w) array
         Metres along the view axis; `EMPTY_DEPTH` where the pixel is empty.
     position : (h, w, 3) array
@@ -124,6 +124,7 @@ class Film:
         buffer : GBuffer
         radiance : Radiance
         pass_index : (objects,) int32 array
+            As of `PreparedScene.pass_index`.
         environment : EnvironmentLight
             Background, unless the film is transparent.
         """
@@ -186,6 +187,9 @@ class Film:
             "Coverage": seen.coverage,
             "IndexOB": seen.pass_index,
         }
+        if "IndexOB" in names:
+            index = seen.pass_index
+            scalars["IndexOB"] = np.where(index < 0, -1 - index, index)
         made |= {name: values[..., None] for name, values in scalars.items()}
         if "Combined" in names:
             made["Combined"] = self._beauty(light, made["Env"], shadow)

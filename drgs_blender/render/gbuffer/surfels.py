@@ -37,8 +37,9 @@ from ..scene.interaction import nearest
 from ..scene.ray import Ray
 from ..scene.ray_masks import SURFELS
 from ..scene.trace_scene import TraceScene
-from ..shading_points import SECOND
+from ..shading_points import SECOND, UNLIT
 from ..surfel_columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
+from ..surfels.captured import CapturedSamples
 from ..surfels.raster import SurfelSamples, rasterise
 from ..surfels.splats import Splats
 from .camera_hits import MeshHits, shade_mesh, trace_camera
@@ -118,6 +119,25 @@ def primary_surfels(
         stages.shade(scene, layers.hits, splats.parameters, camera.window[0], buffer, SECOND)
     buffer.mark_catchers(scene.object_flags)
     return buffer
+
+
+def show_captured(buffer: GBuffer, blended: CapturedSamples, x0: int, width: int) -> None:
+    """Have the points of captured objects emit what was captured, and reflect nothing.
+
+    Parameters
+    ----------
+    buffer : GBuffer
+        Of `primary_surfels` with these samples; written.
+    blended : CapturedSamples
+    x0, width : int
+        First column of the window, and columns of the picture.
+    """
+    points = buffer.points
+    row, column = np.divmod(points.pixel, width)
+    where = row - buffer.rows[0], column - x0, points.sample
+    shown = np.flatnonzero(blended.captured[where] & (points.flags & SECOND == 0))
+    buffer.emission[shown] = blended.radiance[tuple(index[shown] for index in where)]
+    points.flags[shown] |= UNLIT
 
 
 @njit

@@ -123,31 +123,49 @@ def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
     parameters : array
         `camera.camera_parameters`.
     """
-    x0, y0, x1, y1 = camera.window
     n = len(posed)
     screen = np.empty((n, RECORD), np.float32)
     box = np.empty((n, 4), np.int32)
     nearest = np.empty(n, np.float32)
     arrays = Posed.of(posed)
     over_range(_project, n, arrays, parameters, camera.window, screen, box, nearest, fewest=_FEW)
+    return arranged(arrays, (screen, box, nearest), camera.window, parameters)[0]
+
+
+def arranged(
+    posed: Posed, projected: tuple[Array, Array, Array], window: tuple[int, int, int, int], parameters: Array
+) -> tuple[Splats, Array]:
+    """Projected surfels sorted by depth and listed by tile, and which surfel each is.
+
+    Parameters
+    ----------
+    posed : Posed
+    projected : tuple of array
+        Screen records, boxes and nearest depths of all surfels, see `Splats`.
+    window : tuple of int
+    parameters : array
+        `camera.camera_parameters`.
+    """
+    (screen, box, nearest), (x0, y0, x1, y1) = projected, window
     order = depth_order(np.ascontiguousarray(screen[:, ZC]), box)
     surface = np.empty((len(order), SPLAT), np.float32)
-    over_range(_gather_surface, len(order), order, arrays, surface, fewest=ELEMENTS)
+    over_range(_gather_surface, len(order), order, posed, surface, fewest=ELEMENTS)
     box = box.take(order, axis=0)  # faster than an index
     tiles_x = (x1 - 1) // TILE - x0 // TILE + 1
     tiles_y = (y1 - 1) // TILE - y0 // TILE + 1
     start, listed = list_by_tile(box, x0 // TILE, y0 // TILE, tiles_x, tiles_y)
-    return Splats(
+    splats = Splats(
         screen.take(order, axis=0),
         surface,
         box,
         nearest.take(order),
-        arrays.object_index.take(order),
+        posed.object_index.take(order),
         start,
         listed,
-        *camera.window,
+        *window,
         parameters,
     )
+    return splats, order
 
 
 @inlined
