@@ -309,6 +309,14 @@ class DrgsObjectSettings(bpy.types.PropertyGroup):
         default=False,
         update=tag_changed,
     )
+    captured_colours: BoolProperty(
+        name="Captured Colours",
+        description="Show the object without light, in the colours that its capture has from each side, as viewers of "
+        "splats do. Materials and adjustments do not show meanwhile. With the view transform Standard the picture is "
+        "that of those viewers",
+        default=False,
+        update=tag_changed,
+    )
     physics: PointerProperty(
         type=DrgsPhysicsSettings, name="Physics", description="The simulation of the object and its material"
     )

@@ -49,7 +49,13 @@ class DrgsObjects:
             lambda: _shape(obj, self._depsgraph, self._key_of, self._warn),
         )
         self.states.append(
-            replace(shape, matrix_world=item.matrix_world, pass_index=obj.pass_index, visibility=item.visibility)
+            replace(
+                shape,
+                matrix_world=item.matrix_world,
+                pass_index=obj.pass_index,
+                visibility=item.visibility,
+                captured_colours=obj.drgs.captured_colours,
+            )
         )
         self.keys.append(item.key)
 

@@ -27,7 +27,7 @@ class _Adjustments:
         layout = self.layout
         layout.use_property_split = True
         settings = context.object.drgs.adjustment
-        layout.active = settings.use
+        layout.active = settings.use and not context.object.drgs.captured_colours
         column = layout.column(align=True)
         for name in ("tint", "hue", "saturation", "value"):
             column.prop(settings, name)

@@ -29,6 +29,7 @@ class DRGS_PT_asset(bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         draw_asset(self.layout, context.object)
+        self.layout.prop(context.object.drgs, "captured_colours")
         self.layout.operator("drgs.bind_to_rig", icon="ARMATURE_DATA")
         self.layout.operator("drgs.play_point_cache", icon="MOD_MESHDEFORM")
 

@@ -12,6 +12,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -41,6 +42,7 @@ EXAMPLES = """examples:
   drgs relight robot.drgs --env city.exr --camera front.json --vertices pose.npy --out pose.png
   drgs relight robot.drgs --env city.exr --camera front.json --vertices walk.pc2 --frames 1-24 --out 'walk/####.exr'
   drgs relight cat.drgs --env city.exr --camera front.json --cache bake --frames 1-48 --out 'cat/####.exr'
+  drgs relight room.drgs --captured --camera front.json --out room.png
 """
 
 
@@ -58,6 +60,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--env-rotation", type=finite, default=0.0, metavar="DEG", help="Rotation Z of a World Mapping node, degrees"
     )
     light.add_argument("--env-strength", type=finite, default=1.0, metavar="S", help="strength of the environment")
+    light.add_argument(
+        "--captured", action="store_true",
+        help="show the surfels unlit, in the view-dependent colours of their capture; needs no environment",
+    )  # fmt: skip
     pose = parser.add_argument_group("pose").add_mutually_exclusive_group()
     pose.add_argument("--cache", type=Path, metavar="CACHE", help="folder that `drgs simulate` wrote")
     pose.add_argument(
@@ -105,20 +111,25 @@ def run(args: argparse.Namespace) -> int:
 
         session = Session()
     key = session.load_asset(args.asset)
-    world = World(read_environment(args, session.asset(key)), rotation_z(args.env_rotation), strength=args.env_strength)
+    asset = session.asset(key)
+    if args.captured and args.env is None and asset.environment is None:
+        world = World(strength=0.0)
+    else:
+        world = World(read_environment(args, asset), rotation_z(args.env_rotation), strength=args.env_strength)
+    state = ObjectState(args.asset.stem, key, tear=tear, grain=grain, captured_colours=args.captured)
     warned = False
     for number, give_pose in poses:
         vertices = give_pose()
         if vertices is not None and args.vertices:
             vertices = in_asset_order(args, session.asset(key).mesh, vertices)
         shape = session.asset(key).mesh.vertices if vertices is None else vertices
-        if not warned and (size := size_around(camera.matrix_world[:3, 3], shape)) is not None:
+        if not warned and not args.captured and (size := size_around(camera.matrix_world[:3, 3], shape)) is not None:
             logger.warning("the camera is inside %s (a box of %s m): move it back", args.asset.stem, size)
             warned = True
         frame = Frame(
             noise_index=number,
             camera=camera,
-            objects=[ObjectState(name=args.asset.stem, asset=key, vertices=vertices, tear=tear, grain=grain)],
+            objects=[replace(state, vertices=vertices)],
             world=world,
             settings=settings,
             passes=args.passes,

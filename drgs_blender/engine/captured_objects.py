@@ -44,8 +44,8 @@ def captured_faults(state: ObjectState, asset: Asset, settings: RenderSettings) 
     name, seen = state.name, state.visibility
     if asset.surfels.sh is None:
         return [
-            f"{name}: {state.asset} has no captured colours, so it is lit as usual; import it from a file of splats, "
-            "or switch Captured Colours off"
+            f"{name}: {state.asset} has no captured colours, so it is lit as usual; assets imported from files of "
+            "splats have them"
         ]
     if seen.shadow_catcher:
         return [f"{name}: is a shadow catcher, of which captured colours show nothing"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -279,3 +280,19 @@ def test_relights_with_torch_blocked(folder, tmp_path):
     result = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr
     assert np.isfinite(read_frame(out)[0]["Combined"]).all()
+
+
+def test_captured_colours_need_no_light(relight, folder: Path, capsys: pytest.CaptureFixture) -> None:
+    """The picture is the colour of the file, and PNG files show its own numbers; what has none says so."""
+    asset = read_asset(folder / "ball.drgs")
+    sh = np.zeros((len(asset.surfels), 1, 3), np.float32)
+    sh[:, 0] = (np.array([0.6, 0.3, 0.8]) - 0.5) / 0.28209479177387814
+    surfels = replace(asset.surfels, sh=sh, opacity=np.ones_like(asset.surfels.opacity))
+    write_asset(folder / "captured.drgs", Asset(surfels, asset.mesh, asset.binding))
+    passes, _ = relight("--captured", asset="captured.drgs")
+    assert np.allclose(passes["Combined"][15, 20, :3], [0.3185, 0.0732, 0.6038], atol=2e-3)
+    given = "relight", folder / "captured.drgs", "--camera", folder / "front.json", "--out", folder / "o.png"
+    assert main([*map(str, given), "--captured"]) == 0
+    assert np.abs(np.asarray(Image.open(folder / "o.png"))[15, 20, :3] - np.array([153, 76.5, 204])).max() <= 1
+    relight("--captured", asset="ball.drgs")
+    assert "no captured colours" in capsys.readouterr().err
