@@ -50,6 +50,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[object]]]:
     yield "mattes", [*own, "mattes", folder]
     yield "motion", [*own, "motion", folder]
     yield "viewport", [*own, "viewport", folder]
+    yield "captured", [*drgs, "relight", folder / "playbot.drgs", "--captured", *relight[relight.index("--camera") :]]
     yield "surfel rays", [*relight, "--rays-see", "surfels"]
     for solver in ("mpm", "xpbd", "rigid"):
         yield "simulate", [*drgs, "simulate", asset, "--solver", solver, "--resolution", "12", "--frames", "3",

@@ -67,7 +67,7 @@ def surfels_to_z_up(surfels: Surfels, up: str = "y") -> Surfels:
         surfels,
         centre=vectors_to_z_up(surfels.centre, up),
         rotation=multiply_quaternions(_QUATERNIONS[up], surfels.rotation).astype(np.float32),
-        sh=sh if sh is None or up == "z" else rotate_harmonics(whole_bands(sh), UP_AXES[up]),
+        sh=sh if sh is None or up == "z" else rotate_harmonics(whole_bands(sh, 4), UP_AXES[up]),
     )
 
 

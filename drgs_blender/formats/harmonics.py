@@ -1,4 +1,4 @@
-"""Spherical harmonics of 3DGS: evaluation up to degree 3, and rotation.
+"""Spherical harmonics of 3DGS: evaluation up to degree 4, and rotation.
 
 Real basis with the Condon-Shortley phase of 3DGS, order (l, m) = (0, 0), (1, -1), (1, 0), (1, 1), (2, -2), ...
 """
@@ -43,12 +43,26 @@ def polynomials(x: Any, y: Any, z: Any, one: Any, degree: int) -> list[Any]:
             0.5 * b * z * (xx - yy),
             -a * x * (xx - 3 * yy),
         ]
+    if degree >= 4:
+        a, b, c = 2.5033429417967046, 1.7701307697799304, 0.9461746957575601
+        d, e, f = 0.6690465435572892, 0.10578554691520431, 0.47308734787878004
+        columns += [
+            a * x * y * (xx - yy),
+            -b * y * z * (3 * xx - yy),
+            c * x * y * (7 * zz - one),
+            -d * y * z * (7 * zz - 3 * one),
+            e * (zz * (35 * zz - 30 * one) + 3 * one),
+            -d * x * z * (7 * zz - 3 * one),
+            f * (xx - yy) * (7 * zz - one),
+            -b * x * z * (xx - 3 * yy),
+            0.25 * a * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
+        ]
     return columns
 
 
-def whole_bands(sh: Array) -> Array:
-    """The coefficients (n, k, 3) of complete bands up to degree 3; a view."""
-    return sh[:, : next(k for k in (16, 9, 4, 1) if k <= sh.shape[1])]
+def whole_bands(sh: Array, degree: int = 3) -> Array:
+    """The coefficients (n, k, 3) of complete bands up to a degree of at most 4; a view."""
+    return sh[:, : next(k for k in (25, 16, 9, 4, 1) if k <= min(sh.shape[1], (degree + 1) ** 2))]
 
 
 def rotate_harmonics(sh: Array, rotation: Array) -> Array:
@@ -57,7 +71,7 @@ def rotate_harmonics(sh: Array, rotation: Array) -> Array:
     Parameters
     ----------
     sh : (n, k, 3) float32 array
-        With k = 1, 4, 9 or 16.
+        With k = 1, 4, 9, 16 or 25.
     rotation : (3, 3) or (n, 3, 3) array
         One for all functions, or one per function; orthogonal: it may mirror.
 
@@ -67,7 +81,7 @@ def rotate_harmonics(sh: Array, rotation: Array) -> Array:
         Each band stays within itself. Its matrix comes from the band's values at fixed directions and at the turned
         ones, exact because the directions determine the band.
     """
-    degree = {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
+    degree = {1: 0, 4: 1, 9: 2, 16: 3, 25: 4}[sh.shape[1]]
     if degree == 0:
         return sh
     result = np.empty_like(sh)
@@ -86,7 +100,7 @@ def rotate_harmonics(sh: Array, rotation: Array) -> Array:
 
 @cache
 def _directions() -> Array:
-    """(16, 3) directions spread over the sphere (Fibonacci lattice), which determine every band up to degree 3."""
+    """(16, 3) directions spread over the sphere (Fibonacci lattice), which determine every band up to degree 4."""
     turn = np.arange(16)
     z = 1 - (2 * turn + 1) / 16
     angle = turn * np.pi * (3 - np.sqrt(5))
@@ -97,4 +111,4 @@ def _directions() -> Array:
 @cache
 def _inverse(l: int) -> Array:
     """(2 l + 1, 16): coefficients of band l from its values at `_directions`."""
-    return np.linalg.pinv(basis(_directions(), 3)[:, l * l : (l + 1) * (l + 1)])
+    return np.linalg.pinv(basis(_directions(), 4)[:, l * l : (l + 1) * (l + 1)])

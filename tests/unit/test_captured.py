@@ -13,7 +13,7 @@ from drgs_blender.core.asset.model import Surfels
 from drgs_blender.core.color import srgb_to_linear
 from drgs_blender.core.frame import Camera, RenderSettings
 from drgs_blender.deform.rigid import pose_by_matrix
-from drgs_blender.formats.harmonics import basis
+from drgs_blender.formats.harmonics import basis, rotate_harmonics
 from drgs_blender.formats.registry import read_surfels
 from drgs_blender.render.camera import camera_parameters, lattice, pixel_shift
 from drgs_blender.render.surfels.captured import CapturedObject, blend, project
@@ -86,7 +86,7 @@ def expected(surfels: Surfels, camera: Camera, positions: np.ndarray):
 
 
 def test_harmonics_are_orthonormal_and_those_of_the_files():
-    """Bands 0 to 4 by quadrature over the sphere; up to degree 3 they are what readers and writers turn."""
+    """Bands 0 to 4 by quadrature over the sphere; they are those that readers turn."""
     node, weight = np.polynomial.legendre.leggauss(12)
     angle = np.arange(24) * 2 * np.pi / 24
     ring = np.sqrt(1 - node**2)[:, None]
@@ -96,7 +96,7 @@ def test_harmonics_are_orthonormal_and_those_of_the_files():
         harmonics(*d, 25, row)
     measure = np.repeat(weight, 24) * 2 * np.pi / 24
     assert np.allclose(values.T @ (values * measure[:, None]), np.eye(25), atol=1e-12)
-    assert np.allclose(values[:, :16], basis(directions, 3), atol=1e-12)
+    assert np.allclose(values, basis(directions, 4), atol=1e-12)
 
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
@@ -182,6 +182,16 @@ def test_colours_turn_with_the_object(mirror: bool):
     before, after = colours_of(surfels, np.eye(4), eye), colours_of(surfels, matrix, moved)
     assert before.std() > 0.1
     assert np.allclose(np.sort(before, axis=0), np.sort(after, axis=0), atol=2e-5)
+
+
+def test_functions_of_every_degree_turn():
+    """The coefficients turned, asked at a turned direction, are what they were."""
+    sh, turn = np.random.default_rng(2).normal(size=(5, 25, 3)), turned(0.8, (1.0, 2.0, -0.5))[:3, :3]
+    d = np.random.default_rng(3).normal(size=(9, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    before, after = basis(d, 4), basis(d @ turn.T, 4)
+    rotated = rotate_harmonics(sh.astype(np.float32), turn)
+    assert np.allclose(np.einsum("dk,nkc->ndc", before, sh), np.einsum("dk,nkc->ndc", after, rotated), atol=1e-5)
 
 
 def test_colours_of_a_stretched_surfel_turn_as_its_matter_does():
