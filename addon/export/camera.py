@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+from typing import Any, Literal
+
 import bpy
 import numpy as np
 from mathutils import Matrix
@@ -11,8 +15,14 @@ from ...drgs_blender.core.frame import Camera
 
 #: For frames whose camera has no part in what is made of them.
 NO_CAMERA = Camera(np.eye(4), 1, 1, 1.0, 1.0, 0.5, 0.5)
-#: Camera type -> orthographic? What is not here cannot be rendered.
-SUPPORTED = {"PERSP": False, "ORTHO": True}
+#: Types of cameras, and of the panoramas of one of type PANO, that can be rendered, with the engine's name of these.
+TYPES = ("PERSP", "ORTHO", "PANO")
+PANORAMAS: dict[str, Literal["equirectangular", "fisheye", "equisolid"]] = {
+    "EQUIRECTANGULAR": "equirectangular",
+    "FISHEYE_EQUIDISTANT": "fisheye",
+    "FISHEYE_LENS_POLYNOMIAL": "fisheye",
+    "FISHEYE_EQUISOLID": "equisolid",
+}
 
 
 def resolution(render: bpy.types.RenderSettings) -> tuple[int, int]:
@@ -38,13 +48,38 @@ def border(render: bpy.types.RenderSettings, width: int, height: int) -> tuple[i
     return x0, height - above, x1, height - below
 
 
+def lens_of(data: bpy.types.Camera) -> Any:
+    """What has the properties of a camera's panorama: before Blender 5.0 Cycles' settings; None where it is off."""
+    return data if hasattr(data, "panorama_type") else getattr(data, "cycles", None)
+
+
+def is_panoramic(camera: bpy.types.Object | None) -> bool:
+    """Whether an object is a camera whose picture is curved."""
+    return camera is not None and camera.type == "CAMERA" and camera.data.type == "PANO"
+
+
 def check_lens(camera: bpy.types.Object) -> None:
     """UsageError where a camera is of a type that the engine has no rays for."""
-    if camera.data.type not in SUPPORTED:
+    data = camera.data
+    if data.type not in TYPES:
         raise UsageError(
             f'Camera "{camera.name}"',
-            f"is of type {camera.data.type.capitalize()}, which DR-GS cannot render",
-            "Set Lens > Type to Perspective or Orthographic",
+            f"is of type {data.type.capitalize()}, which DR-GS cannot render",
+            "Set Lens > Type to Perspective, Orthographic or Panoramic",
+        )
+    if data.type != "PANO":
+        return
+    lens = lens_of(data)
+    if lens is None:
+        raise UsageError(
+            f'Camera "{camera.name}"', "is panoramic, and Cycles, which has the settings, is off", "Enable the add-on"
+        )
+    if lens.panorama_type not in PANORAMAS:
+        kind = lens.panorama_type.replace("_", " ").title()
+        raise UsageError(
+            f'Camera "{camera.name}"',
+            f"has the panorama type {kind}, which DR-GS cannot render",
+            "Choose Equirectangular or one of the fisheyes",
         )
 
 
@@ -79,7 +114,7 @@ def export_camera(
         )
     check_lens(camera)
     data = camera.data
-    orthographic = SUPPORTED[data.type]
+    orthographic = data.type == "ORTHO"
     width, height = resolution(render)
     aspect = render.pixel_aspect_y / render.pixel_aspect_x
     fit = data.sensor_fit
@@ -98,7 +133,7 @@ def export_camera(
     else:
         fx = span * data.lens / (data.sensor_height if data.sensor_fit == "VERTICAL" else data.sensor_width)
     shift_x = data.shift_x if shift_x is None else shift_x
-    return Camera(
+    flat = Camera(
         matrix_world=_pose(camera.name, matrix_world or camera.matrix_world),
         width=width,
         height=height,
@@ -111,6 +146,32 @@ def export_camera(
         clip_end=data.clip_end,
         region=border(render, width, height),
     )
+    return replace(flat, **_panorama(camera.name, data, flat, shift_x)) if data.type == "PANO" else flat
+
+
+def _panorama(name: str, data: bpy.types.Camera, flat: Camera, shift_x: float) -> dict[str, Any]:
+    """Fields of `flat`, the picture of the same camera in perspective, that differ in its panorama, as in Cycles."""
+    lens = lens_of(data)
+    panorama = PANORAMAS[lens.panorama_type]
+    fields: dict[str, Any] = {"panorama": panorama}
+    # Shifts are in units of either side.
+    left, down = shift_x * flat.width, data.shift_y * flat.height
+    if panorama == "equirectangular":
+        across, along = lens.longitude_max - lens.longitude_min, lens.latitude_max - lens.latitude_min
+        if not (across > 0 and along > 0):
+            raise UsageError(f'Camera "{name}"', "has longitudes or latitudes that end before they begin", "Swap them")
+        fx, fy = flat.width / across, flat.height / along
+        return fields | {"fx": fx, "fy": fy, "cx": -lens.longitude_min * fx - left, "cy": lens.latitude_max * fy + down}
+    fields |= {"fov": lens.fisheye_fov, "cx": flat.width / 2 - left, "cy": flat.height / 2 + down}
+    if lens.panorama_type == "FISHEYE_EQUIDISTANT":
+        return fields | {"fx": flat.width / lens.fisheye_fov, "fy": flat.height / lens.fisheye_fov}
+    # Pixels per millimetre of the sensor, which is as that of the flat picture.
+    per_mm, aspect = flat.fx / data.lens, flat.fx / flat.fy
+    if panorama == "fisheye":
+        angle = tuple(-getattr(lens, f"fisheye_polynomial_k{i}") for i in range(5))
+        return fields | {"fx": per_mm, "fy": per_mm / aspect, "lens": angle}
+    fx = per_mm * lens.fisheye_lens
+    return fields | {"fx": fx, "fy": fx / aspect, "fov": min(lens.fisheye_fov, 2 * math.pi)}
 
 
 def _pose(name: str, matrix_world: Matrix) -> np.ndarray:

@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
 from ...drgs_blender.core.errors import UsageError
 from ...drgs_blender.core.frame import Camera
-from .camera import export_camera, picture_of, resolution
+from .camera import export_camera, is_panoramic, picture_of, resolution
 
 #: Part of the picture's side by which two cameras differ that are the same but for rounding.
 _SAME = 1e-4
 
 
 def view_camera(
-    region: bpy.types.Region, space: bpy.types.SpaceView3D, rv3d: bpy.types.RegionView3D, scene: bpy.types.Scene
+    region: bpy.types.Region,
+    space: bpy.types.SpaceView3D,
+    rv3d: bpy.types.RegionView3D,
+    scene: bpy.types.Scene,
+    curved: bool = False,
 ) -> Camera | None:
     """The camera whose picture covers the region, border included; None where there is nothing to render.
 
-    Zoom, offset, shift and lens of a camera view are in the viewport's own projection, which is read here.
+    Zoom, offset, shift and lens of a camera view are in the viewport's own projection, which is read here. A panoramic
+    camera fills its frame in the region where pictures may be `curved`; other engines show its view in perspective.
     """
     size = pixel_size(scene)
     width, height = max(1, round(region.width / size)), max(1, round(region.height / size))
+    if curved and rv3d.view_perspective == "CAMERA" and is_panoramic(space.camera):
+        return _panorama(space, rv3d, scene, width, height)
     projection = np.array(rv3d.window_matrix, np.float64)
     pose = np.array(rv3d.view_matrix.inverted().normalized(), np.float64)
     if not (np.isfinite(projection).all() and np.isfinite(pose).all()) or projection[0, 0] * projection[1, 1] <= 0:
@@ -51,6 +60,37 @@ def view_camera(
     if rv3d.view_perspective == "CAMERA" and space.camera == scene.camera:
         return _final(found, scene) or found
     return found
+
+
+def _panorama(
+    space: bpy.types.SpaceView3D, rv3d: bpy.types.RegionView3D, scene: bpy.types.Scene, width: int, height: int
+) -> Camera | None:
+    """The picture of a panoramic camera, in its frame in a region of `width` x `height` pixels."""
+    frame = _camera_frame(space.camera, rv3d, scene)
+    if frame is None:
+        return None
+    render = picture_of(scene)
+    final = export_camera(space.camera, render)
+    if final.region is None and (width, height) == (final.width, final.height) and np.allclose(frame, (0, 0, 1, 1)):
+        return final
+    x0, y0, x1, y1 = frame[0] * width, (1 - frame[3]) * height, frame[2] * width, (1 - frame[1]) * height
+    sx, sy = (x1 - x0) / final.width, (y1 - y0) / final.height
+    left, top, right, bottom = final.window
+    edges = (x0 + sx * left, y0 + sy * top, x0 + sx * right, y0 + sy * bottom)
+    ends = (width, height, width, height)
+    window = tuple(min(max(round(edge), 0), end) for edge, end in zip(edges, ends))
+    if window[2] <= window[0] or window[3] <= window[1]:
+        return None
+    return replace(
+        final,
+        width=width,
+        height=height,
+        fx=final.fx * sx,
+        fy=final.fy * sy,
+        cx=x0 + final.cx * sx,
+        cy=y0 + final.cy * sy,
+        region=window,
+    )
 
 
 def _final(seen: Camera, scene: bpy.types.Scene) -> Camera | None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ...drgs_blender.core.frame import Frame
 from ...drgs_blender.ipc import blur
+from ..export.camera import is_panoramic
 from ..property_limits import Limited
 
 Warn = Callable[[str], None]
@@ -41,6 +42,9 @@ def steps(scene: bpy.types.Scene, camera: bpy.types.Object, warn: Warn) -> list[
     """The pictures that make one of an evaluated scene; none where nothing is blurred."""
     render, dof = scene.render, camera.data.dof
     radius = _radius(camera.data)
+    if radius and is_panoramic(camera):
+        warn(f'Camera "{camera.name}": panoramas have no depth of field in DR-GS; all is sharp')
+        radius = 0.0
     shutter = render.motion_blur_shutter if render.use_motion_blur else 0.0
     if not (radius or shutter):
         return []

@@ -87,7 +87,10 @@ def update(
             check_lens(through)
         except DrgsError as error:
             return str(error)
-    camera = view_camera(region, space, rv3d, depsgraph.scene)
+    try:
+        camera = view_camera(region, space, rv3d, depsgraph.scene, curved=not composited)
+    except DrgsError as error:
+        return str(error)
     if camera is None:
         return ""
     viewport = _viewports.setdefault(name, ViewportState())

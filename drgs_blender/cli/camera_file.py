@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,7 +13,13 @@ from ..core.frame import Camera
 from ..core.json_values import excerpt, is_number, number_array
 from .json_file import read_json
 
-_KEYS = {"matrix_world", "width", "height", "fov_x", "fx", "fy", "cx", "cy", "orthographic", "clip_start", "clip_end"}
+_KEYS = {
+    *("matrix_world", "width", "height", "fov_x", "fx", "fy", "cx", "cy", "orthographic", "clip_start", "clip_end"),
+    *("panorama", "fov", "lens"),
+}
+KINDS: tuple[Literal["equirectangular", "fisheye", "equisolid"], ...] = ("equirectangular", "fisheye", "equisolid")
+#: Full angle of a fisheye, degrees.
+_FOV = (1e-3, 360.0)
 LARGEST_SIDE = 65536
 #: Bytes; a camera is a few hundred.
 LARGEST_FILE = 1 << 20
@@ -41,6 +47,9 @@ def read_camera(path: str | Path) -> Camera:
         - ``fov_x``: horizontal field of view in degrees, **or** ``fx``, ``fy`` in pixels (pixels per metre when
           orthographic) and optionally ``cx``, ``cy``, the principal point, by default the centre
         - optionally ``orthographic`` (true or false), ``clip_start``, ``clip_end`` in metres
+        - optionally ``panorama``: "equirectangular", "fisheye" or "equisolid" (`core.frame.Camera`), then ``fx`` and
+          ``fy`` are pixels per radian, of "equisolid" per focal length, by default what has the picture show all
+          directions, or the fisheye's ``fov`` in degrees (default 180); ``lens``: the 5 coefficients of a "fisheye"
 
     Raises
     ------
@@ -111,7 +120,15 @@ class _Reader:
         orthographic = self.data.get("orthographic", False)
         if not isinstance(orthographic, bool):
             raise self.fail("orthographic", "is not true or false")
+        panorama, lens = self.panorama(), self.data.get("lens")
+        fov = math.radians(self.number("fov", *_FOV, 360.0 if panorama == "equirectangular" else 180.0))
+        if orthographic and panorama:
+            raise self.fail("orthographic", "and panorama exclude each other")
+        if not panorama and (clash := sorted({"fov", "lens"} & set(self.data))):
+            raise self.fail(clash[0], "is of panoramas; fov_x is the field of view of a flat picture")
         if "fov_x" in self.data:
+            if panorama:
+                raise self.fail("fov_x", "is of flat pictures; give fov, or fx and fy")
             if clash := sorted({"fx", "fy"} & set(self.data)):
                 raise self.fail("fov_x", f"and {clash[0]} exclude each other")
             if orthographic:
@@ -120,12 +137,17 @@ class _Reader:
         elif "fx" in self.data:
             fx = self.number("fx", *_FOCAL)
             fy = self.number("fy", *_FOCAL, fx)
+        elif panorama == "equirectangular":
+            fx, fy = width / (2 * math.pi), height / math.pi
+        elif panorama:
+            across = fov if panorama == "fisheye" else 4 * math.sin(fov / 4)
+            fx, fy = width / across, height / across
         else:
             raise self.fail("fov_x", "is missing, and so is fx")
         clip_start, clip_end = self.number("clip_start", *_CLIP, 1e-3), self.number("clip_end", *_CLIP, 1e6)
         if clip_end <= clip_start:
             raise self.fail("clip_end", f"is {clip_end:g}, not beyond clip_start, {clip_start:g}")
-        return Camera(
+        camera = Camera(
             matrix_world=matrix,
             width=width,
             height=height,
@@ -137,3 +159,21 @@ class _Reader:
             clip_start=clip_start,
             clip_end=clip_end,
         )
+        if panorama:
+            camera.panorama, camera.fov = panorama, fov
+        if lens is not None:
+            numbers = number_array(lens, (5,), _FAR)
+            if panorama != "fisheye" or numbers is None:
+                raise self.fail("lens", 'is not the 5 coefficients of the panorama "fisheye"')
+            k0, k1, k2, k3, k4 = (float(x) for x in numbers)
+            camera.lens = (k0, k1, k2, k3, k4)
+        return camera
+
+    def panorama(self) -> Literal["", "equirectangular", "fisheye", "equisolid"]:
+        name = self.data.get("panorama", "")
+        if name == "":
+            return ""
+        for known in KINDS:
+            if name == known:
+                return known
+        raise self.fail("panorama", f"is {excerpt(name, 40)}; it must be one of {', '.join(KINDS)}")

@@ -16,11 +16,19 @@ Array = np.ndarray
 
 @dataclass(slots=True)
 class Camera:
-    """A perspective or orthographic camera.
+    """A perspective, orthographic or panoramic camera.
 
     The ray through pixel position (px, py) has, in the camera's own frame (Blender's: looking down -Z, Y up), the
     direction ``((px - cx) / fx, -(py - cy) / fy, -1)`` from the camera centre; when orthographic it starts at
     ``((px - cx) / fx, -(py - cy) / fy, 0)`` and runs along -Z, so fx is in pixels per metre.
+
+    Of a panoramic camera, ``x = (px - cx) / fx`` and ``y = -(py - cy) / fy`` are places on a curved picture, from which
+    all rays start at the centre, and depth is the distance from there:
+
+    - "equirectangular": longitude to the right and latitude upwards in radians;
+    - "fisheye": the direction lies at ``lens[0] + lens[1] r + lens[2] r^2 + ...`` radians from -Z, with r the length
+      of (x, y), on the side of (x, y); with the default lens equidistant, fx in pixels per radian;
+    - "equisolid": at 2 asin(r / 2), fx in pixels per focal length.
 
     Attributes
     ----------
@@ -34,6 +42,12 @@ class Camera:
     region : tuple of int, optional
         (x0, y0, x1, y1) in pixels, half-open: what is rendered (border); None is everything. Results are always of the
         region's size.
+    panorama : {"", "equirectangular", "fisheye", "equisolid"}
+        "" where the picture is flat.
+    fov : float
+        Radians, the full angle that a fisheye lens sees: the picture ends where the axis is half of it away.
+    lens : tuple of float
+        Of "fisheye", see above.
     """
 
     matrix_world: Array
@@ -47,6 +61,9 @@ class Camera:
     clip_start: float = 1e-3
     clip_end: float = 1e6
     region: tuple[int, int, int, int] | None = None
+    panorama: Literal["", "equirectangular", "fisheye", "equisolid"] = ""
+    fov: float = 6.283185307179586
+    lens: tuple[float, float, float, float, float] = (0.0, 1.0, 0.0, 0.0, 0.0)
 
     @property
     def window(self) -> tuple[int, int, int, int]:

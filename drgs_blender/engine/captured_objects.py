@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core.asset.model import Asset, PosedSurfels
 from ..core.color import srgb_to_linear
-from ..core.frame import Image, Material, MeshState, ObjectState, RenderSettings, Texture
+from ..core.frame import Frame, Image, Material, MeshState, ObjectState, Texture
 from ..render.scene.trace_scene import TraceObject
 from ..render.surfels.captured import CapturedObject
 from ..render.surfels.harmonics import CONSTANT
@@ -31,13 +31,18 @@ class Glow:
     uvs: Array
 
 
-def shows_captured(state: ObjectState, asset: Asset, settings: RenderSettings) -> bool:
+def shows_captured(state: ObjectState, asset: Asset, frame: Frame) -> bool:
     """Whether the camera sees the object in the colours of its capture."""
-    able = settings.camera_sees == "surfels" and asset.surfels.sh is not None and len(asset.surfels) > 0
+    able = (
+        frame.settings.camera_sees == "surfels"
+        and not frame.camera.panorama
+        and asset.surfels.sh is not None
+        and len(asset.surfels) > 0
+    )
     return state.captured_colours and able and not state.visibility.shadow_catcher
 
 
-def captured_faults(state: ObjectState, asset: Asset, settings: RenderSettings) -> list[str]:
+def captured_faults(state: ObjectState, asset: Asset, frame: Frame) -> list[str]:
     """What an object that is to be shown in captured colours lacks, in words for the user."""
     if not state.captured_colours:
         return []
@@ -49,11 +54,13 @@ def captured_faults(state: ObjectState, asset: Asset, settings: RenderSettings) 
         ]
     if seen.shadow_catcher:
         return [f"{name}: is a shadow catcher, of which captured colours show nothing"]
-    if settings.camera_sees == "mesh":
+    if frame.camera.panorama:
+        return [f"{name}: is lit as usual, since panoramic cameras show no captured colours"]
+    if frame.settings.camera_sees == "mesh":
         return [f"{name}: its captured colours are those of surfels; it is lit as usual while Camera Sees is Mesh"]
     found = []
     if seen.diffuse or seen.glossy:
-        if settings.rays_see == "surfels":
+        if frame.settings.rays_see == "surfels":
             found.append(
                 f"{name}: reflections and indirect light see its materials instead of its captured colours while "
                 "Rays See is Surfels"

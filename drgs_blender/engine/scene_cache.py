@@ -96,6 +96,8 @@ class SceneCache:
         Scene that rays are traced in.
     tree : SurfelBVH or None
         Surfels that rays meet; None when they meet the mesh.
+    seen_tree : SurfelBVH or None
+        The same tree, where a panoramic camera sees the surfels by it.
     world : World, optional
         Of the last frame.
     environment : EnvironmentLight, optional
@@ -113,6 +115,7 @@ class SceneCache:
         self.images: list[Image] = []
         self.scene = TraceScene()
         self.tree: SurfelBVH | None = None
+        self.seen_tree: SurfelBVH | None = None
         self._in_tree: list[CachedObject] = []
         self._current = True
         self.world: World | None = None
@@ -159,7 +162,7 @@ class SceneCache:
             return False
         known = [state for state in frame.objects if state.asset in self._assets]
         assets = [self._assets[state.asset].asset for state in known]
-        if any(shows_captured(state, asset, frame.settings) for state, asset in zip(known, assets, strict=True)):
+        if any(shows_captured(state, asset, frame) for state, asset in zip(known, assets, strict=True)):
             return False
         return all(len(a.surfels) <= _SURFELS_A_VERTEX * len(a.mesh.vertices) for a in assets)
 
@@ -181,7 +184,7 @@ class SceneCache:
                     f"its asset {state.asset} is not loaded",
                     "Link the object to its file again",
                 )
-            shown = shows_captured(state, loaded.asset, frame.settings)
+            shown = shows_captured(state, loaded.asset, frame)
             _check_surface(state, loaded.asset, frame.settings, shown)
             state = in_asset_order(state, loaded.asset)
             known = self.objects[index] if index < len(self.objects) else None
@@ -191,7 +194,7 @@ class SceneCache:
                 item = known
             else:
                 item = _begun(kept, loaded, mode)
-                item.faults += captured_faults(kept, loaded.asset, frame.settings)
+                item.faults += captured_faults(kept, loaded.asset, frame)
             if (seen or met) and item.posed is None:
                 given = item.state, index, loaded.surfels_of(item.state), item.traced
                 item.posed, item.hidden_count = posed_surfels(*given, self._poser(backend))
@@ -212,7 +215,9 @@ class SceneCache:
         for key, loaded in self._assets.items():
             if key not in used:
                 loaded.driven = loaded.glow = None
-        self._update_surfel_bvh(objects if met else None)
+        along_rays = seen and bool(frame.camera.panorama)
+        tree = self._surfel_bvh(objects if met or along_rays else None)
+        self.tree, self.seen_tree = tree if met else None, tree if along_rays else None
         visible = [item for item in objects if item.state.visibility.camera] if seen else []
         self.captured = tuple(item.captured for item in visible if item.captured is not None)
         lit = [item.posed for item in visible if item.posed is not None and item.captured is None]
@@ -241,18 +246,21 @@ class SceneCache:
             return on_cpu()
         return backend.with_fallback(lambda: joined(launcher, parts, on_cpu), on_cpu)
 
-    def _update_surfel_bvh(self, objects: list[CachedObject] | None) -> None:
-        """Bring the tree of surfels up to date; None when light does not meet surfels."""
+    def _surfel_bvh(self, objects: list[CachedObject] | None) -> SurfelBVH | None:
+        """The tree of the surfels of all objects; None when nothing meets surfels."""
+        known = self.seen_tree if self.tree is None else self.tree
+        self.tree = self.seen_tree = None  # an update that fails half way leaves nothing to be taken for current
         if objects is None:
-            self.tree, self._in_tree = None, []
-            return
+            self._in_tree = []
+            return None
         same = len(objects) == len(self._in_tree) and all(a is b for a, b in zip(objects, self._in_tree))
-        if self.tree is not None and same:
-            return
-        self.tree, tree = None, self.tree or SurfelBVH()  # as above
+        if known is not None and same:
+            return known
+        tree = SurfelBVH() if known is None else known
         masks = [group_mask(item.state.visibility, True) for item in objects]
         tree.update(join([item.posed for item in objects if item.posed is not None]), np.array(masks, np.int32))
-        self.tree, self._in_tree = tree, objects
+        self._in_tree = objects
+        return tree
 
     def scene_state(self, frame: Frame, step: MotionStep | None) -> SceneState | None:
         """The scene at another time; None when no pass asks for it."""

@@ -276,8 +276,9 @@ class Session:
         timer("deform")
         environment, lights = self._scene_cache.environment_of(frame.world), self._scene_cache.lights_of(frame.lights)
         timer("light")
-        scene = self._scene_cache
-        return PreparedScene(scene.scene, environment, posed, lights, scene.tree, captured=scene.captured)
+        cache = self._scene_cache
+        seen = cache.seen_tree
+        return PreparedScene(cache.scene, environment, posed, lights, cache.tree, seen, captured=cache.captured)
 
     def _warnings(self, settings: RenderSettings) -> list[str]:
         trouble = cache_folder().trouble
@@ -299,7 +300,7 @@ def jobs_of(frame: Frame) -> list[str]:
         jobs.append("mesh")
     if any(state.captured_colours for state in frame.objects):
         jobs += ["captured", "lights"]
-    if settings.rays_see == "surfels":
+    if settings.rays_see == "surfels" or (frame.camera.panorama and settings.camera_sees == "surfels"):
         jobs.append("surfel rays")
     if settings.denoise == "svgf":
         jobs.append("denoise")

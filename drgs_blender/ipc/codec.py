@@ -199,6 +199,24 @@ def decode(hint: Any, data: Any, path: str, arrays: dict[str, Array]) -> Any:
     raise CodecError(f"{path} is not of type {getattr(hint, '__name__', hint)}")
 
 
+def completed(hint: Any, data: Any) -> Any:
+    """Encoded `data` of type `hint`, with the defaults of fields that it lacks."""
+    if (other := _alternative(hint)) is not None:
+        return None if data is None else completed(other, data)
+    if dataclasses.is_dataclass(hint) and isinstance(data, dict):
+        hints = _fields(typing.cast(type, hint))
+        given = {name: completed(hints[name], item) if name in hints else item for name, item in data.items()}
+        for field in dataclasses.fields(hint):
+            if field.name not in data and field.default is not dataclasses.MISSING:
+                given[field.name] = encode(hints[field.name], field.default, field.name, {})
+            elif field.name not in data and field.default_factory is not dataclasses.MISSING:
+                given[field.name] = encode(hints[field.name], field.default_factory(), field.name, {})
+        return given
+    if typing.get_origin(hint) in (list, tuple) and isinstance(data, list):
+        return [completed(kind, item) for kind, item in zip(_item_hints(hint, len(data), ""), data)]
+    return data
+
+
 def encode_frame(frame: Frame) -> tuple[dict[str, Any], dict[str, Array]]:
     """`frame` as JSON-able data and its arrays by slot."""
     arrays: dict[str, Array] = {}

@@ -19,7 +19,7 @@ from ..core.asset.tensors import decode, encode, parse_json
 from ..core.errors import AssetError, VersionError
 from ..core.frame import Frame
 from ..core.version import __version__
-from .codec import CodecError, decode_frame, encode_frame
+from .codec import CodecError, completed, decode_frame, encode_frame
 
 Array = np.ndarray
 
@@ -82,7 +82,7 @@ def _read(path: Path) -> tuple[Frame, str]:
     try:
         for upgrade in _UPGRADES[kind - 1 :]:
             frame = upgrade(frame)
-    except (TypeError, KeyError, AttributeError) as error:
+    except (TypeError, KeyError, AttributeError, CodecError) as error:
         raise AssetError(subject, f"is no frame ({type(error).__name__}: {error})", _REMEDY) from error
     try:
         return decode_frame(frame, arrays), str(content.get("version"))
@@ -104,13 +104,14 @@ def _named_samples(frame: dict[str, Any]) -> dict[str, Any]:
     return frame
 
 
-def _lit_objects(frame: dict[str, Any]) -> dict[str, Any]:
-    """Format 2 to 3: objects say whether they are shown in captured colours."""
-    return {**frame, "objects": [{"captured_colours": False, **state} for state in frame["objects"]]}
+def _with_new_fields(frame: dict[str, Any]) -> dict[str, Any]:
+    """Format 2 to 3: fields that came later have their defaults."""
+    found: dict[str, Any] = completed(Frame, frame)
+    return found
 
 
 #: From each format to the next, the oldest first.
-_UPGRADES = (_named_samples, _lit_objects)
+_UPGRADES = (_named_samples, _with_new_fields)
 
 
 def _write_beside(folder: Path, array: Array) -> str:

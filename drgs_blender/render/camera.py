@@ -15,14 +15,15 @@ import numpy as np
 from ..compute.jit import inlined, njit
 from ..core.errors import UsageError
 from ..core.frame import Camera, RenderSettings
+from .panorama import PANORAMA, PARAMETERS, fill_parameters, lens_problem, panorama_direction
 from .pixel_filter import check_filter, filter_position
 from .sampling import GOLDEN, mix
 
 Array = np.ndarray
 
 #: Offsets into the array of `camera_parameters`.
-POSITION, FX, FY, CX, CY, ORTHOGRAPHIC, CLIP_START, CLIP_END, WIDTH, SEED, SUBPIXELS, LEAN, FILTER, PARAMETERS = (
-    *(9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 24, 25),
+POSITION, FX, FY, CX, CY, ORTHOGRAPHIC, CLIP_START, CLIP_END, WIDTH, SEED, SUBPIXELS, LEAN, FILTER = (
+    *(9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 24),
 )
 _GOLDEN_RATIO = 0.6180339887498949
 
@@ -45,6 +46,8 @@ def check_camera(camera: Camera) -> None:
         refuse(f"the picture has {camera.width} x {camera.height} pixels", "Choose a resolution of at least one pixel")
     if max(camera.width, camera.height) > 65536 or camera.width * camera.height > 2**31 - 1:
         refuse(f"the picture has {camera.width} x {camera.height} pixels", "Render it in several parts")
+    if problem := lens_problem(camera):
+        refuse(problem, "Check the camera's panorama type, field of view and lens")
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     if not np.isfinite(intrinsics).all() or camera.fx <= 0 or camera.fy <= 0:
         refuse(
@@ -99,6 +102,7 @@ def camera_parameters(camera: Camera, settings: RenderSettings, noise_index: int
     out[SUBPIXELS] = settings.subpixel_count
     out[LEAN : LEAN + 2] = lean(camera)
     out[FILTER] = settings.filter_width
+    fill_parameters(camera, out)
     return out
 
 
@@ -163,7 +167,8 @@ def camera_ray(parameters, px, py):  # type: ignore[no-untyped-def]
     ox, oy, oz : float64
         Origin, world, m.
     dx, dy, dz : float64
-        Direction, world, of length 1 along the view axis, so that the ray's parameter is the depth.
+        Direction, world, of length 1 along the view axis, so that the ray's parameter is the depth; of a panoramic
+        camera of length 1, or 0 where its lens sees nothing.
     """
     p = parameters
     x = (px - p[CX]) / p[FX]
@@ -177,6 +182,16 @@ def camera_ray(parameters, px, py):  # type: ignore[no-untyped-def]
             -p[2],
             -p[5],
             -p[8],
+        )
+    if p[PANORAMA] != 0.0:
+        x, y, z = panorama_direction(p, x, y)
+        return (
+            ox,
+            oy,
+            oz,
+            p[0] * x + p[1] * y + p[2] * z,
+            p[3] * x + p[4] * y + p[5] * z,
+            p[6] * x + p[7] * y + p[8] * z,
         )
     return (
         ox,

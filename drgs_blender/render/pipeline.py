@@ -25,6 +25,7 @@ from .film.film import COMPONENTS, Film
 from .film.motion_vectors import MotionFilm, SceneState, vector_pass
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.mesh import primary_mesh
+from .gbuffer.surfel_rays import SurfelRays, blend_along_rays
 from .gbuffer.surfels import Stages, primary_surfels, show_captured, snap_windows
 from .gbuffer.visible_lights import visible_lights
 from .integrator.adaptive import part_count, sample_adaptively
@@ -32,6 +33,7 @@ from .integrator.variance import variances
 from .prepared_scene import PreparedScene
 from .shading_points import UNLIT, Radiance, ShadingPoints
 from .surfels import captured
+from .surfels.raster import SurfelSamples
 from .surfels.splats import Splats
 from .surfels.surfel_bvh import SurfelBVH
 
@@ -174,10 +176,16 @@ class VisibleSurfaces:
     def __init__(self, prepared: PreparedScene, frame: Frame, parameters: Array, backend: RenderBackend = CPU) -> None:
         self._scene, self._camera, self._parameters = prepared.scene, frame.camera, parameters
         self._tree, self._objects, self._backend = prepared.surfel_bvh, len(frame.objects), backend
-        self._splats: Splats | None = None
+        self._splats: Splats | SurfelRays | None = None
         self._captured: captured.CapturedSplats | None = None
+        self._rasterise: Callable[..., SurfelSamples] = backend.rasterise
         if frame.settings.camera_sees == "surfels":
-            self._splats = backend.prepare(prepared.surfels, frame.camera, parameters)
+            if frame.camera.panorama:
+                assert prepared.seen_surfels is not None
+                self._splats = SurfelRays.of(prepared.seen_surfels, frame.camera, parameters)
+                self._rasterise = blend_along_rays
+            else:
+                self._splats = backend.prepare(prepared.surfels, frame.camera, parameters)
             self._windows = snap_windows(prepared.scene, len(frame.objects))
             if prepared.captured:
                 self._captured = captured.project(prepared.captured, frame.camera, parameters)
@@ -191,8 +199,8 @@ class VisibleSurfaces:
                 _own_surfels(buffer, self._tree, self._objects)
             return buffer
         given = self._splats, self._scene, self._windows, self._camera, y0, y1, self._tree is None
-        if self._captured is None:
-            return primary_surfels(*given, Stages(backend.rasterise, backend.tie, backend.trace, backend.shade))
+        if self._captured is None or isinstance(self._splats, SurfelRays):
+            return primary_surfels(*given, Stages(self._rasterise, backend.tie, backend.trace, backend.shade))
         blended = captured.blend(self._captured, self._splats, y0, y1, backend.rasterise)
         stages = Stages(lambda *_: blended.samples, backend.tie, backend.trace, backend.shade)
         buffer = primary_surfels(*given, stages)

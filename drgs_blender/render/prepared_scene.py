@@ -33,6 +33,8 @@ class PreparedScene:
         All lights but the environment, emitting meshes included.
     surfel_bvh : SurfelBVH, optional
         The surfels that light meets, where ``frame.settings.rays_see`` is "surfels".
+    seen_surfels : SurfelBVH, optional
+        The surfels that the camera sees along its rays, where it is panoramic.
     previous, following : SceneState, optional
         The scene one frame earlier and later, for motion vectors; None: nothing moves.
     captured : tuple of CapturedObject
@@ -44,6 +46,7 @@ class PreparedScene:
     surfels: PosedSurfels
     lights: Lights | None = None
     surfel_bvh: SurfelBVH | None = None
+    seen_surfels: SurfelBVH | None = None
     previous: SceneState | None = None
     following: SceneState | None = None
     captured: tuple[CapturedObject, ...] = ()

@@ -18,7 +18,7 @@ from ..compute.jit import njit
 from ..compute.threads import use_threads
 from ..core.asset.model import PosedSurfels
 from ..core.errors import Cancelled
-from ..core.frame import Camera, Frame, RenderSettings
+from ..core.frame import Frame, RenderSettings
 from .backend import CPU, RenderBackend
 from .camera import camera_parameters
 from .film.film import Film
@@ -65,17 +65,15 @@ def coarse(frame: Frame, size: int, by_mesh: bool = False) -> Frame:
     x0, y0, x1, y1 = camera.window
     width, height = max(1, round((x1 - x0) / size)), max(1, round((y1 - y0) / size))
     sx, sy = width / (x1 - x0), height / (y1 - y0)
-    view = Camera(
-        matrix_world=camera.matrix_world,
+    view = replace(
+        camera,
         width=width,
         height=height,
         fx=camera.fx * sx,
         fy=camera.fy * sy,
         cx=(camera.cx - x0) * sx,
         cy=(camera.cy - y0) * sy,
-        orthographic=camera.orthographic,
-        clip_start=camera.clip_start,
-        clip_end=camera.clip_end,
+        region=None,
     )
     samples, by_strategy = min(3, frame.settings.samples), frame.settings.strategy_samples
     few = by_strategy and (min(1, by_strategy[0]), min(1, by_strategy[1]), min(1, by_strategy[2]))

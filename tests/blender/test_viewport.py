@@ -234,7 +234,7 @@ def test_a_local_view_shows_its_objects_alone(crowd):
 # --- cameras -------------------------------------------------------------------------------------------------------
 
 
-def through(camera, scene, width, height, zoom=1.0):
+def through(camera, scene, width, height, zoom=1.0, curved=False):
     """A region that shows what `camera` sees, as Blender's own camera view does."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     projection = camera.calc_matrix_camera(depsgraph, x=width, y=height)
@@ -243,11 +243,12 @@ def through(camera, scene, width, height, zoom=1.0):
     rv3d = SimpleNamespace(
         window_matrix=projection,
         view_matrix=camera.matrix_world.normalized().inverted(),
-        is_perspective=camera.data.type == "PERSP",
+        is_perspective=camera.data.type != "ORTHO",
         view_perspective="CAMERA",
     )
     space = SimpleNamespace(camera=camera, clip_start=0.1, clip_end=100.0, use_render_border=False)
-    return part("addon.export.view").view_camera(SimpleNamespace(width=width, height=height), space, rv3d, scene)
+    region = SimpleNamespace(width=width, height=height)
+    return part("addon.export.view").view_camera(region, space, rv3d, scene, curved)
 
 
 @pytest.mark.parametrize("kind", ["PERSP", "ORTHO"])
@@ -269,7 +270,27 @@ def test_camera_view_is_the_final_frame(scene, kind, size, fit):
         assert getattr(seen, name) == pytest.approx(getattr(final, name), rel=2e-4), name
 
 
-def test_a_panoramic_camera_is_refused_in_its_view_as_by_f12(scene, ball, monkeypatch):
+def test_a_panoramic_camera_fills_its_frame_in_the_view(scene):
+    """Zoomed out by two, its picture is the middle half of the region, and the border a part of that."""
+    data, render = scene.camera.data, scene.render
+    data.type = "PANO"
+    part("addon.export.camera").lens_of(data).panorama_type = "EQUIRECTANGULAR"
+    render.resolution_x, render.resolution_y = 640, 360
+    final = part("addon.export.camera").export_camera(scene.camera, render)
+    seen = through(scene.camera, scene, 640, 360, curved=True)
+    names = ("width", "height", "fx", "fy", "cx", "cy", "region", "panorama")
+    assert all(getattr(seen, name) == getattr(final, name) for name in names)
+    half = through(scene.camera, scene, 640, 360, zoom=0.5, curved=True)
+    assert half.panorama == "equirectangular" and half.window == (160, 90, 480, 270)
+    assert (half.fx, half.cx, half.cy) == pytest.approx((final.fx / 2, 320, 180), rel=1e-4)
+    render.use_border = True
+    render.border_min_x, render.border_max_x, render.border_min_y, render.border_max_y = 0.25, 0.75, 0.1, 0.6
+    assert through(scene.camera, scene, 640, 360, zoom=0.5, curved=True).window == (240, 162, 400, 252)
+    assert through(scene.camera, scene, 640, 360).panorama == ""
+
+
+def test_a_panorama_without_rays_is_refused_in_its_view_as_by_f12(scene, ball, monkeypatch):
+    part("addon.export.camera").lens_of(scene.camera.data).panorama_type = "MIRRORBALL"
     views = part("addon.viewport.views")
     asked = []
     monkeypatch.setattr(views.worker, "submit", lambda name, request: asked.append(name))
@@ -290,7 +311,7 @@ def test_a_panoramic_camera_is_refused_in_its_view_as_by_f12(scene, ball, monkey
         views.forget()
         asked.clear()
         error = views.update(context, depsgraph, "view", composited)
-        assert ("Perspective or Orthographic" in error) == refused and bool(asked) != refused
+        assert ("Choose Equirectangular" in error) == refused and bool(asked) != refused
     views.forget()
 
 

@@ -18,6 +18,7 @@ from drgs_blender.deform.binding import bind
 from drgs_blender.formats.harmonics import rotate_harmonics
 from drgs_blender.formats.registry import read_environment, read_mesh, read_surfels
 from drgs_blender.ipc import frame_file
+from drgs_blender.ipc.codec import CodecError, completed, decode_frame, encode_frame
 from drgs_blender.ipc.frame_file import read_frame_file, write_frame_file
 
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
@@ -73,6 +74,20 @@ def test_frame_files_of_format_1_open(tmp_path: Path) -> None:
     assert (strategies.strategy_samples, strategies.sample_count) == ((16, 8, 4), 28)
     write_frame_file(tmp_path / "again.drgsframe", frame)
     assert read_frame_file(tmp_path / "again.drgsframe").settings == expected
+
+
+def test_fields_that_came_after_format_2_have_their_defaults() -> None:
+    light = Light("sun", "sun", np.eye(4))
+    data, arrays = encode_frame(frame_of([ObjectState("ball", "b.drgs")], lights=[light]))
+    old = json.loads(json.dumps(data))
+    for name in ("panorama", "fov", "lens"):
+        del old["camera"][name]
+    del old["lights"][0]["normalize"], old["history"]
+    assert completed(Frame, old) == data
+    assert decode_frame(completed(Frame, old), arrays).camera.lens == (0.0, 1.0, 0.0, 0.0, 0.0)
+    old["camera"]["colour"] = 3
+    with pytest.raises(CodecError, match="camera"):
+        decode_frame(completed(Frame, old), arrays)
 
 
 def test_frame_files_of_a_later_format_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -115,15 +115,19 @@ def _one(passes: dict[str, Array], name: str) -> Array:
 def _camera_text(camera: Camera) -> str:
     numbers = [*np.asarray(camera.matrix_world, np.float64)[:3].ravel(), camera.fx, camera.fy, camera.cx, camera.cy]
     size = [camera.width, camera.height, *camera.window]
-    return json.dumps([[float(x) for x in numbers], bool(camera.orthographic), [int(x) for x in size]])
+    text = [[float(x) for x in numbers], bool(camera.orthographic), [int(x) for x in size]]
+    lens = [[camera.panorama, float(camera.fov), [float(x) for x in camera.lens]]] if camera.panorama else []
+    return json.dumps(text + lens)
 
 
 def _parameters(text: str) -> tuple[Array, tuple[int, ...]]:
     """`camera.camera_parameters` (what sampling adds to them left at its defaults), and the window."""
-    numbers, orthographic, size = json.loads(text)
+    numbers, orthographic, size, *lens = json.loads(text)
     matrix = np.eye(4)
     matrix[:3] = np.reshape(np.array(numbers[:12], np.float64), (3, 4))
     width, height, x0, y0, x1, y1 = size
     fx, fy, cx, cy = numbers[12:]
     camera = Camera(matrix, width, height, fx, fy, cx, cy, orthographic, region=(x0, y0, x1, y1))
+    if lens:
+        camera.panorama, camera.fov, camera.lens = lens[0]
     return camera_parameters(camera, RenderSettings(), 0), tuple(size)

@@ -24,7 +24,7 @@ import numpy as np
 from ...compute.jit import njit
 from ...compute.threads import ROWS, over_range
 from ...core.frame import Camera, RenderSettings
-from ..camera import FX, FY, ORTHOGRAPHIC, WIDTH, sample_ray
+from ..camera import FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, sample_ray
 from ..gbuffer.gbuffer import GBuffer
 from ..lights.environment import EnvironmentLight, envmap_radiance, map_at
 from ..sampling import luminance
@@ -113,6 +113,7 @@ class Film:
         self.transparent = settings.film_transparent
         self.origin = (x0, y0)
         self.parameters = parameters
+        self.round = camera.panorama in ("fisheye", "equisolid")
         self.pixels = Pixels.empty(size)
         self.environment, self.veiled = (np.zeros((*size, 3), np.float32) for _ in range(2))
 
@@ -204,6 +205,8 @@ class Film:
 
     def _beauty(self, light: Array, environment: Array, shadow: Array) -> Array:
         opaque = self.pixels.coverage + self.pixels.catcher[:, :, 0] * shadow if self.transparent else np.float32(1.0)
+        if self.transparent and self.round:
+            over_range(_around, len(shadow), self.parameters, *self.origin, opaque, fewest=ROWS)
         return add_light(light, environment, self.pixels.emission, opaque)
 
 
@@ -318,9 +321,24 @@ def _develop(y0, y1, points, surfaces, light, pass_index, p, pixels):  # type: i
 def _world(p, pixel, sample, envmap):  # type: ignore[no-untyped-def]
     """The world's radiance along the ray of a sub-pixel sample."""
     _, _, _, dx, dy, dz = sample_ray(p, pixel, sample)
-    scale = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+    square = dx * dx + dy * dy + dz * dz
+    if square == 0.0:  # beyond the picture of a fisheye lens
+        return np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    scale = 1.0 / np.sqrt(square)
     u, v = map_at(np.float32(dx * scale), np.float32(dy * scale), np.float32(dz * scale), envmap)
     return envmap_radiance(u, v, envmap)
+
+
+@njit
+def _around(first, last, p, x0, y0, opaque):  # type: ignore[no-untyped-def]
+    """Add the share of each pixel's samples that a fisheye lens does not see: it is black, as in Cycles."""
+    width, subpixels = np.int64(p[WIDTH]), np.int64(p[SUBPIXELS])
+    for y in range(first, last):
+        for x in range(opaque.shape[1]):
+            for k in range(subpixels):
+                _, _, _, dx, dy, dz = sample_ray(p, (y0 + y) * width + x0 + x, k)
+                if dx * dx + dy * dy + dz * dz == 0.0:
+                    opaque[y, x] += np.float32(1.0 / subpixels)
 
 
 @njit

@@ -7,6 +7,7 @@ that a seen point moves exactly as its surfel.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from ...compute.jit import inlined, njit
 from ...compute.threads import ELEMENTS, ROWS, over_range
 from ..camera import CX, CY, FX, FY, ORTHOGRAPHIC, POSITION, WIDTH
 from ..gbuffer.gbuffer import GBuffer
+from ..panorama import EQUIRECTANGULAR, PANORAMA, panorama_place
 from ..scene.interaction import position_at
 from ..scene.trace_scene import TraceScene
 from ..shading_points import CATCHER
@@ -159,12 +161,15 @@ def project(p, x, y, z):  # type: ignore[no-untyped-def]
     px, py : float64
         Pixels, from the upper left corner of the full picture.
     depth : float64
-        Metres along the view axis.
+        Metres along the view axis; from the centre of a panoramic camera.
     """
     x, y, z = x - p[POSITION], y - p[POSITION + 1], z - p[POSITION + 2]
     depth = -(p[2] * x + p[5] * y + p[8] * z)
     right = p[0] * x + p[3] * y + p[6] * z
     up = p[1] * x + p[4] * y + p[7] * z
+    if p[PANORAMA] != 0.0:
+        u, v = panorama_place(p, right, up, depth)
+        return p[CX] + p[FX] * u, p[CY] - p[FY] * v, np.sqrt(right * right + up * up + depth * depth)
     scale = 1.0 if p[ORTHOGRAPHIC] != 0.0 else 1.0 / depth
     return p[CX] + p[FX] * right * scale, p[CY] - p[FY] * up * scale, depth
 
@@ -264,5 +269,8 @@ def _vectors(first, last, now, before, position, previous, coverage, vector):  #
             bx, by, depth = project(
                 before, np.float64(previous[y, x, 0]), np.float64(previous[y, x, 1]), np.float64(previous[y, x, 2])
             )
+            if before[PANORAMA] == EQUIRECTANGULAR:  # the shorter way round
+                turn = 2.0 * math.pi * before[FX]
+                bx -= turn * np.rint((bx - ax) / turn)
             if depth > 0.0 or before[ORTHOGRAPHIC] != 0.0:
                 vector[y, x, 0], vector[y, x, 1] = np.float32(bx - ax), np.float32(by - ay)

@@ -135,6 +135,9 @@ def trace_samples(thread, stride, scratch, tracer, view_of, mask, owners, out): 
         for n in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
             x, y, k = n // subpixels % columns, n // (subpixels * columns), n % subpixels
             ox, oy, oz, dx, dy, dz = sample_ray(p, (y0 + y) * width + x0 + x, k)
+            if dx * dx + dy * dy + dz * dz == 0.0:  # beyond the picture of a fisheye lens
+                owner[y, x, k] = -1
+                continue
             start, along = (F(ox), F(oy), F(oz)), (F(dx), F(dy), F(dz))
             t, f, i, u, v, gx, gy, gz = nearest(tracer, Ray(start, along, near, far, mask))
             depth[y, x, k], face[y, x, k], instance[y, x, k] = t, f, i

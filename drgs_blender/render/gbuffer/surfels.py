@@ -45,6 +45,7 @@ from ..surfels.splats import Splats
 from .camera_hits import MeshHits, shade_mesh, trace_camera
 from .gbuffer import GBuffer, compact, face_viewer
 from .layers import combine
+from .surfel_rays import SurfelRays
 
 Array = np.ndarray
 
@@ -70,7 +71,7 @@ def snap_windows(scene: TraceScene, object_count: int) -> Array:
 
 
 def primary_surfels(
-    splats: Splats,
+    splats: Splats | SurfelRays,
     scene: TraceScene,
     windows: Array,
     camera: Camera,
@@ -83,8 +84,8 @@ def primary_surfels(
 
     Parameters
     ----------
-    splats : Splats
-        `prepare` of this frame.
+    splats : Splats or SurfelRays
+        `prepare` of this frame; of a panoramic camera `SurfelRays`, which the stages must blend.
     scene : TraceScene
     windows : array
         `snap_windows` of this frame.
@@ -334,7 +335,7 @@ class Stages(NamedTuple):
         As of `mesh.primary_mesh`, for ordinary meshes next to the surfels.
     """
 
-    rasterise: Callable[[Splats, int, int], SurfelSamples] = rasterise
+    rasterise: Callable[[Any, int, int], SurfelSamples] = rasterise
     tie: Callable[..., None] = tie_to_mesh
     trace: Callable[..., MeshHits] = trace_camera
     shade: Callable[..., None] = shade_mesh

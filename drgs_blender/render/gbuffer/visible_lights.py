@@ -61,6 +61,8 @@ def _look(y0, y1, p, points, alpha, lights, out):  # type: ignore[no-untyped-def
                     n += 1
                 ox, oy, oz, dx, dy, dz = sample_ray(p, place, k)
                 length = np.sqrt(dx * dx + dy * dy + dz * dz)
+                if length == 0.0:  # beyond the picture of a fisheye lens
+                    continue
                 # As in Cycles, rays start at the clip distance: soft lights face that place.
                 origin = F(ox + near * dx), F(oy + near * dy), F(oz + near * dz)
                 direction = F(dx / length), F(dy / length), F(dz / length)
