@@ -297,3 +297,20 @@ def test_materials_and_adjustments_do_not_show_on_it(captured_path, frame_of):
     changed.objects[0].albedo = np.full_like(changed.objects[0].vertices, 0.9)
     changed.objects[0].adjustment = Adjustment(tint=(1.0, 0.0, 0.0))
     assert_same_bits(session.render(changed), plain)
+
+
+@pytest.mark.slow
+def test_a_device_shows_the_same(shiny_path, asset_path, frame_of, monkeypatch):
+    """Warp's processor as the card: posed, blended and lit there."""
+    pytest.importorskip("warp", reason="warp-lang is not installed")
+    pictures = []
+    for device in ("cpu", "cuda"):
+        frame = frame_of(shiny_path, samples=8, device=device)
+        frame.objects[0].vertices[:, 0] += 0.2 * frame.objects[0].vertices[:, 2]
+        beside(frame, asset_path)
+        pictures.append(session_of(shiny_path, asset_path).render(frame))
+        monkeypatch.setattr("drgs_blender.render.gpu.select_backend.name_of", lambda device: "cpu")
+    here, there = pictures
+    assert here.warnings == there.warnings
+    for name in ("Combined", "Emit", "DiffDir"):
+        assert here[name].any() and np.mean((here[name] - there[name]) ** 2) < 1e-6
