@@ -58,16 +58,11 @@ def captured_faults(state: ObjectState, asset: Asset, frame: Frame) -> list[str]
         return [f"{name}: is lit as usual, since panoramic cameras show no captured colours"]
     if frame.settings.camera_sees == "mesh":
         return [f"{name}: its captured colours are those of surfels; it is lit as usual while Camera Sees is Mesh"]
-    found = []
-    if seen.diffuse or seen.glossy:
-        if frame.settings.rays_see == "surfels":
-            found.append(
-                f"{name}: reflections and indirect light see its materials instead of its captured colours while "
-                "Rays See is Surfels"
-            )
-        elif not len(asset.mesh.faces):
-            found.append(f"{name}: has no mesh, so others reflect no captured colours of it and get no shadow")
-    return found
+    if len(asset.mesh.faces) or not (seen.diffuse or seen.glossy or seen.shadow):
+        return []
+    if frame.settings.rays_see == "surfels":
+        return [f"{name}: has no mesh, so reflections and indirect light see its materials, not its captured colours"]
+    return [f"{name}: has no mesh, so others reflect no captured colours of it and get no shadow"]
 
 
 def glow_of(asset: Asset, key: str) -> Glow:

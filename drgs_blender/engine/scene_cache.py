@@ -257,7 +257,8 @@ class SceneCache:
         if known is not None and same:
             return known
         tree = SurfelBVH() if known is None else known
-        masks = [group_mask(item.state.visibility, True) for item in objects]
+        # Of what glows, rays meet the mesh.
+        masks = [0 if item.glowing is not None else group_mask(item.state.visibility, True) for item in objects]
         tree.update(join([item.posed for item in objects if item.posed is not None]), np.array(masks, np.int32))
         self._in_tree = objects
         return tree
@@ -341,7 +342,7 @@ def _begun(state: ObjectState, loaded: _Loaded, mode: tuple[bool, bool]) -> Cach
     met, shown = mode
     item = CachedObject(state, loaded, traced_object(state, loaded.asset, met or shown), mode=mode)
     item.faults = material_faults(state)
-    if shown and not met and len(loaded.asset.mesh.faces):
+    if shown and len(loaded.asset.mesh.faces):
         item.glowing = glowing_mesh(state, item.traced, loaded.glow_of(state.asset))
     return item
 

@@ -150,8 +150,10 @@ def test_a_lit_object_beside_it_has_the_light_it_has_beside_a_glowing_mesh(captu
     assert np.abs(a - b).mean() < 0.02 * b.mean()
 
 
-def test_a_mirror_shows_its_colour(captured_path, frame_of):
-    frame = with_meshes(frame_of(captured_path, ("GlossDir", "GlossInd", "Emit"), samples=32))
+@pytest.mark.parametrize("rays_see", ["mesh", "surfels"])
+def test_a_mirror_shows_its_colour(captured_path, frame_of, rays_see):
+    passes = "GlossDir", "GlossInd", "Emit"
+    frame = with_meshes(frame_of(captured_path, passes, samples=32, rays_see=rays_see))
     frame.world = World(strength=0.0)
     floor = frame.meshes[0]
     floor.materials = [Material("mirror", (1.0, 1.0, 1.0), 0.0, 1.0)]
@@ -258,19 +260,12 @@ def test_an_asset_without_harmonics_is_lit_and_says_so(asset_path, frame_of):
 
 def test_what_cannot_be_shown_is_named_and_no_longer(captured_path, frame_of):
     session = session_of(captured_path)
-    for change, words in (
-        ({"camera_sees": "mesh"}, "Camera Sees is Mesh"),
-        ({"rays_see": "surfels"}, "Rays See is Surfels"),
-    ):
-        (warning,) = session.render(frame_of(captured_path, **change)).warnings
-        assert warning.startswith("Ball: ") and words in warning
-        assert not session.render(frame_of(captured_path)).warnings
+    (warning,) = session.render(frame_of(captured_path, camera_sees="mesh")).warnings
+    assert warning.startswith("Ball: ") and "Camera Sees is Mesh" in warning
+    assert not session.render(frame_of(captured_path)).warnings
     caught = frame_of(captured_path)
     caught.objects[0].visibility.shadow_catcher = True
     assert "shadow catcher" in session.render(caught).warnings[0]
-    hidden = frame_of(captured_path, rays_see="surfels")
-    hidden.objects[0].visibility = Visibility(diffuse=False, glossy=False)
-    assert not session.render(hidden).warnings
 
 
 def test_without_a_mesh_it_is_seen_by_the_camera_alone(tmp_path, captured_path, frame_of):
@@ -282,9 +277,15 @@ def test_without_a_mesh_it_is_seen_by_the_camera_alone(tmp_path, captured_path, 
     frame.objects[0].vertices = None
     picture = session.render(frame)
     (warning,) = picture.warnings
-    assert "has no mesh" in warning
+    assert "has no mesh" in warning and "no shadow" in warning
     inside = picture["Combined"][..., 3] > 0.999
     assert np.allclose(np.median(picture["Combined"][inside, :3], axis=0), srgb_to_linear(np.array(COLOUR)), atol=2e-3)
+    frame.settings.rays_see = "surfels"
+    (warning,) = session.render(frame).warnings
+    assert "has no mesh" in warning and "its materials" in warning
+    frame.settings.rays_see = "mesh"
+    frame.objects[0].visibility = Visibility(diffuse=False, glossy=False, shadow=False)
+    assert not session.render(frame).warnings
     frame.objects[0].captured_colours = False
     with pytest.raises(AssetError, match="has no faces"):
         session.render(frame)
