@@ -69,18 +69,21 @@ def _some(picture: Image) -> Array:
     return picture.pixels[:: steps[0], :: steps[1]].reshape(-1, 4)
 
 
-def export_curved(image: bpy.types.Image, straight: bool, source: str, curve: bytes, warn: Warn) -> Image:
+def export_curved(
+    image: bpy.types.Image, straight: bool, source: str, curve: bytes, warn: Warn, data: bool = False
+) -> Image:
     """Pixels of an 8-bit texture whose bytes stand for other values.
 
     Parameters
     ----------
     source : channel whose bytes are looked up for red, green and blue; "rgb" is each of its own
     curve : (256, 3) float32 in [0, 1], linear, as bytes
+    data : keep the values as they are; else colours are encoded as sRGB
     """
     plain = export_image(image, straight, warn)
     assert plain is not None, "a curve is made of pixels"
     values = np.frombuffer(curve, np.float32).reshape(256, 3)
-    number = bool((np.ptp(values, axis=1) < 1e-6).all()) and source != "rgb"
+    number = data or (bool((np.ptp(values, axis=1) < 1e-6).all()) and source != "rgb")
     table = np.rint(255 * (values if number else linear_to_srgb(values))).astype(np.uint8)
 
     def make(_: bpy.types.Image) -> Image:
@@ -88,10 +91,10 @@ def export_curved(image: bpy.types.Image, straight: bool, source: str, curve: by
         for i in range(3):
             pixels[..., i] = table[:, i][plain.pixels[..., i if source == "rgb" else "rgba".index(source)]]
         pixels.flags.writeable = False
-        mark = hashlib.blake2b(source.encode() + curve, digest_size=6).hexdigest()
+        mark = hashlib.blake2b(source.encode() + b"data" * data + curve, digest_size=6).hexdigest()
         return Image(f"{plain.name} ({mark})", pixels, "linear" if number else "srgb")
 
-    return _remembered(image, f"{straight} {source} {hashlib.blake2b(curve).hexdigest()}", make)
+    return _remembered(image, f"{straight} {source} {data} {hashlib.blake2b(curve).hexdigest()}", make)
 
 
 def is_grey(picture: Image) -> bool:

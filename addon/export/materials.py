@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import bpy
 import numpy as np
 
-from ...drgs_blender.core.frame import Image, Material, Texture
+from ...drgs_blender.core.frame import Image, Material, SurfaceDetail, Texture
+from .layers import AttributeRef, LayerRef
+from .normal_nodes import DetailRef
 from .socket_value import SocketValue, Warn
 from .surface_nodes import SurfaceWalker
 from .texture_refs import TextureRef
@@ -16,10 +19,17 @@ from .texture_refs import TextureRef
 
 @dataclass(frozen=True, slots=True)
 class ExportedMaterial:
-    """An exported material; ``material`` None is an invisible one, ``uv_map`` "" the active UV map."""
+    """An exported material; ``material`` None is an invisible one.
+
+    Attributes
+    ----------
+    uv_map : UV map that is the mesh's own, "" the active one
+    layers : further coordinates and values that its textures refer to
+    """
 
     material: Material | None
     uv_map: str | None = None
+    layers: tuple[LayerRef, ...] = ()
 
 
 DEFAULT_MATERIAL = Material("Default")
@@ -64,23 +74,42 @@ class Materials:
             "metallic": surface.metallic,
             "emission": surface.emission,
         }
-        values: dict[str, Any] = {}
-        maps: list[str] = []
-        for name, value in paints.items():
-            picture = value.texture
-            values[name] = _usable(tree, name, value, getattr(DEFAULT_MATERIAL, name))
-            if isinstance(picture, TextureRef):
-                values[f"{name}_texture"] = self._texture(picture)
-                maps.append(picture.uv_map)
-        if len(set(maps)) > 1:
-            names = ", ".join(name or "the active one" for name in dict.fromkeys(maps))
-            self._warn(f'Material "{material.name}": of its UV maps ({names}) only the first is used')
-        return ExportedMaterial(Material(material.name, **values), maps[0] if maps else None)
+        textures = [value.texture for value in (*paints.values(), *(d.value for d in surface.details)) if value.texture]
+        wanted = [t.layer for t in textures] + [d.tangents for d in surface.details if d.kind == "tangent"]
+        uv_map = next((layer.name for layer in wanted if layer.source == "uv"), None)
+        layers = tuple(dict.fromkeys(layer for layer in wanted if layer != LayerRef("uv", uv_map or "")))
 
-    def _texture(self, picture: TextureRef) -> Texture:
+        def label(layer: LayerRef) -> str:
+            return layer.label if layer in layers else ""
+
+        values: dict[str, Any] = {}
+        for name, value in paints.items():
+            values[name] = _usable(tree, name, value, getattr(DEFAULT_MATERIAL, name))
+            if value.texture is not None:
+                values[f"{name}_texture"] = self._texture(value.texture, label(value.texture.layer))
+        details = [self._detail(tree, detail, label) for detail in surface.details]
+        return ExportedMaterial(Material(material.name, **values, details=details), uv_map, layers)
+
+    def _detail(self, tree: SurfaceWalker, detail: DetailRef, label: Callable[[LayerRef], str]) -> SurfaceDetail:
+        texture, numbers = detail.value.texture, (*detail.value.colour, detail.strength, detail.distance)
+        if not np.isfinite(numbers).all():
+            tree.report("its normal or bump map has a number that is not finite; it is left out. Check its drivers")
+            return SurfaceDetail("bump")
+        return SurfaceDetail(
+            detail.kind,
+            None if texture is None else self._texture(texture, label(texture.layer)),
+            tuple(map(float, detail.value.colour)),
+            max(detail.strength, 0.0),
+            detail.distance,
+            label(detail.tangents),
+        )
+
+    def _texture(self, picture: TextureRef | AttributeRef, layer: str) -> Texture:
+        if isinstance(picture, AttributeRef):
+            return picture.texture("", layer)
         exported = picture.export(self._warn)
         self.images[exported.name] = exported
-        return picture.texture(exported.name)
+        return picture.texture(exported.name, layer)
 
 
 def _usable(tree: SurfaceWalker, name: str, value: SocketValue, default: tuple[float, float, float] | float) -> object:

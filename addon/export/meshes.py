@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import bpy
 import numpy as np
 
-from ...drgs_blender.core.frame import Image, Material, MeshState
+from ...drgs_blender.core.frame import Image, Layer, Material, MeshState
 from .. import mesh_arrays
 from .export_cache import ExportCache, uid
 from .instances import Key, Visible
@@ -117,7 +117,7 @@ class Meshes:
         corners, polygons, index = arrays.corners, arrays.polygons, arrays.material_index
         if index is not None:
             index = np.clip(index, 0, len(exported) - 1)[polygons]  # as Cycles reads what is out of range
-        corners, index = _seen(corners, index, exported)
+        corners, polygons, index = _seen(corners, polygons, index, exported)
         if len(corners) == 0:
             return None
         normals = arrays.normals
@@ -132,6 +132,27 @@ class Meshes:
             material_index=None if index is None or not index.any() else _frozen(index.astype(np.int32)),
             materials=[material.material or DEFAULT_MATERIAL for material in exported],
             visibility=item.visibility,
+            layers=self._layers(item.object.name, mesh, (corners, polygons, arrays.corner_vertices), exported),
+        )
+
+    def _layers(
+        self, name: str, mesh: bpy.types.Mesh, elements: tuple[Array, Array, Array], exported: list[ExportedMaterial]
+    ) -> list[Layer]:
+        """All that textures of its materials refer to besides the UV map that each asks for first."""
+        found = []
+        for ref in dict.fromkeys(layer for material in exported for layer in material.layers):
+            values = ref.values(mesh, *elements)
+            if values is None:
+                self._lacks_uvs(name, ref.name)
+                values = np.zeros((len(elements[0]), 3, 2), np.float32)
+            found.append(Layer(ref.label, _frozen(np.ascontiguousarray(values))))
+        return found
+
+    def _lacks_uvs(self, name: str, uv_map: str) -> None:
+        which = f'the UV map "{uv_map}"' if uv_map else "a UV map"
+        self._warn(
+            f'"{name}": its textures need {which}, which it has not; they show a single texel. Unwrap it, or '
+            "choose a map that it has"
         )
 
     def _uvs(
@@ -145,11 +166,7 @@ class Meshes:
         for uv_map in {u for u in requested if u is not None}:
             values = mesh_arrays.read_uvs(mesh, uv_map)
             if values is None:
-                which = f'the UV map "{uv_map}"' if uv_map else "a UV map"
-                self._warn(
-                    f'"{name}": its textures need {which}, which it has not; they show a single texel. Unwrap it, or '
-                    "choose a map that it has"
-                )
+                self._lacks_uvs(name, uv_map)
                 continue
             if index is None:
                 faces: slice | Array = slice(None) if requested[0] == uv_map else slice(0)
@@ -180,18 +197,21 @@ def _images_of(state: MeshState | None) -> set[str]:
         return set()
     names = [name for name in Material.__dataclass_fields__ if name.endswith("_texture")]
     textures = [getattr(material, name) for material in state.materials for name in names]
-    return {texture.image for texture in textures if texture is not None}
+    textures += [detail.texture for material in state.materials for detail in material.details]
+    return {texture.image for texture in textures if texture is not None and texture.image}
 
 
-def _seen(corners: Array, index: Array | None, exported: list[ExportedMaterial]) -> tuple[Array, Array | None]:
+def _seen(
+    corners: Array, polygons: Array, index: Array | None, exported: list[ExportedMaterial]
+) -> tuple[Array, Array, Array | None]:
     """Only the faces whose material is seen."""
     unseen = [i for i, material in enumerate(exported) if material.material is None]
     if not unseen:
-        return corners, index
+        return corners, polygons, index
     if index is None:
-        return (corners[:0] if 0 in unseen else corners), None
+        return (corners[:0], polygons[:0], None) if 0 in unseen else (corners, polygons, None)
     kept = ~np.isin(index, unseen)
-    return corners[kept], index[kept]
+    return corners[kept], polygons[kept], index[kept]
 
 
 def _frozen(array: Array) -> Array:

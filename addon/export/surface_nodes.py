@@ -8,9 +8,9 @@ import bpy
 import numpy as np
 
 from .node_math import reflectance
+from .normal_nodes import DetailRef, NormalWalker
 from .socket_value import Array, SocketValue, constant, once, uniform
 from .sockets import SocketRef, surface_of
-from .texture_nodes import TextureWalker
 
 #: Of the Principled BSDF: inputs that must be zero, and what they are called in the warning.
 _LOBES = {
@@ -37,9 +37,10 @@ class Surface:
     emission: SocketValue = field(default_factory=lambda: uniform(0))
     scattered: float = 0.0
     clear: float = 0.0
+    details: tuple[DetailRef, ...] = ()
 
 
-class SurfaceWalker(TextureWalker):
+class SurfaceWalker(NormalWalker):
     """Evaluates a material on a mesh."""
 
     def surface(self) -> Surface | None:
@@ -96,6 +97,7 @@ class SurfaceWalker(TextureWalker):
             emission.times(alpha),
             scattered=alpha,
             clear=1 - alpha,
+            details=self.normal_of(output),
         )
 
     def reflectance(self, output: SocketRef) -> float:
@@ -115,20 +117,17 @@ class SurfaceWalker(TextureWalker):
 
     def warn_unsupported(self, output: SocketRef, unsupported: list[str]) -> None:
         """One warning for all that a shader node does beyond the supported."""
-        normal = output.node.inputs.get("Normal")
-        if normal is not None and normal.is_linked:
-            unsupported = [*unsupported, "its normal or bump map"]
         if unsupported:
             self.warn(output.node, f"not rendered: {', '.join(unsupported)}")
 
     def shader_bsdf_diffuse(self, output: SocketRef) -> Surface:
         self.warn_unsupported(output, [])
-        return Surface(self.colour(output.input("Color")), scattered=1)
+        return Surface(self.colour(output.input("Color")), scattered=1, details=self.normal_of(output))
 
     def shader_bsdf_glossy(self, output: SocketRef) -> Surface:
         self.warn_unsupported(output, ["anisotropy"] if _used(output.input("Anisotropy")) else [])
         base, roughness = self.colour(output.input("Color")), self.number(output.input("Roughness"))
-        return Surface(base, roughness, uniform(1), scattered=1)
+        return Surface(base, roughness, uniform(1), scattered=1, details=self.normal_of(output))
 
     def shader_bsdf_metallic(self, output: SocketRef) -> Surface:
         node = output.node
@@ -137,7 +136,7 @@ class SurfaceWalker(TextureWalker):
             unsupported.append("physical conductor (its Base Color is used)")
         self.warn_unsupported(output, unsupported)
         base, roughness = self.colour(output.inputs()["Base Color"]), self.number(output.input("Roughness"))
-        return Surface(base, roughness, uniform(1), scattered=1)
+        return Surface(base, roughness, uniform(1), scattered=1, details=self.normal_of(output))
 
     def shader_emission(self, output: SocketRef) -> Surface:
         operands = self.colour(output.input("Color")), self.number(output.input("Strength"))
@@ -195,7 +194,18 @@ class SurfaceWalker(TextureWalker):
             self.combine(node, mix, share, first.emission, second.emission),
             scattered=sum(weights),
             clear=(1 - mean) * first.clear + mean * second.clear,
+            details=self.stronger_details(node, first, second, weights),
         )
+
+    def stronger_details(
+        self, node: bpy.types.Node, first: Surface, second: Surface, weights: tuple[float, float]
+    ) -> tuple[DetailRef, ...]:
+        """Normal and bump maps of the surface that scatters more, for both."""
+        more, less = (first, second) if weights[0] >= weights[1] else (second, first)
+        alike = len(first.details) == len(second.details) and all(map(DetailRef.same, first.details, second.details))
+        if min(weights) > 0 and not alike:
+            self.warn(node, "its shaders have other normal or bump maps; those of the stronger one are used for both")
+        return more.details if max(weights) > 0 else ()
 
     def other_shader(self, output: SocketRef) -> Surface:
         """The nearest to a shader that is not known: its colour, scattered."""
@@ -204,7 +214,8 @@ class SurfaceWalker(TextureWalker):
         colours = [s for s in node.inputs if s.type == "RGBA" and s.enabled]
         base = self.colour(SocketRef(colours[0], output.groups)) if colours else uniform(0.8)
         rough = output.input("Roughness") if "Roughness" in node.inputs else None
-        return Surface(base, self.number(rough) if rough else uniform(1), scattered=1)
+        rough_value = self.number(rough) if rough else uniform(1)
+        return Surface(base, rough_value, scattered=1, details=self.normal_of(output))
 
 
 def _used(ref: SocketRef) -> bool:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, cast
 
 import bpy
 import numpy as np
 
 from . import images
+from .layers import AttributeRef, LayerRef, attribute_values, colour_average
 from .node_math import reflectance
 from .nodes import Walker, euler, vector_rotate
 from .socket_value import Array, SocketValue, Warn, uniform
@@ -33,10 +35,15 @@ class TextureWalker(Walker):
     def mean(self, texture: Any) -> Array:
         return texture.mean(self._warn)
 
-    def channel(self, texture: Any, name: str) -> TextureRef:
+    def channel(self, texture: Any, name: str) -> TextureRef | AttributeRef:
         return texture.only(cast(Channel, name))
 
     def curved(self, texture: Any, function: Callable[[Array], Array]) -> SocketValue | None:
+        if isinstance(texture, AttributeRef):
+            made, exact = texture.curved(function)
+            if not exact:
+                self.report(f'nodes change the values "{texture.layer.name}" at the corners; between, they are blended')
+            return SocketValue(np.ones(3), made)
         found = texture.curved(function, self._warn)
         return None if found is None else SocketValue(np.full(3, found[1]), found[0])
 
@@ -51,14 +58,16 @@ class TextureWalker(Walker):
             self.warn(node, f"the {node.projection.title()} projection is not supported; the UV map is used")
         if node.interpolation not in ("Linear", "Closest"):
             self.warn(node, f"{node.interpolation} interpolation is read as Linear")
-        matrix, uv_map = self.coordinates(output.input("Vector"))
+        matrix, layer = self.coordinates(output.input("Vector"))
+        if layer.source != "uv":
+            layer, matrix = replace(layer, matrix=tuple(map(tuple, matrix.tolist()))), np.eye(4)
         return SocketValue(
             np.ones(3),
             TextureRef(
                 image,
                 straight,
                 "a" if output.socket.name == "Alpha" else "rgb",
-                uv_map,
+                layer,
                 tuple(map(tuple, matrix.tolist())),
                 "closest" if node.interpolation == "Closest" else "linear",
                 node.extension.lower(),
@@ -82,19 +91,23 @@ class TextureWalker(Walker):
         return self.attribute(output, node.attribute_name)
 
     def attribute(self, output: SocketRef, name: str) -> SocketValue:
-        """The mean of an attribute of the mesh; "" is the colour attribute that renders."""
+        """Values of an attribute of the mesh; "" is the colour attribute that renders."""
         self.uses_mesh = True
         if name == "" and len(self.mesh.color_attributes):
             name = self.mesh.color_attributes[max(self.mesh.color_attributes.render_color_index, 0)].name
-        values = _attribute_values(self.mesh, name)
+        values = attribute_values(self.mesh, name)
         if values is None:
             self.warn(output.node, f'mesh "{self.mesh.name}" has no values "{name}"; a plain grey is used')
             return uniform(self.unknown)
-        self.warn(output.node, f'values on the mesh are not rendered; the mean of "{name}" is used')
-        mean = values.mean(axis=0, dtype=np.float64)
+        layer, channel = LayerRef("attribute", name), cast(Channel, "rgb")
         if output.socket.name == "Alpha":
-            return uniform(mean[3] if len(mean) == 4 else 1)
-        return uniform(mean[:3].mean()) if output.socket.identifier == "Fac" else uniform(mean[:3])
+            channel = "a"
+        elif output.socket.type == "VALUE":
+            layer, values, channel = replace(layer, change=colour_average, mark="mean"), colour_average(values), "r"
+        texture = AttributeRef(layer, channel, np.nan_to_num(values.astype(np.float64)))
+        if (np.ptp(values, axis=0) == 0).all():
+            return SocketValue(texture.mean(self._warn))
+        return SocketValue(np.ones(3), texture)
 
     def node_ambient_occlusion(self, output: SocketRef) -> SocketValue:
         if output.socket.type == "RGBA":
@@ -116,32 +129,38 @@ class TextureWalker(Walker):
 
     # Coordinates
 
-    def coordinates(self, ref: SocketRef) -> tuple[Array, str]:
-        """(4, 4) from UV coordinates to those of a texture, and the UV map's name ("" is the active one)."""
+    def coordinates(self, ref: SocketRef) -> tuple[Array, LayerRef]:
+        """(4, 4) from coordinates on the mesh to those of a texture, and which ones these are."""
         origin = ref.origin()
         if not origin.socket.is_output:
-            return np.eye(4), ""
+            return np.eye(4), LayerRef("uv")
         node, name = origin.node, origin.socket.name
         if node.type == "UVMAP":
-            return np.eye(4), node.uv_map
+            return np.eye(4), LayerRef("uv", node.uv_map)
         if node.type == "TEX_COORD":
+            if name in ("Generated", "Object") and node.object is None and not node.from_instancer:
+                return np.eye(4), LayerRef("generated" if name == "Generated" else "object")
             if name != "UV":
                 self.warn(node, f"{name} coordinates are not supported; the UV map is used")
-            return np.eye(4), ""
+            return np.eye(4), LayerRef("uv")
         if node.type == "ATTRIBUTE" and node.attribute_type == "GEOMETRY":
-            return np.eye(4), node.attribute_name
+            self.uses_mesh = True
+            known = (
+                node.attribute_name in self.mesh.uv_layers or attribute_values(self.mesh, node.attribute_name) is None
+            )
+            return np.eye(4), LayerRef("uv" if known else "vector", node.attribute_name)
         if node.type == "MAPPING" and node.vector_type != "NORMAL":
-            matrix, uv_map = self.coordinates(origin.input("Vector"))
-            return self.mapping(origin) @ matrix, uv_map
+            matrix, layer = self.coordinates(origin.input("Vector"))
+            return self.mapping(origin) @ matrix, layer
         if node.type == "VECTOR_ROTATE":
-            matrix, uv_map = self.coordinates(origin.input("Vector"))
+            matrix, layer = self.coordinates(origin.input("Vector"))
             centre = np.append(self.fixed(origin.input("Center")), 1)
             turn = np.eye(4)
             turn[:3, :3] = vector_rotate(self, origin)
             turn[:3, 3] = (centre - turn @ centre)[:3]
-            return turn @ matrix, uv_map
+            return turn @ matrix, layer
         if node.type == "VECT_MATH" and node.operation in ("ADD", "SUBTRACT", "MULTIPLY", "SCALE"):
-            matrix, uv_map = self.coordinates(origin.input(0))
+            matrix, layer = self.coordinates(origin.input(0))
             change = np.eye(4)
             if node.operation == "SCALE":
                 change[:3, :3] *= self.value(origin.input("Scale"))
@@ -149,10 +168,10 @@ class TextureWalker(Walker):
                 change[:3, :3] = np.diag(self.fixed(origin.input(1)))
             else:
                 change[:3, 3] = self.fixed(origin.input(1)) * (1 if node.operation == "ADD" else -1)
-            return change @ matrix, uv_map
+            return change @ matrix, layer
         inputs = [s for s in node.inputs if s.type == "VECTOR" and s.is_linked]
         self.warn(node, f"{node.bl_label} is not supported between UV map and image, and left out")
-        return self.coordinates(SocketRef(inputs[0], origin.groups)) if inputs else (np.eye(4), "")
+        return self.coordinates(SocketRef(inputs[0], origin.groups)) if inputs else (np.eye(4), LayerRef("uv"))
 
     def mapping(self, output: SocketRef) -> Array:
         """(4, 4) of a Mapping node."""
@@ -168,21 +187,3 @@ class TextureWalker(Walker):
             self.warn(node, "a Scale of 0 cannot be undone; it is left out")
             return np.eye(4)
         return np.linalg.inv(matrix)
-
-
-def _attribute_values(mesh: bpy.types.Mesh, name: str) -> Array | None:
-    """(n, 1), (n, 2), (n, 3) or (n, 4) float32 values of a mesh's attribute, colours linear; None without any."""
-    attribute = mesh.attributes.get(name)
-    kinds = {
-        "FLOAT_COLOR": ("color", 4),
-        "BYTE_COLOR": ("color", 4),
-        "FLOAT_VECTOR": ("vector", 3),
-        "FLOAT2": ("vector", 2),
-        "FLOAT": ("value", 1),
-    }
-    if attribute is None or attribute.data_type not in kinds or len(attribute.data) == 0:
-        return None
-    prop, width = kinds[attribute.data_type]
-    values = np.empty((len(attribute.data), width), np.float32)
-    attribute.data.foreach_get(prop, values.ravel())
-    return values

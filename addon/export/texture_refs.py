@@ -16,6 +16,7 @@ import numpy as np
 from ...drgs_blender.core.color import srgb_to_linear
 from ...drgs_blender.core.frame import Image, Texture
 from . import images
+from .layers import LayerRef
 from .nodes import LUMINANCE
 
 Array = np.ndarray
@@ -36,24 +37,27 @@ class TextureRef:
     straight : as of images.export_image
     channel : of the picture, after the curve
     curve : (256, 3) float32 as bytes, the value that each byte stands for; empty where it stands for itself
+    layer : coordinates that place it, before `matrix`
     source : channel of the image whose bytes the curve is of; "rgb" is each of its own
+    data : values that are no colours, such as normals: a curve of them is not encoded as sRGB
     """
 
     image: bpy.types.Image
     straight: bool
     channel: Channel
-    uv_map: str
+    layer: LayerRef
     matrix: tuple[tuple[float, ...], ...]
     interpolation: Literal["linear", "closest"]
     extension: Literal["repeat", "extend", "clip", "mirror"]
     curve: bytes = b""
     source: str = "rgb"
+    data: bool = False
 
     def export(self, warn: Warn) -> Image:
         """The pixels."""
         if not self.curve:
             return self._plain(warn)
-        return images.export_curved(self.image, self.straight, self.source, self.curve, warn)
+        return images.export_curved(self.image, self.straight, self.source, self.curve, warn, self.data)
 
     def _plain(self, warn: Warn) -> Image:
         """The pixels before the curve. What has none is no texture: whoever makes a `TextureRef` has looked."""
@@ -61,10 +65,10 @@ class TextureRef:
         assert exported is not None, self.image
         return exported
 
-    def texture(self, name: str) -> Texture:
-        """What it is on the surface; `name` is that of the exported image."""
+    def texture(self, name: str, layer: str = "") -> Texture:
+        """What it is on the surface; `name` is that of the exported image, `layer` that of the exported layer."""
         matrix = np.array(self.matrix)[:2, (0, 1, 3)]
-        return Texture(name, self.channel, matrix, self.interpolation, self.extension)
+        return Texture(name, self.channel, matrix, self.interpolation, self.extension, layer)
 
     def mean(self, warn: Warn) -> Array:
         """(3,) linear mean; of one channel three times the same."""

@@ -186,12 +186,12 @@ class Image:
 
 @dataclass(slots=True)
 class Texture:
-    """An image on a surface.
+    """An image on a surface, or values that lie on the surface itself.
 
     Attributes
     ----------
     image : str
-        Name of one of ``Frame.images``.
+        Name of one of ``Frame.images``; "" for the values of the layer itself, which then has four numbers a corner.
     channel : {"rgb", "r", "g", "b", "a", "luminance"}
         Channel that is used: "rgb" for colours, one channel or the luminance for numbers.
     transform : (2, 3) float64 array
@@ -200,6 +200,8 @@ class Texture:
         As Blender's Image Texture node.
     extension : {"repeat", "extend", "clip", "mirror"}
         As Blender's Image Texture node.
+    layer : str
+        Name of one of ``MeshState.layers``, whose coordinates place the image; "" for ``MeshState.uvs``.
     """
 
     image: str
@@ -207,6 +209,37 @@ class Texture:
     transform: Array = field(default_factory=lambda: np.eye(2, 3))
     interpolation: Literal["linear", "closest"] = "linear"
     extension: Literal["repeat", "extend", "clip", "mirror"] = "repeat"
+    layer: str = ""
+
+
+@dataclass(slots=True)
+class SurfaceDetail:
+    """A normal map or a bump map, which changes the shading normal; as Blender's nodes of these names.
+
+    Attributes
+    ----------
+    kind : {"tangent", "object", "world", "blender_object", "blender_world", "bump"}
+        Space of a normal map, or a bump map.
+    texture : Texture, optional
+        Normals as colours, or heights; None: the same everywhere. The tangents of a normal map follow the coordinates
+        of ``tangents``.
+    colour : tuple of float
+        Linear Rec.709, times the texture; of a bump map the first counts.
+    strength : float
+        At least 0.
+    distance : float
+        Metres that a height of 1 stands out, of a bump map; negative ones go in.
+    tangents : str
+        Layer with two numbers a corner whose coordinates the tangents follow, of a normal map in tangent space; "" for
+        ``MeshState.uvs``.
+    """
+
+    kind: Literal["tangent", "object", "world", "blender_object", "blender_world", "bump"]
+    texture: Texture | None = None
+    colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    strength: float = 1.0
+    distance: float = 1.0
+    tangents: str = ""
 
 
 @dataclass(slots=True)
@@ -221,6 +254,8 @@ class Material:
         In [0, 1]; with a texture factors that may be larger.
     emission : tuple of float
         Linear Rec.709 radiance, colour times strength.
+    details : list of SurfaceDetail
+        Done to the shading normal one after the other.
     """
 
     name: str
@@ -232,6 +267,23 @@ class Material:
     roughness_texture: Texture | None = None
     metallic_texture: Texture | None = None
     emission_texture: Texture | None = None
+    details: list[SurfaceDetail] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class Layer:
+    """Values at the corners of a mesh's faces, to which textures refer.
+
+    Attributes
+    ----------
+    name : str
+        Unlike those of the mesh's other layers.
+    values : (m, 3, 2) or (m, 3, 4) float32 array
+        One per face corner: texture coordinates (u, v), or colour (linear Rec.709) and alpha, or any numbers.
+    """
+
+    name: str
+    values: Array
 
 
 @dataclass(slots=True)
@@ -253,6 +305,8 @@ class MeshState:
         Unit, object space, or None for smooth angle-weighted vertex normals.
     uvs : (m, 3, 2) float32 array, optional
         One per face corner, or None without textures.
+    layers : list of Layer
+        Further texture coordinates, and values such as colour attributes.
     material_index : (m,) int32 array, optional
         Into ``materials``, or None: the first everywhere.
     materials : list of Material
@@ -271,6 +325,7 @@ class MeshState:
     material_index: Array | None = None
     materials: list[Material] = field(default_factory=lambda: [Material("Default")])
     visibility: Visibility = field(default_factory=Visibility)
+    layers: list[Layer] = field(default_factory=list)
 
 
 @dataclass(slots=True)

@@ -304,7 +304,7 @@ class SceneCache:
                 )
         for item in self.objects:
             found += item.faults
-        found += self.scene.mesh_materials.table.warnings
+        found += self.scene.mesh_materials.warnings
         found += self.lights.warnings
         if self.environment is not None and self.environment.bad_texels:
             found.append(

@@ -41,6 +41,7 @@ class PointArrays(NamedTuple):
     metallic: Array
     own: Array
     size: Array
+    smooth: Array
 
 
 @dataclass(slots=True)
@@ -74,6 +75,8 @@ class ShadingPoints:
         surfels; empty where they meet meshes alone.
     size : (n,) float32 array
         Metres: mean larger standard deviation of these surfels; as long as ``own``.
+    smooth : (n, 3) float32 array
+        Unit: shading normal without normal and bump maps, or 0 where it is ``normal``; empty in a scene without such.
     """
 
     pixel: Array
@@ -89,6 +92,7 @@ class ShadingPoints:
     flags: Array = field(default_factory=lambda: np.zeros(0, np.uint8))
     own: Array = field(default_factory=lambda: np.zeros(0, np.int32))
     size: Array = field(default_factory=lambda: np.zeros(0, np.float32))
+    smooth: Array = field(default_factory=lambda: np.zeros((0, 3), np.float32))
 
     def __post_init__(self) -> None:
         self.pixel = np.ascontiguousarray(self.pixel, np.int32)
@@ -99,6 +103,7 @@ class ShadingPoints:
         self.flags = np.ascontiguousarray(self.flags if len(self.flags) else np.zeros(n), np.uint8)
         self.own = np.ascontiguousarray(self.own, np.int32)
         self.size = as_float(self.size, (len(self.own),), "shading point size")
+        self.smooth = as_float(self.smooth, (len(self.smooth), 3), "shading point smooth")
 
     def __len__(self) -> int:
         return len(self.pixel)

@@ -534,11 +534,10 @@ def test_one_warning_names_all_that_a_material_lacks(scene, export):
     for name in ("Coat Weight", "Transmission Weight", "Sheen Weight", "Subsurface Weight"):
         principled.inputs[name].default_value = 0.5
     principled.inputs["IOR"].default_value = 2.4
-    tree.links.new(add(tree, "NormalMap"), principled.inputs["Normal"])
     swatch(bpy.data.materials["Material"])
     (warning,) = export()[1]
     assert 'Material "Material", node "Principled BSDF"' in warning
-    for word in ("coat", "transmission", "sheen", "subsurface", "specular", "normal"):
+    for word in ("coat", "transmission", "sheen", "subsurface", "specular"):
         assert word in warning
 
 
@@ -671,22 +670,6 @@ def test_missing_image_is_magenta_as_in_cycles_and_named(scene, export, tmp_path
     for state, pixel in zip(sorted(frame.meshes, key=lambda s: s.vertices[:, 0].min()), (theirs[0], theirs[2])):
         np.testing.assert_allclose(state.materials[0].emission, (1, 0, 1))
         np.testing.assert_allclose(pixel, (1, 0, 1), atol=1e-6)
-
-
-def test_colours_on_the_mesh_become_their_mean(scene, export):
-    tree, principled = material()
-    data = bpy.data.materials["Material"]
-    tree.links.new(add(tree, "VertexColor", layer_name="Paint"), principled.inputs["Base Color"])
-    means = []
-    for i, seed in enumerate((1, 2)):
-        obj = swatch(data, 2.0 * i)
-        colours = np.random.default_rng(seed).uniform(0, 1, (4, 4)).astype(np.float32)
-        obj.data.attributes.new("Paint", "FLOAT_COLOR", "POINT").data.foreach_set("color", colours.ravel())
-        means.append(colours[:, :3].mean(0))
-    frame, warnings = export()
-    assert warnings and all('"Paint"' in w and 'Material "Material"' in w for w in warnings)
-    found = sorted(m.materials[0].base_colour for m in frame.meshes)
-    np.testing.assert_allclose(found, sorted(map(tuple, means)), rtol=1e-5)
 
 
 def test_unchanged_images_are_not_read_again(scene, export, tmp_path):

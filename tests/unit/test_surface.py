@@ -31,7 +31,7 @@ def _meet(tracer, geometry, mesh, o, d, mask, t, numbers, out):  # type: ignore[
         numbers[i, 0], numbers[i, 1], numbers[i, 2], numbers[i, 3] = face, place, -1, blocked
         if face >= 0:
             values = surface_at(hit, (dx, dy, dz), geometry)
-            nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, owner = values
+            nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, _, _, _, owner = values
             x, y, z = position_at(face, place, u, v, vertices, faces, places)
             out[i] = np.array([nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, x, y, z], np.float32)
             numbers[i, 2] = owner

@@ -86,7 +86,7 @@ def shade_mesh(scene: TraceScene, hits: MeshHits, parameters: Array, x0: int, bu
 def arrays_of(buffer: GBuffer) -> tuple[tuple[Array, ...], tuple[tuple[Array, ...], ...]]:
     """Pixel, sample and flags of its points, and in three groups the arrays that `shade_hits` fills."""
     points = buffer.points
-    frames = points.origin, points.normal, points.geometric_normal, points.view
+    frames = points.origin, points.normal, points.geometric_normal, points.view, points.smooth
     materials = points.albedo, points.roughness, points.metallic
     seen = buffer.position, buffer.depth, buffer.object_index, buffer.emission
     tied = buffer.face, buffer.instance, buffer.barycentric
@@ -175,7 +175,7 @@ def shade_hits(thread, stride, scratch, geometry, moving, view_of, layer, hits, 
     hit_depth, _, hit_face, hit_instance, where = hits
     pixel, sample, flags = keys
     frames, materials, seen = out
-    origin, normal, geometric, view = frames
+    origin, normal, geometric, view, smooth = frames
     albedo, roughness, metallic = materials
     position, depth, owner, emission, out_face, out_instance, barycentric = seen
     width = np.int64(p[WIDTH])
@@ -191,13 +191,15 @@ def shade_hits(thread, stride, scratch, geometry, moving, view_of, layer, hits, 
             # Points that a device found and has lost are traced again, where a ray along an edge may meet nothing.
             face = max(hit_face[y, x, k], np.int32(0))
             hit = Hit(hit_depth[y, x, k], face, instance, u, v, where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4])
-            nx, ny, nz, gx, gy, gz, r, g, b, rough, metal, er, eg, eb, who = surface_at(
+            nx, ny, nz, gx, gy, gz, r, g, b, rough, metal, er, eg, eb, ux, uy, uz, who = surface_at(
                 hit, (F(-vx), F(-vy), F(-vz)), geometry
             )
-            sx, sy, sz = face_viewer(
-                np.float64(nx), np.float64(ny), np.float64(nz), np.float64(gx), np.float64(gy), np.float64(gz),
-                vx, vy, vz,
-            )  # fmt: skip
+            sx, sy, sz = np.float64(nx), np.float64(ny), np.float64(nz)
+            # A normal of a map may look away from the viewer, as in Cycles.
+            if nx == ux and ny == uy and nz == uz:
+                sx, sy, sz = face_viewer(sx, sy, sz, np.float64(gx), np.float64(gy), np.float64(gz), vx, vy, vz)
+            elif len(smooth) > 0:
+                smooth[n, 0], smooth[n, 1], smooth[n, 2] = ux, uy, uz
             px, py, pz = position_at(face, instance, u, v, vertices, faces, instances)
             origin[n, 0], origin[n, 1], origin[n, 2] = px, py, pz
             position[n, 0], position[n, 1], position[n, 2] = px, py, pz

@@ -120,7 +120,9 @@ class GBuffer:
             self.points.flags |= np.where(object_flags[self.object_index] & CATCHER_OBJECT, CATCHER, 0).astype(np.uint8)
 
 
-def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | None = None) -> GBuffer:
+def compact(
+    alpha: Array, parameters: Array, x0: int, y0: int, second: Array | None = None, detailed: bool = False
+) -> GBuffer:
     """Make room for the samples with positive `alpha`, with pixel, sample, weight and flags filled in.
 
     Parameters
@@ -132,6 +134,8 @@ def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | N
         Full-picture pixel of ``alpha[0, 0]``.
     second : (rows, width, subpixels) float32 array, optional
         Of a second layer, or None: its points follow those of their samples.
+    detailed : bool
+        Whether there are normal or bump maps, so that points have smooth normals apart.
     """
     n = np.count_nonzero(alpha) + (0 if second is None else np.count_nonzero(second))
     pixel, sample, owner, face, instance = np.empty((5, n), np.int32)
@@ -141,6 +145,7 @@ def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | N
     none = np.empty((0, 0, 0), np.float32)
     _number(alpha, none if second is None else second, parameters, x0, y0, pixel, sample, weight, flags)
     points = ShadingPoints(pixel, sample, weight, origin, normal, geometric, view, albedo, roughness, metallic, flags)
+    points.smooth = np.zeros((n if detailed else 0, 3), np.float32)
     emission = np.zeros((n, 3), np.float32)
     tied = face, instance, np.empty((n, 2), np.float32)
     return GBuffer((y0, y0 + len(alpha)), points, position, depth, owner, emission, *tied, alpha)

@@ -44,7 +44,7 @@ def primary_mesh(
     x0, _, x1, _ = camera.window
     hits = trace(scene, parameters, x0, y0, (y1 - y0, x1 - x0, int(parameters[SUBPIXELS])), CAMERA)
     layers = lone(hits, scene)
-    buffer = compact(layers.first, parameters, x0, y0)
+    buffer = compact(layers.first, parameters, x0, y0, None, scene.mesh_materials.table.detailed)
     buffer.alpha = layers.opaque
     shade(scene, hits, parameters, x0, buffer, 0)
     buffer.mark_catchers(scene.object_flags)

@@ -99,7 +99,8 @@ def primary_surfels(
     stages = stages or Stages()
     samples = stages.rasterise(splats, y0, y1)
     layers = combine(samples, scene, splats.parameters, camera.window[0], y0, stages.trace)
-    buffer = compact(layers.first, splats.parameters, camera.window[0], y0, layers.second)
+    detailed = scene.mesh_materials.table.detailed
+    buffer = compact(layers.first, splats.parameters, camera.window[0], y0, layers.second, detailed)
     buffer.alpha = layers.opaque
     points = buffer.points
     stages.tie(

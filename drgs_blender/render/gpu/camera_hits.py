@@ -82,9 +82,13 @@ def shade(
     with launcher.failures("copying the scene"):
         geometry, moving = mirror.geometry(scene), mirror.moving(scene)
     # Those alone: what is written to comes back as a whole.
-    found = tuple(tuple(np.empty((len(chosen), *array.shape[1:]), array.dtype) for array in group) for group in out)
+    found = tuple(
+        tuple(np.zeros((min(len(chosen), len(array)), *array.shape[1:]), array.dtype) for array in group)
+        for group in out
+    )
     arguments = geometry, moving, (parameters, x0, buffer.rows[0]), layer, hits.on_device
     launcher.launch(SHADE, len(chosen), (*arguments, tuple(key[chosen] for key in keys)), found)
     for group, values in zip(out, found):
         for array, value in zip(group, values):
-            array[chosen] = value
+            if len(array):
+                array[chosen] = value

@@ -124,6 +124,8 @@ def _trace_lights(rays, count, scene, settings, sums):  # type: ignore[no-untype
     s = rays.floats
     w.light_directions(rays, count, scene.lights)
     w.evaluate(rays, count, settings.shading_model)
+    if scene.traits.detailed:
+        w.soften(rays, count)
     mask = np.int32(ray_masks.SHADOW << settings.shift)
     for slot in range(count):
         i, _ = w.at(slot)
@@ -156,6 +158,8 @@ def _trace_envmap(rays, count, scene, settings, sums):  # type: ignore[no-untype
     s = rays.floats
     w.environment_directions(rays, count, scene.envmap)
     w.evaluate(rays, count, settings.shading_model)
+    if scene.traits.detailed:
+        w.soften(rays, count)
     if scene.traits.lobes_apart:
         mis.balance_heuristic_per_lobe(rays, count)
     else:
@@ -201,6 +205,8 @@ def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: igno
         w.ggx_directions(rays, count)
         mask = np.int32(ray_masks.GLOSSY << shift)
     w.evaluate(rays, count, shading_model)
+    if scene.traits.detailed:
+        w.soften(rays, count)
     w.look_up(rays, count, envmap)
     cosine = ggx = ONE
     if scene.traits.lobes_apart and strategy == COSINE:

@@ -64,7 +64,11 @@ def _surfaces(rays, count, scene, settings):  # type: ignore[no-untyped-def]
     for slot in range(count):
         a, c = w.at(slot)
         vx, vy, vz = s[a + w.VX], s[a + w.VY], s[a + w.VZ]
-        nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, _, _, _ = surface_of(tracer, rays, slot, geometry)
+        nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, _, _, _, ux, uy, uz = surface_of(
+            tracer, rays, slot, geometry
+        )
+        if scene.traits.detailed:
+            s[a + w.UX], s[a + w.UY], s[a + w.UZ] = ux, uy, uz
         mx, my, mz = brdf.glossy_normal(nx, ny, nz, gx, gy, gz, vx, vy, vz)
         s[a + w.NX], s[a + w.NY], s[a + w.NZ] = nx, ny, nz
         s[a + w.MX], s[a + w.MY], s[a + w.MZ] = mx, my, mz
@@ -74,6 +78,13 @@ def _surfaces(rays, count, scene, settings):  # type: ignore[no-untyped-def]
         s[a + w.AR], s[a + w.AG], s[a + w.AB] = r, g, b
         s[a + w.METALLIC], s[a + w.A2] = metallic, brdf.alpha_squared(roughness)
         s[a + w.KD] = brdf.diffuse_weight(roughness, metallic, mx * vx + my * vy + mz * vz, shading_model, layers)
+
+
+@njit
+def _evaluate(rays, count, scene, shading_model):  # type: ignore[no-untyped-def]
+    w.evaluate(rays, count, shading_model)
+    if scene.traits.detailed:
+        w.soften(rays, count)
 
 
 @njit
@@ -200,16 +211,16 @@ def trace_paths(rays, count, scene, settings, found):  # type: ignore[no-untyped
         if scene.traits.environment:
             w.fresh_numbers(rays, count, GOLDEN)
             w.environment_directions(rays, count, envmap)
-            w.evaluate(rays, count, shading_model)
+            _evaluate(rays, count, scene, shading_model)
             mis.path_weights(rays, count, ONE)
             _towards_envmap(rays, count, scene, shift, found)
         if scene.traits.lights:
             w.fresh_numbers(rays, count, U(0x2C1B3C6D))
             w.light_directions(rays, count, lights)
-            w.evaluate(rays, count, shading_model)
+            _evaluate(rays, count, scene, shading_model)
             _towards_lights(rays, count, scene, shift, found)
         w.fresh_numbers(rays, count, U(0x7FEB352D))
         w.brdf_directions(rays, count)
-        w.evaluate(rays, count, shading_model)
+        _evaluate(rays, count, scene, shading_model)
         mis.path_weights(rays, count, ZERO)
         count = _onwards(rays, count, bounce, bounce + 1 == settings.bounces, scene, shift, found)

@@ -130,7 +130,8 @@ def integrate(
         tracer = tracer._replace(**tracer_of(surfels)._asdict())
     extent = F(scene.extent if surfels is None else max(scene.extent, surfels.extent))
     apart = scene.rays_differ and (auto or min(counts[:2]) > 0)
-    traits = Traits(extent, not environment.black, lights.count > 0, emissive, lights.rays_differ, apart)
+    detailed = scene.mesh_materials.table.detailed
+    traits = Traits(extent, not environment.black, lights.count > 0, emissive, lights.rays_differ, apart, detailed)
     given = Scene(tracer, geometry, envmap, light_tables, traits)
     clamp = F(settings.clamp_indirect * settings.subpixel_count * part[1] / sum(counts))
     how = Settings(settings.bounces, brdf.SHADING_DATABLOCKS[settings.shading_model], brdf.layer_table(), clamp, 0)
@@ -255,7 +256,7 @@ def shade_points(thread, stride, scratch, points, scene, settings, sampler, out)
                         begun = trace_batch(strategy, count, begun, scratch, scene, settings)
                         count = np.int64(0)
                     total[h] += 1
-                    put_sample(scene.tracer, rays, count, points, i, state, h, rate)
+                    put_sample(scene, rays, count, points, i, state, h, rate)
                     _, c = w.at(count)
                     ints[c + w.KEY] = mix(U(key ^ U(U(j + 1) * U(0x85EBCA6B))))
                     ints[c + w.CELL], ints[c + w.ROW] = key, scratch.row[h]

@@ -291,7 +291,7 @@ def _face_of(rays, slot, geometry):  # type: ignore[no-untyped-def]
     i, c = w.at(slot)
     face, instance = np.int32(ints[c + w.N0]), np.int32(ints[c + w.N1])
     hit = Hit(ZERO, face, instance, s[i + w.MU], s[i + w.MV], s[i + w.GX], s[i + w.GY], s[i + w.GZ])
-    return surface_at(hit, (-s[i + w.VX], -s[i + w.VY], -s[i + w.VZ]), geometry)[:14]
+    return surface_at(hit, (-s[i + w.VX], -s[i + w.VY], -s[i + w.VZ]), geometry)[:17]
 
 
 @njit
@@ -307,7 +307,7 @@ def surface_of_meshes(tracer, rays, slot, geometry):  # type: ignore[no-untyped-
 
     Returns
     -------
-    nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb : float32
+    nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, ux, uy, uz : float32
         As of `surface_of`.
     """
     return _face_of(rays, slot, geometry)
@@ -335,6 +335,8 @@ def surface_of(tracer, rays, slot, geometry):  # type: ignore[no-untyped-def]
         In [0, 1].
     er, eg, eb : float32
         Emitted radiance, linear Rec.709; 0 of surfels.
+    ux, uy, uz : float32
+        Unit shading normal without normal and bump maps, world.
     """
     s, ints = rays
     i, c = w.at(slot)
@@ -343,6 +345,7 @@ def surface_of(tracer, rays, slot, geometry):  # type: ignore[no-untyped-def]
     return (
         s[i + w.NX], s[i + w.NY], s[i + w.NZ], s[i + w.GX], s[i + w.GY], s[i + w.GZ],
         s[i + w.AR], s[i + w.AG], s[i + w.AB], s[i + w.A2], s[i + w.METALLIC], ZERO, ZERO, ZERO,
+        s[i + w.NX], s[i + w.NY], s[i + w.NZ],
     )  # fmt: skip
 
 

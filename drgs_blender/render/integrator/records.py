@@ -30,6 +30,8 @@ class Traits(NamedTuple):
         Whether diffuse and glossy rays see different lights.
     lobes_apart : bool
         The same of objects: cosine samples are of the diffuse lobe alone, GGX samples of the specular one.
+    detailed : bool
+        Whether surfaces have normal or bump maps.
     """
 
     extent: np.float32
@@ -38,6 +40,7 @@ class Traits(NamedTuple):
     emissive: bool
     lights_differ: bool
     lobes_apart: bool
+    detailed: bool
 
 
 class Scene(NamedTuple):

@@ -108,14 +108,14 @@ def write_point_states(first, last, points, scene, settings, sampler, scratch): 
 
 
 @njit
-def put_sample(tracer, rays, slot, points, i, state, h, rate):  # type: ignore[no-untyped-def]
+def put_sample(scene, rays, slot, points, i, state, h, rate):  # type: ignore[no-untyped-def]
     """Copy a shading point into a slot: surface, viewer, BRDF parameters and number of samples of each strategy.
 
     Parameters
     ----------
-    tracer : MixedTracer
+    scene : Scene
     rays : Batch
-        Written: fields from OX to KD, WC to WL, OWNER, and those of `put_start`.
+        Written: fields from OX to KD, WC to WL, OWNER, those of `put_start`, and U where there are normal maps.
     slot : int64
     points : PointArrays
     i : int64
@@ -141,4 +141,9 @@ def put_sample(tracer, rays, slot, points, i, state, h, rate):  # type: ignore[n
     s[a + w.WC], s[a + w.WG] = state[h, COUNTS + COSINE] * rate, state[h, COUNTS + GGX] * rate
     s[a + w.WE], s[a + w.WL] = state[h, COUNTS + ENVIRONMENT] * rate, state[h, COUNTS + LIGHTS] * rate
     ints[c + w.OWNER] = U(h)
-    put_start(tracer, rays, slot, points, i)
+    if scene.traits.detailed:
+        s[a + w.UX], s[a + w.UY], s[a + w.UZ] = ZERO, ZERO, ZERO
+        if len(points.smooth) > 0:
+            smooth = points.smooth
+            s[a + w.UX], s[a + w.UY], s[a + w.UZ] = smooth[i, 0], smooth[i, 1], smooth[i, 2]
+    put_start(scene.tracer, rays, slot, points, i)

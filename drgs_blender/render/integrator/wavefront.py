@@ -38,7 +38,9 @@ MU, MV, PE = (LANES * i for i in range(33, 36))
 TR, TG, TB, SHARE, ER, EG, EB = (LANES * i for i in range(36, 43))
 # of a point's samples: how many each strategy draws there; where rays meet surfels: size of those that they start on
 WC, WG, WE, WL, SIZE = (LANES * i for i in range(43, 48))
-PACKET_FLOATS = 48 * LANES
+# where there are normal or bump maps: the shading normal without them, 0 where it is N
+UX, UY, UZ = (LANES * i for i in range(48, 51))
+PACKET_FLOATS = 51 * LANES
 # uint32 fields: three random numbers, the key of more, the owner (a point, or a path), a place in a table, the row of
 # the normal in the light's tables, the object of the surfels that the ray starts on (or -1)
 N0, N1, N2, KEY, OWNER, CELL, ROW, OWN = (LANES * i for i in range(8))
@@ -50,6 +52,7 @@ IN_LANES = (
     "AR", "AG", "AB", "METALLIC", "A2", "KD",
     "LX", "LY", "LZ", "LIVE", "QR", "QG", "QB", "SR", "SG", "SB", "PC", "PG",
     "MU", "MV", "PE", "TR", "TG", "TB", "SHARE", "ER", "EG", "EB", "WC", "WG", "WE", "WL", "SIZE",
+    "UX", "UY", "UZ",
     "N0", "N1", "N2", "KEY", "OWNER", "CELL", "ROW", "OWN",
 )  # fmt: skip
 
@@ -61,8 +64,8 @@ class Batch(NamedTuple):
 
     Attributes
     ----------
-    floats : (packets * 48 * LANES,) float32 array
-        Fields from OX to SIZE.
+    floats : (packets * 51 * LANES,) float32 array
+        Fields from OX to UZ.
     ints : (packets * 8 * LANES,) uint32 array
         Fields from N0 to OWN.
     """
@@ -390,6 +393,33 @@ def evaluate(rays, count, shading_model):  # type: ignore[no-untyped-def]
             s[i + PC], s[i + PG] = nl * INVERSE_PI, pg if above else ZERO
             out = min(s[i + GX] * lx + s[i + GY] * ly + s[i + GZ] * lz, max(nl, ml))
             s[i + LIVE] = ONE if out > ZERO else ZERO
+
+
+@njit
+def soften(rays, count):  # type: ignore[no-untyped-def]
+    """Take light from the diffuse lobe where a normal or bump map sees what the smooth surface turns away from.
+
+    The shadowing function of Estevez, Lecocq and Stein (2019), "A Microfacet-Based Shadowing Function to Solve the Bump
+    Terminator Problem", as in Cycles.
+
+    Parameters
+    ----------
+    rays : Batch
+        N, U and LX, LY, LZ are read, QR, QG, QB are scaled.
+    count : int64
+        Slots.
+    """
+    s = rays.floats
+    for p in range(packets(count)):
+        for i in range(p * PACKET_FLOATS, p * PACKET_FLOATS + LANES):
+            ux, uy, uz = s[i + UX], s[i + UY], s[i + UZ]
+            facing = s[i + NX] * ux + s[i + NY] * uy + s[i + NZ] * uz
+            up = max(ux * s[i + LX] + uy * s[i + LY] + uz * s[i + LZ], F(1e-6))
+            tilt, up = min(facing * facing, ONE), min(up * up, ONE)
+            a2 = min(F(0.125) * (ONE - tilt) / max(tilt, F(1e-6)), ONE)
+            g = TWO / (ONE + math.sqrt(ONE + a2 * (ONE - up) / up)) if facing > ZERO else ZERO
+            g = g if ux * ux + uy * uy + uz * uz > ZERO else ONE
+            s[i + QR], s[i + QG], s[i + QB] = s[i + QR] * g, s[i + QG] * g, s[i + QB] * g
 
 
 @njit

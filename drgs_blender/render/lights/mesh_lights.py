@@ -225,9 +225,12 @@ def _luminance(emitter: EmissiveMesh, scene: TraceScene) -> Array:
         own = emitter.material == material
         mean = float(table.mean_emission(material) @ weights)
         out[own] = mean
-        if table.arrays[1][material, 3] >= 0 and emitter.uvs is not None:
-            uv = np.einsum("pc,fcd->fpd", _LOOKUPS, emitter.uvs[own]).reshape(-1, 2)
-            found = table.lookup(np.full(len(uv), material, np.int32), uv)[:, 5:] @ weights
+        if table.arrays[1][material, 3] >= 0:
+            uvs = np.zeros((len(own), 3, 2), np.float32) if emitter.uvs is None else emitter.uvs
+            uv = np.einsum("pc,fcd->fpd", _LOOKUPS, uvs[own]).reshape(-1, 2)
+            faces = np.repeat(emitter.faces[own] - scene.vertex_faces, len(_LOOKUPS))
+            where = np.tile(_LOOKUPS[:, 1:], (int(np.count_nonzero(own)), 1))
+            found = table.lookup(np.full(len(uv), material, np.int32), uv, faces, where)[:, 5:] @ weights
             out[own] = 0.5 * (mean + found.reshape(-1, len(_LOOKUPS)).mean(axis=1))
     return out
 

@@ -12,12 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import inlined, njit
+from ...compute.jit import njit
 from ..memory import load_float, load_int32, load_int64
 from ..sampling import ONE, ZERO, F
+from .detailed_normal import SLOTS, STEPS, detailed_normal
 from .embree import blocked, trace
 from .ray import Hit
-from .texture_lookup import emission_at, emits, material_at
+from .texture_lookup import blend, emission_at, emits, material_at
 
 _TINY = F(1e-30)
 
@@ -66,7 +67,7 @@ class Geometry(NamedTuple):
     instance_object : int
         (p,) int32.
     materials : int
-        (6,) int64, ``textures.MaterialTable.addresses``.
+        (10,) int64, ``mesh_materials.MeshMaterials.addresses``.
     """
 
     shading_faces: int
@@ -120,12 +121,6 @@ def shadowed(tracer, ray):  # type: ignore[no-untyped-def]
     return blocked(tracer.occluded, tracer.scene, ray)
 
 
-@inlined
-def _blend(rows, i, j, k, w, u, v):  # type: ignore[no-untyped-def]
-    """A float32 column blended over a face, from where its corners' values lie."""
-    return w * load_float(rows, i) + u * load_float(rows, j) + v * load_float(rows, k)
-
-
 @njit
 def _turned(matrices, instance, x, y, z):  # type: ignore[no-untyped-def]
     """A normal of a shape as a unit vector in world space; (0, 0, 0) when it has no direction."""
@@ -154,18 +149,23 @@ def _normal_of_instance(normals, i, j, k, w, u, v, matrices, instance):  # type:
 
 
 @njit
-def _texture_place(own, u, v, geometry):  # type: ignore[no-untyped-def]
-    """Texture coordinates on a mesh's face, numbered without those of DR-GS objects."""
+def _place(face, u, v, geometry):  # type: ignore[no-untyped-def]
+    """A point of a mesh's face as `texture_lookup` takes it."""
+    own = np.int64(face) - geometry.vertex_faces
     if geometry.uvs == 0:
-        return ZERO, ZERO
+        return ZERO, ZERO, own, u, v
     c, w = 6 * own, ONE - u - v
-    return _blend(geometry.uvs, c, c + 2, c + 4, w, u, v), _blend(geometry.uvs, c + 1, c + 3, c + 5, w, u, v)
+    s = blend(geometry.uvs, c, c + 2, c + 4, w, u, v)
+    return s, blend(geometry.uvs, c + 1, c + 3, c + 5, w, u, v), own, u, v
 
 
 @njit
 def _tables(geometry):  # type: ignore[no-untyped-def]
     m = geometry.materials
-    return load_int64(m, 0), load_int64(m, 1), load_int64(m, 2), load_int64(m, 3), load_int64(m, 4), load_int64(m, 5)
+    return (
+        load_int64(m, 0), load_int64(m, 1), load_int64(m, 2), load_int64(m, 3), load_int64(m, 4), load_int64(m, 5),
+        load_int64(m, 6),
+    )  # fmt: skip
 
 
 @njit
@@ -191,8 +191,7 @@ def emitted(face, u, v, geometry):  # type: ignore[no-untyped-def]
     material, tables = load_int32(geometry.material, own), _tables(geometry)
     if not emits(material, tables):
         return ZERO, ZERO, ZERO
-    s, t = _texture_place(own, u, v, geometry)
-    return emission_at(material, s, t, tables)
+    return emission_at(material, _place(face, u, v, geometry), tables)
 
 
 @njit
@@ -219,6 +218,8 @@ def surface_at(hit, direction, geometry):  # type: ignore[no-untyped-def]
         In [0, 1].
     er, eg, eb : float32
         Emitted radiance, linear Rec.709.
+    ux, uy, uz : float32
+        Unit shading normal without normal and bump maps, world.
     object : int32
     """
     _, face, instance, u, v, gx, gy, gz = hit
@@ -229,29 +230,29 @@ def surface_at(hit, direction, geometry):  # type: ignore[no-untyped-def]
     k = np.int64(load_int32(geometry.shading_faces, corner + 2))
     w = ONE - u - v
     er = eg = eb = ZERO
+    material = np.int32(-1)
     owner = load_int32(geometry.face_object, np.int64(face))
     if face < geometry.vertex_faces:
         rows = geometry.shading
         i, j, k = 8 * i, 8 * j, 8 * k
-        nx = _blend(rows, i, j, k, w, u, v)
-        ny = _blend(rows, i + 1, j + 1, k + 1, w, u, v)
-        nz = _blend(rows, i + 2, j + 2, k + 2, w, u, v)
-        r = _blend(rows, i + 3, j + 3, k + 3, w, u, v)
-        g = _blend(rows, i + 4, j + 4, k + 4, w, u, v)
-        b = _blend(rows, i + 5, j + 5, k + 5, w, u, v)
-        roughness = _blend(rows, i + 6, j + 6, k + 6, w, u, v)
-        metallic = _blend(rows, i + 7, j + 7, k + 7, w, u, v)
+        nx = blend(rows, i, j, k, w, u, v)
+        ny = blend(rows, i + 1, j + 1, k + 1, w, u, v)
+        nz = blend(rows, i + 2, j + 2, k + 2, w, u, v)
+        r = blend(rows, i + 3, j + 3, k + 3, w, u, v)
+        g = blend(rows, i + 4, j + 4, k + 4, w, u, v)
+        b = blend(rows, i + 5, j + 5, k + 5, w, u, v)
+        roughness = blend(rows, i + 6, j + 6, k + 6, w, u, v)
+        metallic = blend(rows, i + 7, j + 7, k + 7, w, u, v)
     else:
-        own = np.int64(face) - geometry.vertex_faces
-        s, t = _texture_place(own, u, v, geometry)
-        material = load_int32(geometry.material, own)
-        r, g, b, roughness, metallic, er, eg, eb = material_at(material, s, t, _tables(geometry))
+        place = _place(face, u, v, geometry)
+        material = load_int32(geometry.material, place[2])
+        r, g, b, roughness, metallic, er, eg, eb = material_at(material, place, _tables(geometry))
         rows = geometry.normals
         i, j, k = 3 * i, 3 * j, 3 * k
         if instance < 0:
-            nx = _blend(rows, i, j, k, w, u, v)
-            ny = _blend(rows, i + 1, j + 1, k + 1, w, u, v)
-            nz = _blend(rows, i + 2, j + 2, k + 2, w, u, v)
+            nx = blend(rows, i, j, k, w, u, v)
+            ny = blend(rows, i + 1, j + 1, k + 1, w, u, v)
+            nz = blend(rows, i + 2, j + 2, k + 2, w, u, v)
         else:
             nx, ny, nz = _normal_of_instance(rows, i, j, k, w, u, v, geometry.instance_normal, instance)
             scale = ONE / max(abs(gx), max(abs(gy), max(abs(gz), _TINY)))
@@ -262,14 +263,21 @@ def surface_at(hit, direction, geometry):  # type: ignore[no-untyped-def]
         scale = -scale
     gx, gy, gz = gx * scale, gy * scale, gz * scale
     length = nx * nx + ny * ny + nz * nz
+    side = ONE
     if length > F(1e-12):
         scale = ONE / math.sqrt(length)
         if gx * nx + gy * ny + gz * nz < ZERO:
-            scale = -scale
+            scale, side = -scale, -ONE
         nx, ny, nz = nx * scale, ny * scale, nz * scale
     else:
         nx, ny, nz = gx, gy, gz
-    return nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, owner
+    ux, uy, uz = nx, ny, nz
+    if material >= 0:
+        slots = load_int64(geometry.materials, 1)
+        if load_int32(slots, SLOTS * np.int64(material) + STEPS) > 0:
+            place = _place(face, u, v, geometry)
+            nx, ny, nz = detailed_normal(material, (i, j, k), place, instance, (ux, uy, uz), side, geometry)
+    return nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, ux, uy, uz, owner
 
 
 @njit

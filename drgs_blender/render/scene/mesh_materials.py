@@ -12,6 +12,8 @@ from ...core.arrays import Array
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
 from ...core.frame import Image, MeshState
+from ..memory import AddressOf, address
+from .mesh_layers import MeshLayers, Placed
 from .textures import MaterialTable
 from .trace_mesh import Part, TraceObject
 
@@ -31,6 +33,7 @@ class EmissiveMesh:
     material : (k,) int32 array
         Of ``MeshMaterials.table``.
     uvs : (k, 3, 2) float32 array or None
+        By the mesh's own UVs.
     instances : array, optional
         Rows of ``TraceScene.instances``, or None where the faces are in world space.
     """
@@ -50,8 +53,10 @@ class MeshMaterials:
     ----------
     table : MaterialTable
         All materials.
-    addresses : (6,) int64 array
-        ``table.addresses``.
+    layers : MeshLayers
+        What textures and normal maps refer to.
+    addresses : (10,) int64 array
+        Of the arrays of `table`, then of the frames of `layers`.
     index : (k,) int32 array
         Material of each face, in `table`.
     uvs : (k, 3, 2) float32 array
@@ -60,9 +65,13 @@ class MeshMaterials:
 
     def __init__(self) -> None:
         self.table = MaterialTable([], [])
-        self.addresses: Array = np.array(self.table.addresses, np.int64)
+        self.layers = MeshLayers()
+        self._first_face = 0
+        self._tables: tuple[Array, Array] = self.layers.tables(0)
+        self.addresses: Array = self.addresses_at(address)
         self._given: list[Any] = []  # lists of materials, images
         self._first: list[int] = []  # of each mesh, in `table`
+        self._names: list[Any] = []  # of the layers of each mesh
         self.clear(0)
 
     def clear(self, count: int) -> None:
@@ -75,6 +84,16 @@ class MeshMaterials:
         """Names of all materials, in the order of `table`."""
         given = self._given[: max(len(self._first) - 1, 0)]
         return [material.name for materials in given for material in materials]
+
+    @property
+    def warnings(self) -> list[str]:
+        """Problems of materials, images and layers, in words."""
+        return self.table.warnings + self.layers.warnings
+
+    def addresses_at(self, address_of: AddressOf) -> Array:
+        """`addresses` of arrays that lie elsewhere; who calls it keeps what it returns."""
+        tables = self._tables if address_of is address else self.layers.tables(self._first_face, address_of)
+        return np.array([*self.table.addresses_at(address_of, tables[0]), address_of(tables[1])], np.int64)
 
     def of(self, face: Array) -> Array:
         """(n,) int64 place in `names` of the materials of faces; one behind the last for negative ones."""
@@ -90,6 +109,7 @@ class MeshMaterials:
         meshes: Sequence[MeshState],
         images: Sequence[Image],
         sources: tuple[int, int],
+        placed: Placed,
     ) -> None:
         """Bring all up to date.
 
@@ -105,6 +125,8 @@ class MeshMaterials:
             Images of their textures.
         sources : tuple of int
             First source that is a mesh, first face that is of one.
+        placed : callable
+            Where a part of a mesh stands.
 
         Raises
         ------
@@ -115,10 +137,13 @@ class MeshMaterials:
         given: list[Any] = [mesh.materials for mesh in meshes]
         first = [int(n) for n in np.cumsum([0, *(len(own) for own in given)])]
         given += images
-        if first != self._first or [id(g) for g in given] != [id(g) for g in self._given]:
-            self.table = MaterialTable([m for mesh in meshes for m in mesh.materials], list(images), self.table)
-            self.addresses = np.array(self.table.addresses, np.int64)
-            self._given = given
+        # Which layers there are, not what is in them.
+        names = [
+            (mesh.uvs is None, *((layer.name, np.shape(layer.values)[-1:]) for layer in mesh.layers)) for mesh in meshes
+        ]
+        if first != self._first or names != self._names or [id(g) for g in given] != [id(g) for g in self._given]:
+            self._make_table(meshes, images)
+            self._given, self._names = given, names
         if any(mesh.uvs is not None for mesh in meshes) and not len(self.uvs):
             self.uvs = np.zeros((len(self.index), 3, 2), np.float32)
             before = [None] * len(before)
@@ -134,6 +159,23 @@ class MeshMaterials:
             elif mesh.uvs is not None and (not isinstance(old, MeshState) or old.uvs is not mesh.uvs):
                 self.uvs[rows] = as_float(mesh.uvs, (len(part.faces), 3, 2), f"texture coordinates of {mesh.name}")
         self._first = first
+        of_mesh = {part.source - first_source: part for part in parts if isinstance(part.item, MeshState)}
+        detailed = [any(material.details for material in mesh.materials) for mesh in meshes]
+        self.layers.update(of_mesh, meshes, detailed, placed)
+        self._first_face, self._tables = first_face, self.layers.tables(first_face)
+        self.table.take_layers(self._tables[0])
+        self.addresses = self.addresses_at(address)
+
+    def _make_table(self, meshes: Sequence[MeshState], images: Sequence[Image]) -> None:
+        owner = [index for index, mesh in enumerate(meshes) for _ in mesh.materials]
+        self.layers.begin()
+
+        def layer_row(material: int, name: str, tangents: bool) -> int | None:
+            mesh = owner[material]
+            return self.layers.row(mesh, meshes[mesh], name, tangents)
+
+        materials = [m for mesh in meshes for m in mesh.materials]
+        self.table = MaterialTable(materials, list(images), self.table, layer_row, owner)
 
 
 def _material_index(mesh: MeshState, count: int) -> Array | int:

@@ -14,7 +14,8 @@ the tables too: arrays that are passed on from function to function are counted 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,8 +23,23 @@ from ...compute.jit import njit
 from ...core.arrays import frozen
 from ...core.color import LUMINANCE, srgb_to_linear, to_unit
 from ...core.errors import UsageError
-from ...core.frame import Image, Material, Texture
+from ...core.frame import Image, Material, SurfaceDetail, Texture
 from ..memory import AddressOf, address
+from .detailed_normal import (
+    COLOUR,
+    DISTANCE,
+    FIRST_STEP,
+    FRAME,
+    KIND,
+    KINDS,
+    SLOTS,
+    STEP_FLOATS,
+    STEP_INTS,
+    STEPS,
+    STRENGTH,
+    TANGENTS,
+    TEXTURE,
+)
 from .texture_lookup import (
     BRIGHTEST,
     BYTE,
@@ -37,8 +53,12 @@ from .texture_lookup import (
 )
 
 Array = np.ndarray
+#: Function of a material's index, a layer's name and whether tangents are meant, to the row of `MeshLayers`; or None.
+LayerRow = Callable[[int, str, bool], int | None]
 
 _SLOTS = ("base_colour_texture", "roughness_texture", "metallic_texture", "emission_texture")
+#: Strengths, distances and colours of normal and bump maps above this are no use.
+_STRONGEST = 1e12
 #: What Blender shows of an image that is not there.
 _MISSING = np.array([[[255, 0, 255, 255]]], np.uint8)
 
@@ -85,6 +105,10 @@ class MaterialTable:
         Images that their textures name; only those in use are read.
     previous : MaterialTable, optional
         Table of the frame before: what it made of images whose pixels are the same frozen array is taken over.
+    layer_row : callable, optional
+        Says where layers of the material's mesh are found; None: there are none.
+    frames : sequence of int, optional
+        Of each material, the row of its mesh among the frames that its details need; see `mesh_layers`.
 
     Raises
     ------
@@ -94,22 +118,35 @@ class MaterialTable:
     Attributes
     ----------
     addresses : tuple of int
-        Of the six arrays, for ``material_at``; valid as long as this table lives.
+        Of the first seven arrays, for ``material_at``; valid as long as this table lives.
     arrays : tuple of array
         Arrays that ``material_at`` reads:
         constants (k, 8) float32, the eight results without textures;
-        slots (k, 4) int32, rows of textures for base colour, roughness, metallic and emission, or -1;
-        textures (t, 4) int32, image, channel, interpolation, extension;
+        slots (k, 8) int32, rows of textures for base colour, roughness, metallic and emission, or -1; nothing; first
+        step and number of steps of its details, row of its mesh's frame;
+        textures (t, 5) int32, image or -1, channel, interpolation, extension, layer or -1;
         transforms (t, 6) float32;
         images (i, 4) int64, address, width, height, kind;
-        decode (256,) float32, linear value of each sRGB byte.
+        decode (256,) float32, linear value of each sRGB byte;
+        layers (l, 2) int64, see `mesh_layers.MeshLayers`, which fills it;
+        steps (d, 4) int32, kind, texture or -1, layer of the tangents or -1, nothing;
+        numbers (d, 8) float32, strength, distance, colour.
+    detailed : bool
+        Whether anything has a normal or a bump map.
     emissive : bool
         Whether anything emits light.
     warnings : list of str
         Problems and their substitutes, in words.
     """
 
-    def __init__(self, materials: list[Material], images: list[Image], previous: MaterialTable | None = None) -> None:
+    def __init__(
+        self,
+        materials: list[Material],
+        images: list[Image],
+        previous: MaterialTable | None = None,
+        layer_row: LayerRow = lambda material, name, tangents: None,
+        frames: Sequence[int] = (),
+    ) -> None:
         self.warnings: list[str] = []
         self._given = {image.name: image for image in images}
         if len(self._given) < len(images):
@@ -117,42 +154,72 @@ class MaterialTable:
         self._known = previous._images if previous else {}
         self._rows: dict[str, int] = {}
         self._images: dict[str, _Texels] = {}
-        self._textures: list[tuple[int, int, int, int]] = []
+        self._textures: list[tuple[int, int, int, int, int]] = []
         self._transforms: list[Array] = []
+        self._steps: list[tuple[Array, Array]] = []
+        self._layer_row = layer_row
         constants = np.zeros((max(len(materials), 1), 8), np.float32)
-        slots = np.full((len(constants), len(_SLOTS)), -1, np.int32)
+        slots = np.full((len(constants), SLOTS), -1, np.int32)
         for i, material in enumerate(materials):
             constants[i] = self._constants(material)
             for j, slot in enumerate(_SLOTS):
                 texture = getattr(material, slot)
                 if texture is not None:
-                    slots[i, j] = self._add_texture(texture, f"{material.name}, {slot.replace('_', ' ')}")
+                    slots[i, j] = self._add_texture(texture, f"{material.name}, {slot.replace('_', ' ')}", i)
+            slots[i, FIRST_STEP] = len(self._steps)
+            self._steps += [self._step(detail, material.name, i) for detail in material.details]
+            slots[i, STEPS] = len(self._steps) - slots[i, FIRST_STEP]
+            slots[i, FRAME] = frames[i] if len(frames) else 0
+        self.detailed = bool(self._steps)
         self.arrays = (
             constants,
             slots,
-            np.array(self._textures, np.int32).reshape(-1, 4),
+            np.array(self._textures, np.int32).reshape(-1, 5),
             np.array(self._transforms, np.float32).reshape(-1, 6),
             np.array([texels.row() for texels in self._images.values()], np.int64).reshape(-1, 4),
             srgb_to_linear(np.arange(256) / 255.0),
+            np.empty((0, 2), np.int64),
+            np.array([step for step, _ in self._steps], np.int32).reshape(-1, STEP_INTS),
+            np.array([numbers for _, numbers in self._steps], np.float32).reshape(-1, STEP_FLOATS),
         )
         self.emissive = bool((constants[:, 5:] > 0.0).any())
-        self.addresses = self.addresses_at(address)
+        self.addresses = self.addresses_at(address)[:7]
         # Only needed above; they would keep the pixels of the frame before alive.
         self._given, self._known = {}, {}
 
-    def addresses_at(self, address_of: AddressOf) -> tuple[int, ...]:
-        """`addresses` of arrays and pictures that lie elsewhere."""
-        constants, slots, textures, transforms, images, decode = self.arrays
-        if address_of is not address:
-            images = np.array([texels.row(address_of) for texels in self._images.values()], np.int64).reshape(-1, 4)
-        return tuple(address_of(array) for array in (constants, slots, textures, transforms, images, decode))
+    def take_layers(self, layers: Array) -> None:
+        """Take the (l, 2) int64 table of the layers that textures refer to."""
+        self.arrays = (*self.arrays[:6], layers, *self.arrays[7:])
+        self.addresses = (*self.addresses[:6], address(layers))
 
-    def lookup(self, material: Array, uv: Array) -> Array:
-        """(n, 8) float32, the results of ``material_at`` for (n,) integers and (n, 2) coordinates."""
+    def addresses_at(self, address_of: AddressOf, layers: Array | None = None) -> tuple[int, ...]:
+        """Addresses of all arrays, of arrays and pictures that lie elsewhere, with the table of `layers` there."""
+        arrays: list[Array] = list(self.arrays)
+        if address_of is not address:
+            arrays[4] = np.array([t.row(address_of) for t in self._images.values()], np.int64).reshape(-1, 4)
+        if layers is not None:
+            arrays[6] = layers
+        return tuple(address_of(array) for array in arrays)
+
+    def lookup(self, material: Array, uv: Array, face: Array | None = None, where: Array | None = None) -> Array:
+        """(n, 8) float32, the results of ``material_at``.
+
+        Parameters
+        ----------
+        material : (n,) array
+            Integers.
+        uv : (n, 2) array
+            Coordinates by the mesh's own UVs.
+        face : (n,) array, optional
+            Integers; with `where`, for textures that refer to layers.
+        where : (n, 2) array, optional
+            Barycentric coordinates of the face's second and third corner.
+        """
         out = np.empty((len(material), 8), np.float32)
-        _material_many(
-            np.ascontiguousarray(material, np.int32), np.ascontiguousarray(uv, np.float32), self.addresses, out
-        )
+        face = np.zeros(len(out), np.int64) if face is None else np.ascontiguousarray(face, np.int64)
+        where = np.zeros((len(out), 2), np.float32) if where is None else np.ascontiguousarray(where, np.float32)
+        given = np.ascontiguousarray(material, np.int32), np.ascontiguousarray(uv, np.float32), face, where
+        _material_many(*given, self.addresses, out)
         return out
 
     def mean_emission(self, material: int) -> Array:
@@ -163,7 +230,8 @@ class MaterialTable:
         if texture < 0 or not radiance.any():
             return radiance
         image, channel = textures[texture, :2]
-        mean = list(self._images.values())[image].mean()
+        # Values of a layer are not averaged: half of the estimate is of each face itself.
+        mean = list(self._images.values())[image].mean() if image >= 0 else np.ones(4)
         if channel == CHANNELS["rgb"]:
             return radiance * mean[:3]
         return radiance * (mean[:3] @ np.array(LUMINANCE) if channel == CHANNELS["luminance"] else mean[channel])
@@ -182,7 +250,31 @@ class MaterialTable:
                 self.warnings.append(f"{material.name}: {name} {given[where]} is out of range, taken as {kept[where]}")
         return kept.astype(np.float32)
 
-    def _add_texture(self, texture: Texture, subject: str) -> int:
+    def _step(self, detail: SurfaceDetail, name: str, material: int) -> tuple[Array, Array]:
+        """A normal or bump map as a row of integers and one of numbers."""
+        subject = f"{name}, {'bump' if detail.kind == 'bump' else 'normal'} map"
+        if detail.kind not in KINDS:
+            raise UsageError(subject, f"kind {detail.kind!r} is unknown", f"Use one of {', '.join(KINDS)}")
+        step, numbers = np.full(STEP_INTS, -1, np.int32), np.zeros(STEP_FLOATS)
+        step[KIND] = KINDS[detail.kind]
+        if detail.texture is not None:
+            step[TEXTURE] = self._add_texture(detail.texture, subject, material)
+        numbers[STRENGTH], numbers[DISTANCE] = detail.strength, detail.distance
+        numbers[COLOUR : COLOUR + 3] = detail.colour
+        if not np.isfinite(numbers).all() or np.abs(numbers).max() > _STRONGEST:
+            self.warnings.append(f"{subject}: its strength, distance or colour is no usable number; it is left out")
+            numbers[STRENGTH] = numbers[DISTANCE] = 0.0
+            numbers[COLOUR : COLOUR + 3] = 0.5, 0.5, 1.0
+            step[TEXTURE] = -1
+        if detail.kind == "tangent":
+            row = self._layer_row(material, detail.tangents, True)
+            if row is None:
+                self.warnings.append(f"{subject}: {_lacks(detail.tangents)}; it is left out")
+                return self._step(replace(detail, kind="bump", texture=None), name, material)
+            step[TANGENTS] = row
+        return step, numbers.astype(np.float32)
+
+    def _add_texture(self, texture: Texture, subject: str, material: int) -> int:
         """Row of a new texture."""
         codes = []
         for name, known in (
@@ -198,7 +290,15 @@ class MaterialTable:
         if transform.shape != (2, 3) or not np.isfinite(transform).all():
             self.warnings.append(f"{subject}: its transform is not made of 2 x 3 finite numbers, ignored")
             transform = np.eye(2, 3)
-        self._textures.append((self._add_image(texture.image, subject), codes[0], codes[1], codes[2]))
+        layer, image = -1, -1
+        if texture.layer or not texture.image:
+            found = self._layer_row(material, texture.layer, False)
+            if found is None:
+                self.warnings.append(f"{subject}: {_lacks(texture.layer)}")
+            layer = -1 if found is None else found
+        if texture.image or layer < 0:
+            image = self._add_image(texture.image, subject)
+        self._textures.append((image, codes[0], codes[1], codes[2], layer))
         self._transforms.append(transform.ravel())
         return len(self._textures) - 1
 
@@ -208,7 +308,8 @@ class MaterialTable:
             self._rows[name] = len(self._rows)
             image = self._given.get(name)
             if image is None:
-                texels = _Texels(_MISSING, "linear", _MISSING, BYTE, f"{subject}: image {name!r} is missing")
+                problem = f"{subject}: image {name!r} is missing" if name else ""
+                texels = _Texels(_MISSING, "linear", _MISSING, BYTE, problem)
             else:
                 before = self._known.get(name)
                 texels = before if before is not None and before.fits(image) else _read(image)
@@ -216,6 +317,10 @@ class MaterialTable:
             if texels.warning:
                 self.warnings.append(texels.warning)
         return self._rows[name]
+
+
+def _lacks(layer: str) -> str:
+    return f"its mesh has no layer {layer!r}" if layer else "its mesh has no texture coordinates"
 
 
 def _read(image: Image) -> _Texels:
@@ -251,8 +356,9 @@ def _read(image: Image) -> _Texels:
 
 
 @njit
-def _material_many(material, uv, addresses, out):  # type: ignore[no-untyped-def]
+def _material_many(material, uv, face, where, addresses, out):  # type: ignore[no-untyped-def]
     for i in range(len(material)):
-        r, g, b, roughness, metallic, er, eg, eb = material_at(material[i], uv[i, 0], uv[i, 1], addresses)
+        place = uv[i, 0], uv[i, 1], face[i], where[i, 0], where[i, 1]
+        r, g, b, roughness, metallic, er, eg, eb = material_at(material[i], place, addresses)
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = r, g, b, roughness, metallic
         out[i, 5], out[i, 6], out[i, 7] = er, eg, eb

@@ -18,6 +18,7 @@ from ..sampling import F
 from ..surfel_columns import VERTEX
 from .instances import Instances, normal_matrices, other_matrices, usable_instances
 from .interaction import Geometry, Tracer
+from .mesh_layers import world_placement
 from .mesh_materials import EmissiveMesh, MeshMaterials
 from .ray_masks import object_flags
 from .trace_mesh import (
@@ -145,9 +146,7 @@ class TraceScene:
     def geometry_at(self, address_of: AddressOf) -> Geometry:
         """`geometry` of arrays that lie elsewhere."""
         meshes = self.mesh_materials
-        tables = (
-            meshes.addresses if address_of is address else np.array(meshes.table.addresses_at(address_of), np.int64)
-        )
+        tables = meshes.addresses if address_of is address else meshes.addresses_at(address_of)
         return Geometry(
             address_of(self.shading_faces),
             address_of(self.shading),
@@ -244,7 +243,13 @@ class TraceScene:
         if not same or elsewhere or len(known) != len(meshes):
             self._list_instances(stands, len(items))
         self._number(objects, meshes, stands)
-        self.mesh_materials.update(parts, before, meshes, images, (len(objects), self.vertex_faces))
+
+        def placed(part: Part) -> tuple[Array, Array]:
+            where = instances[part.source]
+            assert where is not None
+            return (self.instances, self._instance_normal) if part.instanced else world_placement(where.matrices[:1])
+
+        self.mesh_materials.update(parts, before, meshes, images, (len(objects), self.vertex_faces), placed)
         self._commit(parts, vertices, instances, moved, elsewhere, died)
         self.version = object()
         self.faults = [ObjectFaults(item.name, 0, 0, 0, p.bad if p else 0) for item, p in zip(items, instances)]

@@ -1,0 +1,183 @@
+"""Layers of the meshes of a scene: values at corners that textures refer to, and what normal and bump maps need.
+
+Values stay where they are: compiled code reads them at their address.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...compute.jit import plain
+from ...core.arrays import Array, frozen
+from ...core.asset.model import as_float
+from ...core.errors import UsageError
+from ...core.frame import MeshState
+from ..memory import AddressOf, address
+from .detailed_normal import EDGES, FRAME_INTS, MATRICES, NORMALS, TURNS
+from .instances import normal_matrices
+from .tangents import corner_tangents
+from .trace_mesh import Part
+
+#: Matrices (k, 3, 4) and turns of normals (k, 3, 3) of a part, float32; read at row 0 where it is in world space.
+Placed = Callable[[Part], tuple[Array, Array]]
+
+
+@dataclass(slots=True)
+class _Values:
+    """A layer made ready, or tangents or edges, and what it was made of."""
+
+    given: tuple[Array | None, ...]
+    values: Array
+    bad: int = 0
+
+    def fits(self, given: tuple[Array | None, ...]) -> bool:
+        """Whether this is still what `given` makes."""
+        same = len(given) == len(self.given) and all(a is b for a, b in zip(given, self.given))
+        return same and all(array is None or frozen(array) for array in given)
+
+
+class MeshLayers:
+    """Layers that the materials of a scene's meshes refer to.
+
+    Attributes
+    ----------
+    warnings : list of str
+        About values that are no numbers.
+    """
+
+    def __init__(self) -> None:
+        self.warnings: list[str] = []
+        self._rows: dict[tuple[int, str, bool], int] = {}
+        self._values: dict[tuple[int, str, bool], _Values] = {}
+        self._edges: dict[int, _Values] = {}
+        self._first_face: dict[int, int] = {}
+        self._frames: list[tuple[Array, int, Array, int, Array, Array]] = []
+
+    def begin(self) -> None:
+        """Forget which layers are referred to; what was made of them stays until the next `update`."""
+        self._rows = {}
+
+    def row(self, mesh: int, state: MeshState, name: str, tangents: bool) -> int | None:
+        """Row of a layer in the table, or of the tangents of its coordinates; None where the mesh has no such layer."""
+        values = _given(state, name)
+        if values is None or (tangents and np.shape(values)[-1] != 2):
+            return None
+        return self._rows.setdefault((mesh, name, tangents), len(self._rows))
+
+    def update(
+        self, parts: dict[int, Part], meshes: Sequence[MeshState], detailed: Sequence[bool], placed: Placed
+    ) -> None:
+        """Bring all up to date.
+
+        Parameters
+        ----------
+        parts : dict
+            Of the meshes that are traced.
+        meshes : sequence of MeshState
+        detailed : sequence of bool
+            Which of them have normal or bump maps.
+        placed : callable
+            Where a part stands.
+        """
+        known, self._values, self.warnings = self._values, {}, []
+        for key in self._rows:
+            mesh, name, tangents = key
+            if mesh in parts:
+                self._values[key] = self._made(meshes[mesh], parts[mesh], name, tangents, known.get(key))
+        self._first_face = {mesh: part.face.start for mesh, part in parts.items()}
+        self._frames = []
+        for mesh, state in enumerate(meshes):
+            if mesh not in parts or not detailed[mesh]:
+                continue
+            part = parts[mesh]
+            assert part.own_normals is not None
+            self._frames.append(
+                (part.own_normals, part.row.start, self._edges_of(mesh, state, part), mesh, *placed(part))
+            )
+        self._edges = {mesh: self._edges[mesh] for *_, mesh, _, _ in self._frames}
+
+    def tables(self, first_face: int, address_of: AddressOf = address) -> tuple[Array, Array]:
+        """Tables for compiled code.
+
+        Parameters
+        ----------
+        first_face : int
+            First face of the scene that is of a mesh.
+        address_of : callable
+            Where the arrays lie.
+
+        Returns
+        -------
+        layers : (l, 2) int64 array
+            Address of each layer's values, as if it were of all faces of meshes; numbers a corner.
+        frames : (meshes, FRAME_INTS) int64 array
+            Of each mesh: addresses of the normals of its corners, as if of all rows of normals; of the two edges of its
+            faces from the first corner, object space; of matrices and of turns of normals.
+        """
+        layers = np.zeros((len(self._rows), 2), np.int64)
+        for key, row in self._rows.items():
+            if key in self._values:
+                values = self._values[key].values
+                width = values.shape[2]
+                layers[row] = address_of(values) - 12 * width * (self._first_face[key[0]] - first_face), width
+        frames = np.zeros((1 + max((frame[3] for frame in self._frames), default=0), FRAME_INTS), np.int64)
+        for normals, row, edges, mesh, matrices, turns in self._frames:
+            frames[mesh, NORMALS] = address_of(normals) - 12 * row
+            frames[mesh, EDGES] = address_of(edges) - 24 * (self._first_face[mesh] - first_face)
+            frames[mesh, MATRICES], frames[mesh, TURNS] = address_of(matrices), address_of(turns)
+        return layers, frames
+
+    def _edges_of(self, mesh: int, state: MeshState, part: Part) -> Array:
+        """(m, 6) float32: both edges of each face from its first corner, object space."""
+        known, made_of = self._edges.get(mesh), (state.vertices, part.faces)
+        if known is None or not known.fits(made_of):
+            vertices = as_float(state.vertices, (-1, 3), f"vertices of {state.name}")
+            a, b, c = np.moveaxis(vertices[part.faces], 1, 0)
+            known = _Values(made_of, np.concatenate([b - a, c - a], axis=1))
+        self._edges[mesh] = known
+        return known.values
+
+    def _made(self, mesh: MeshState, part: Part, name: str, tangents: bool, known: _Values | None) -> _Values:
+        given = _given(mesh, name)
+        assert given is not None
+        made_of = (given, mesh.vertices, mesh.corner_normals) if tangents else (given,)
+        if known is None or not known.fits(made_of):
+            count = np.shape(given)[-1] if np.ndim(given) == 3 else 0
+            subject = f'values "{name}" of {mesh.name}' if name else f"texture coordinates of {mesh.name}"
+            if count not in (2, 4):
+                raise UsageError(subject, f"have shape {np.shape(given)}", "Give two or four numbers a corner")
+            values = as_float(given, (len(part.faces), 3, count), subject)
+            with np.errstate(over="ignore", invalid="ignore"):
+                bad = 0 if np.isfinite(values.sum()) else int(np.count_nonzero(~np.isfinite(values)))
+            if bad:
+                values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
+            if tangents:
+                assert part.own_normals is not None
+                normals = _at_corners(part, part.own_normals)
+                vertices = as_float(mesh.vertices, (-1, 3), f"vertices of {mesh.name}")
+                values = corner_tangents(vertices, part.faces, normals, values)
+            known = _Values(made_of, plain(np.ascontiguousarray(values, np.float32)), bad)
+        if known.bad:
+            what = f'values "{name}"' if name else "texture coordinates"
+            self.warnings.append(f"{mesh.name}: {known.bad} {what} are not finite; 0 is used")
+        return known
+
+
+def world_placement(matrix: Array) -> tuple[Array, Array]:
+    """`Placed` of a part in world space, whose own (1, 3, 4) matrix is given."""
+    return np.ascontiguousarray(matrix, np.float32), np.ascontiguousarray(normal_matrices(matrix), np.float32)
+
+
+def _given(mesh: MeshState, name: str) -> Array | None:
+    """Values of a layer as given; "" is for the mesh's own texture coordinates."""
+    if not name:
+        return mesh.uvs
+    return next((layer.values for layer in mesh.layers if layer.name == name), None)
+
+
+def _at_corners(part: Part, normals: Array) -> Array:
+    """(m, 3, 3) of the (n, 3) or (3 m, 3) normals of a part."""
+    return normals[part.faces] if part.smooth else normals.reshape(-1, 3, 3)
