@@ -34,24 +34,28 @@ SCENES = {
 _PROGRAM = Path(__file__).with_name("composed_job.py")
 
 
-def render(name: str, options: argparse.Namespace, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+def render(
+    name: str, options: argparse.Namespace, folder: Path, module: str = "composed_job"
+) -> tuple[np.ndarray, np.ndarray]:
     """(ours, theirs): (k, h, w, 4) pictures of k seeds. Those of Cycles are kept for as long as the job is the same."""
     drgs, npz = spread_asset("spot")
     wanted = []
     for engine, samples in (("CYCLES", options.spp), ("DRGS", options.samples)):
         for seed in range(options.seeds):
-            out = OUT / f"composed-{name}-{engine.lower()}-{seed}.npy"
+            out = OUT / f"{module}-{name}-{engine.lower()}-{seed}.npy"
             note = out.with_suffix(".job.json")
-            sources = hashlib.sha256(_PROGRAM.read_bytes() + npz.read_bytes()).hexdigest()
+            program = _PROGRAM.with_name(f"{module}.py").read_bytes()
+            sources = hashlib.sha256(_PROGRAM.read_bytes() + program + npz.read_bytes()).hexdigest()
             text = json.dumps([sources, name, samples, seed, options.size, BOUNCES])
             known = engine == "CYCLES" and out.exists() and note.exists() and note.read_text() == text
             wanted.append(({"engine": engine, "seed": seed, "samples": samples, "out": str(out)}, note, text, known))
     job = {
-        "zip": str(folder / "extension.zip"), "asset": str(drgs), "scene": name, "hdris": str(environments()),
-        "blend": str(OUT / f"composed-{name}.blend"), "size": options.size, "bounces": BOUNCES,
+        "zip": str(folder / "extension.zip"), "asset": str(drgs), "module": module, "scene": name,
+        "hdris": str(environments()), "blend": str(OUT / f"{module}-{name}.blend"), "size": options.size,
+        "bounces": BOUNCES,
         "pictures": [picture for picture, _, _, known in wanted if not known],
     }  # fmt: skip
-    path = OUT / f"composed-{name}.json"
+    path = OUT / f"{module}-{name}.json"
     path.write_text(json.dumps(job))
     environment = os.environ | {"BLENDER_USER_RESOURCES": str(folder / name), "DRGS_ENGINE": sys.executable}
     command = [str(blender_python()), "-P", str(_PROGRAM), str(path)]

@@ -2,12 +2,14 @@
 
     .venv-blender/bin/python bench/composed_job.py JOB.json
 
-The job names the extension's zip, a .drgs, a scene of `SCENES`, a folder of HDRIs, the .blend to write, size and
-bounces, and pictures: engine, seed, samples and the .npy they go to, (h, w, 4), linear, row 0 on top.
+The job names the extension's zip, a .drgs, the module with the scene in its `SCENES` (this one or another), a folder
+of HDRIs, the .blend to write, size and bounces, and pictures: engine, seed, samples and the .npy they go to, (h, w, 4),
+linear, row 0 on top.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import sys
@@ -215,9 +217,12 @@ def build(job: dict) -> bpy.types.Scene:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
     bpy.ops.wm.save_as_mainfile(filepath=job["blend"])
-    SCENES[job["scene"]](job)
+    sys.path.append(str(Path(__file__).parent))
+    importlib.import_module(job["module"]).SCENES[job["scene"]](job)
     for made in bpy.data.materials:
-        made.node_tree.nodes["Principled BSDF"].distribution = "GGX"
+        for node in made.node_tree.nodes if made.node_tree else ():
+            if node.type == "BSDF_PRINCIPLED":
+                node.distribution = "GGX"
     for obj in bpy.data.objects:
         # Not physics: it lights what the mesh itself shadows.
         obj.shadow_terminator_geometry_offset = obj.shadow_terminator_shading_offset = 0.0

@@ -1,0 +1,95 @@
+"""Materials, worlds and meshes as Blender shows them: small scenes against Cycles, one per feature, and two of many.
+
+python bench/bench_materials.py [--size 192] [--seeds 2] [--spp 512] [--samples 1024] [--scenes NAME ...]
+
+Both pictures come out of Blender, ours through the extension, from one file (`composed_job.py`, `material_scenes.py`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from bench_composed import BOUNCES, render, show
+from judge import decibels, psnr, systematic_error
+from report import OUT, ROOT, table, write_section
+from scipy.ndimage import binary_erosion
+
+SCENES = {
+    "helmet": "a glTF file: normal, metallic and roughness maps, five materials, lenses of alpha",
+    "statue": "a glTF file: gilded, normal map",
+    "normal_map": "normal map, strength .8",
+    "bump": "heights",
+    "colours": "colour attribute of corners, float attribute of points as roughness",
+    "coordinates": "images by object and generated coordinates",
+    "leaves": "cards with cut-out leaves",
+    "veil": "alpha as a number, Mix with Transparent BSDF",
+    "sky": "Sky Texture with its sun",
+    "procedural_world": "World of noise and a colour ramp",
+    "procedural": "Voronoi cells as colour, noise as roughness",
+    "forest": "all at once: leaves, statue, captured object, sky",
+    "workshop": "all at once: helmet, bumps, cells, captured object, four lamps, World of noise",
+}
+
+
+def main() -> None:
+    """Measure and write the section."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--size", type=int, default=192)
+    parser.add_argument("--seeds", type=int, default=2, help="independent pictures of either program, at least 2")
+    parser.add_argument("--spp", type=int, default=512, help="of Cycles, per pixel and picture")
+    parser.add_argument("--samples", type=int, default=1024, help="of ours, per pixel and picture")
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
+    options = parser.parse_args()
+    if options.seeds < 2:
+        parser.error("--seeds: noise can be separated from the rest with two pictures or more")
+    OUT.mkdir(parents=True, exist_ok=True)
+    rows = []
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        command = [sys.executable, str(ROOT / "tools" / "extension.py"), "--out", str(folder / "extension.zip")]
+        subprocess.run(command, check=True)
+        for name in options.scenes:
+            ours, theirs = render(name, options, folder, "material_scenes")
+            rows.append(row(name, ours, theirs))
+            show(ours.mean(0), theirs.mean(0), OUT / f"materials-{name}.png")
+            print(*rows[-1], flush=True)
+    if options.scenes == list(SCENES):
+        write_section("materials", "Materials and worlds against Cycles", report(options, rows))
+
+
+def row(name: str, ours: np.ndarray, theirs: np.ndarray) -> tuple[str, ...]:
+    """A scene's line of the table; of the pixels where Cycles shows something."""
+    mask = binary_erosion(theirs[..., 3].min(0) > 0.999, iterations=2)
+    error, deviation = systematic_error(ours, theirs, mask)
+    found = f"{decibels(error):.1f}" if error > 2 * deviation else f"> {decibels(max(error, 0) + 2 * deviation):.1f}"
+    a, b = ours.mean(0), theirs.mean(0)
+    light = a[mask][:, :3].mean() / b[mask][:, :3].mean() - 1
+    return (
+        name,
+        SCENES[name],
+        found,
+        f"{psnr(a, b, mask):.2f}",
+        f"{light:+.2%}",
+        f"{psnr(theirs[0], theirs[1], mask):.1f}",
+    )
+
+
+def report(options: argparse.Namespace, rows: list[tuple[str, ...]]) -> str:
+    """The text of the section."""
+    columns = ("Scene", "", "No noise, dB", "PSNR dB", "Mean light", "Cycles itself")
+    return (
+        f"Foreground PSNR in sRGB (mask of Cycles, eroded by 2 px), {options.size} x {options.size}, of .blend files "
+        f"rendered by Cycles of bpy 5.0.1 and through the extension, *Camera Sees: Mesh*, 16 sub-pixel samples, {BOUNCES} "
+        f"bounces in both. Each picture is the mean of {options.seeds} with independent random numbers, of {options.spp} "
+        f"spp and {options.samples} samples. Cycles' shadow terminator offsets and clamps are off. *No noise* and "
+        "*Cycles itself* as in the section on parity.\n\n" + table(columns, rows)
+    )
+
+
+if __name__ == "__main__":
+    main()
