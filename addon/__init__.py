@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from . import (
     background_render,
+    bakes,
     engine_link,
     handlers,
     panels,
@@ -27,6 +28,7 @@ MODULES = (
     engine_link,
     setup_job,
     reconstruction,
+    bakes,
     handlers,
     physics,
     background_render,

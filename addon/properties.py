@@ -25,6 +25,10 @@ _DENOISERS = {
 DENOISE_ITEMS = [(n, *_DENOISERS[n]) for n in typing.get_args(typing.get_type_hints(RenderSettings)["denoise"])]
 
 
+def _sizes(*sizes: int) -> list[tuple[str, str, str]]:
+    return [(str(size), f"{size} px", f"{size} pixels along the longer side") for size in sizes]
+
+
 def _switch_overlay(settings: DrgsSceneSettings, context: bpy.types.Context) -> None:
     mesh_display.update_display(settings.id_data)
 
@@ -204,6 +208,19 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
             ("paper", "Cook-Torrance (Paper)", "The paper's BRDF, with which materials may have been reconstructed"),
         ),
         default="principled",
+    )
+    bake_world_size: EnumProperty(
+        name="World Size",
+        description="Width of the map that Cycles makes, in the background, of a World that is no colour or image",
+        items=_sizes(512, 1024, 2048, 4096, 8192),
+        default="2048",
+    )
+    bake_texture_size: EnumProperty(
+        name="Texture Size",
+        description="Side of the textures that Cycles makes, in the background, of what is no plain value or image in "
+        "materials",
+        items=_sizes(512, 1024, 2048, 4096, 8192),
+        default="2048",
     )
     seed: IntProperty(
         name="Seed",

@@ -6,6 +6,7 @@ import bpy
 
 from . import (
     bake,
+    bakes,
     bind_armature,
     bind_cage,
     bind_lattice,
@@ -50,6 +51,7 @@ MODULES = (
     material,
     save_asset,
     bake,
+    bakes,
     compositing,
     presets,
     submit,

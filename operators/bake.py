@@ -11,7 +11,7 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
 from ..addon import assets, mesh_arrays, messages
-from ..addon.export import export_frame
+from ..addon.export import export_baked
 from ..addon.export.camera import NO_CAMERA
 from ..addon.export.frame import WORKING_SPACE
 from ..addon.export.topology_check import check_topology
@@ -95,7 +95,8 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
             arguments = ["bake", scenes, "--samples", str(self.samples), "--light", self.light]
             arguments += ["--size", str(self.size), f"--frames={','.join(map(str, self._frames))}"]
             for number in self._visited(context):
-                frame = export_frame(context.evaluated_depsgraph_get(), str, messages.Warnings(), camera=NO_CAMERA)
+                given = context.evaluated_depsgraph_get(), str, messages.Warnings(), lambda text, part: None
+                frame = export_baked(*given, camera=NO_CAMERA)
                 known = {state.name for state in frame.objects}
                 for name in set(self._names) - known:
                     raise UsageError(f'Object "{name}"', "is not rendered", "Enable it in renders, or deselect it")

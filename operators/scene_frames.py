@@ -10,7 +10,7 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty
 
 from ..addon import assets, messages
-from ..addon.export import export_frame
+from ..addon.export import export_baked
 from ..addon.export.camera import NO_CAMERA
 from ..drgs_blender.core.errors import UsageError
 from ..drgs_blender.core.file_types import Held
@@ -81,7 +81,8 @@ class SceneFrames(CommandOperator):
 
     def _write(self, context: bpy.types.Context, template: str, kind: Held, number: int) -> None:
         warn = lambda text: messages.note("WARNING", text)  # noqa: E731
-        frame = export_frame(context.evaluated_depsgraph_get(), str, warn, camera=NO_CAMERA, passes=("Combined",))
+        given = context.evaluated_depsgraph_get(), str, warn, lambda text, part: None
+        frame = export_baked(*given, camera=NO_CAMERA, passes=("Combined",))
         if self.use_selection:
             chosen = {obj.name for obj in context.selected_objects if assets.is_drgs(obj)}
             _hide(frame, chosen)

@@ -59,6 +59,10 @@ class ExportCache:
                 if not (looks and key[0] in SHADED) and shapes.isdisjoint(entry[0])
             }
 
+    def forget_shading(self) -> None:
+        """Drop what depends on materials and worlds."""
+        self._known = {key: entry for key, entry in self._known.items() if key[0] not in SHADED}
+
     def clear(self) -> None:
         """Forget everything."""
         self._known = {}

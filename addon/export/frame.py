@@ -11,6 +11,7 @@ import bpy
 from ...drgs_blender.core.errors import UsageError
 from ...drgs_blender.core.frame import Camera, Frame
 from .. import assets, compositing, preferences
+from ..bakes.requests import Wanted
 from ..property_limits import Limited
 from ..view_layer_passes import enabled
 from .camera import export_camera, picture_of
@@ -39,6 +40,7 @@ def export_frame(
     is_visible: Callable[[bpy.types.Object], bool] | None = None,
     passes: tuple[str, ...] | None = None,
     cancelled: Callable[[], bool] | None = None,
+    wanted: Wanted | None = None,
 ) -> Frame:
     """Describe the frame that `depsgraph` was evaluated for, without its blur: see `render_engine.blur`.
 
@@ -52,6 +54,7 @@ def export_frame(
     is_visible : whether an evaluated object is in the picture; all are when None
     passes : replace those of the view layer
     cancelled : asked before each object
+    wanted : collects what has to be baked for it; None: that is approximated, with warnings
 
     Raises
     ------
@@ -95,11 +98,17 @@ def export_frame(
     if materials.override is not None and objects.states:
         warn(f'View layer "{layer.name}": its Material Override is of meshes; DR-GS objects keep their own materials')
     settings = scene.drgs
+    sky = cache.get(("world", uid(world)), (), lambda: export_world(world, warn, wanted))
+    if wanted is not None:
+        wanted.again(sky.requests)
+    seen = others == "SEEN" and not scene.render.film_transparent
+    lights += [replace(sun, camera=sun.camera and seen) for sun in sky.suns]
     frame = Frame(
         noise_index=scene.frame_current if settings.use_animated_seed else 0,
         camera=camera,
         objects=objects.states,
-        world=cache.get(("world", uid(world)), (), lambda: export_world(world, warn)),
+        world=sky.world,
+        background=sky.background,
         settings=settings.to_settings(scene.render.film_transparent, preferences.read("threads", 0), warn),
         passes=passes or tuple(p.name for p in enabled(scene, depsgraph.view_layer)),
         meshes=meshes.states(),
@@ -108,6 +117,8 @@ def export_frame(
     )
     cache.end()
     end_export()
+    if wanted is not None:
+        wanted.end()
     if frame_set is not None and own_camera:
         add_moments(frame, depsgraph, frame_set, objects.keys, meshes.keys(), cancelled)
     return frame

@@ -31,19 +31,28 @@ class Walker:
     #: Grey for a colour that nothing is known of.
     unknown = 0.5
 
-    def __init__(self, owner: str, warn: Warn) -> None:
+    def __init__(self, owner: str, warn: Warn, approximate: Warn | None = None) -> None:
+        """`approximate` is called with what is not exact and a bake can do better; `warn` with everything else."""
         self.owner = owner
         self._warn = warn
+        self._approximate = approximate or warn
         self._warned: set[str] = set()
         self.found: dict[tuple[str, SocketRef], Any] = {}
         self.depth = 0
 
     def warn(self, node: bpy.types.Node, problem: str) -> None:
-        """Say `problem` once."""
+        """Say once how a node is approximated."""
+        self._say(node, problem, self._approximate)
+
+    def note(self, node: bpy.types.Node, problem: str) -> None:
+        """Say once what is wrong with a node, and stays so when it is baked."""
+        self._say(node, problem, self._warn)
+
+    def _say(self, node: bpy.types.Node, problem: str, say: Warn) -> None:
         text = f'{self.owner}, node "{node.label or node.name}": {problem}'
         if text not in self._warned:
             self._warned.add(text)
-            self._warn(text)
+            say(text)
 
     # What a subclass knows of its textures
 

@@ -1,16 +1,22 @@
-"""A World's node tree -> frame.World: one constant colour or one lat-long image, turned and scaled."""
+"""A World's node tree -> frame.World: one constant colour or one lat-long image, turned and scaled.
+
+What is neither is baked, see `bakes`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import bpy
 import numpy as np
 
 from ...drgs_blender.core.errors import UsageError
-from ...drgs_blender.core.frame import World
+from ...drgs_blender.core.frame import Light, World
+from ..bakes.manager import Request
+from ..bakes.requests import Wanted
+from . import world_bake
 from .images import linear_pixels
 from .node_math import rgb
 from .nodes import Walker, euler, vector_rotate
@@ -32,17 +38,98 @@ class Sky:
     rotation: tuple[tuple[float, ...], ...]
 
 
-def export_world(world: bpy.types.World | None, warn: Warn) -> World:
+@dataclass(slots=True)
+class ExportedWorld:
+    """A world as frames describe it.
+
+    Attributes
+    ----------
+    world : World
+        What lights.
+    background : World, optional
+        What the camera sees, where that is another.
+    suns : list of Light
+        Of its skies.
+    requests : list of Request
+        What has to be baked for it; until then something representative takes its place.
+    """
+
+    world: World
+    background: World | None = None
+    suns: list[Light] = field(default_factory=list)
+    requests: list[Request] = field(default_factory=list)
+
+
+def export_world(world: bpy.types.World | None, warn: Warn, wanted: Wanted | None = None) -> ExportedWorld:
     """Describe an evaluated world; black without one, as in Blender.
+
+    Parameters
+    ----------
+    wanted : what is not read directly is baked; None: it is approximated, with warnings
 
     Raises
     ------
     UsageError
         Colour, strength or rotation are not finite; names the world.
     """
-    light = BLACK if world is None else _Tree(world, warn).light()
+    if world is None:
+        return ExportedWorld(World(colour=(0.0, 0.0, 0.0)))
+    _check_rays(world, warn)
+    paths = world_bake.light_paths(world) if _has_nodes(world) else set()
+    lights = _read(world, False, warn, wanted, bool(paths))
+    if not paths:
+        return lights
+    if others := sorted(paths - {"Is Camera Ray"}):
+        names = ", ".join(f'"{name}"' for name in others)
+        warn(f'World "{world.name}", {names} of Light Path: all that is lit sees what diffuse rays see')
+    lights.suns = [replace(sun, camera=False) for sun in lights.suns]
+    if views := world_bake.of_the_view(world):
+        node, name = views[0]
+        warn(
+            f'World "{world.name}", node "{node.label or node.name}": "{name}" is another for every picture, which is '
+            "not rendered; the camera sees what lights"
+        )
+        return lights
+    seen = _read(world, True, warn, wanted, True)
+    return replace(lights, background=seen.world, requests=lights.requests + seen.requests)
+
+
+def _has_nodes(world: bpy.types.World) -> bool:
+    """Whether nodes make a world; from Blender 5.0 on they make all, and the switch is deprecated."""
+    return world.node_tree is not None and (bpy.app.version >= (5, 0, 0) or world.use_nodes)
+
+
+def _read(world: bpy.types.World, camera: bool, warn: Warn, wanted: Wanted | None, splits: bool) -> ExportedWorld:
+    """The world as it lights, or as the `camera` sees it: read, or baked where it cannot be read exactly.
+
+    Where it `splits` by Light Path, what depends on the view is taken for the camera's.
+    """
+    approximations: list[str] = []
+    tree = _Tree(world, camera, warn, approximations.append)
+    light = tree.light()
+    made = None
+    if approximations and wanted is not None and (splits or not world_bake.of_the_view(world)):
+        made, factor = world_bake.world_request(world, wanted.world_size, camera)
+        found = wanted.find(made)
+        if found is not None:
+            world_bake.report(world, found, warn)
+            return ExportedWorld(
+                World(found["map"], colour=rgb(_usable(np.full(3, factor), np.eye(3), world.name, warn))),
+                suns=world_bake.baked_suns(found, factor, world.name),
+            )
+        failure = wanted.failed(made)
+        if failure:
+            warn(f'World "{world.name}" cannot be baked ({failure}); it is approximated')
+    if made is None or failure:
+        for text in approximations:
+            warn(text)
+    return ExportedWorld(_readable(world, light, warn), requests=[made] if made is not None and not failure else [])
+
+
+def _readable(world: bpy.types.World, light: SocketValue, warn: Warn) -> World:
+    """The frame's world of a light that is a colour, or an image times a colour."""
     pixels, rotation = None, np.eye(3)
-    if world is not None and isinstance(light.texture, Sky):
+    if isinstance(light.texture, Sky):
         pixels, rotation = linear_pixels(light.texture.image, warn), np.array(light.texture.rotation)
         if pixels is None:
             warn(
@@ -50,10 +137,7 @@ def export_world(world: bpy.types.World | None, warn: Warn) -> World:
                 "grey. Choose File > External Data > Find Missing Files, or another image"
             )
             light = SocketValue(light.colour * FALLBACK)
-    colour = light.colour
-    if world is not None:
-        colour = _usable(colour, rotation, world.name, warn)
-        _check_rays(world, warn)
+    colour = _usable(light.colour, rotation, world.name, warn)
     return World(environment=pixels, rotation=rotation, colour=rgb(colour))
 
 
@@ -81,25 +165,23 @@ def _usable(colour: np.ndarray, rotation: np.ndarray, name: str, warn: Warn) -> 
 
 
 class _Tree(Walker):
-    """What a world's nodes say of light that comes from afar."""
+    """What a world's nodes say of light that comes from afar: as it lights, or as the camera sees it."""
 
     unknown = FALLBACK
 
-    def __init__(self, world: bpy.types.World, warn: Warn) -> None:
-        super().__init__(f'World "{world.name}"', warn)
-        self.world = world
+    def __init__(self, world: bpy.types.World, camera: bool, warn: Warn, approximate: Warn) -> None:
+        super().__init__(f'World "{world.name}"', warn, approximate)
+        self.world, self.camera = world, camera
 
     def light(self) -> SocketValue:
         """Light of the world."""
-        tree = self.world.node_tree
-        # From Blender 5.0 on every world has nodes, and the switch is deprecated.
-        if tree is None or (bpy.app.version < (5, 0, 0) and not self.world.use_nodes):
+        if not _has_nodes(self.world):
             return SocketValue(np.array(self.world.color, np.float64))
-        surface = surface_of(tree)
+        surface = surface_of(self.world.node_tree)
         if surface is None:
             return BLACK
         if surface.node.inputs["Volume"].is_linked:
-            self.warn(surface.node, "the volume is not rendered")
+            self.note(surface.node, "the volume is not rendered")
         return self.shader(surface)
 
     def mean(self, texture: Any) -> np.ndarray:
@@ -123,12 +205,10 @@ class _Tree(Walker):
             operands = self.colour(origin.input("Color")), self.number(origin.input("Strength"))
             return self.combine(node, np.multiply, *operands)
         if node.type == "MIX_SHADER":
-            factor = origin.input(0).origin()
-            shaders = self.shader(origin.input(1)), self.shader(origin.input(2))
-            if factor.socket.is_output and factor.node.type == "LIGHT_PATH":
-                self.warn(node, f'"{factor.socket.name}" is not evaluated per ray: what other rays see is used')
-                return shaders[0]
             share = float(np.clip(self.value(origin.input(0)), 0, 1))
+            if share in (0.0, 1.0):  # the other has no part in it
+                return self.shader(origin.input(1 + int(share)))
+            shaders = self.shader(origin.input(1)), self.shader(origin.input(2))
             return self.sum(node, shaders[0].times(1 - share), shaders[1].times(share))
         if node.type == "ADD_SHADER":
             return self.sum(node, self.shader(origin.input(0)), self.shader(origin.input(1)))
@@ -139,12 +219,15 @@ class _Tree(Walker):
         """Sum of two lights."""
         return self.combine(node, np.add, first, second)
 
+    def node_light_path(self, output: SocketRef) -> SocketValue:
+        return uniform(world_bake.light_path(output.socket.name, self.camera))
+
     # Textures
 
     def node_tex_environment(self, output: SocketRef) -> SocketValue:
         node = output.node
         if node.image is None:
-            self.warn(node, "has no image; Blender shows magenta, a dim grey is used. Choose one")
+            self.note(node, "has no image; Blender shows magenta, a dim grey is used. Choose one")
             return uniform(FALLBACK)
         if node.type == "TEX_ENVIRONMENT" and node.projection != "EQUIRECTANGULAR":
             self.warn(node, "the Mirror Ball projection is read as Equirectangular")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import bpy
 from bl_ui.utils import PresetPanel
 
-from .. import presets
+from .. import bakes, presets
+from .text_layout import bar_text
 
 
 class _RenderPanel:
@@ -103,4 +104,21 @@ class DRGS_PT_film(_RenderPanel, bpy.types.Panel):
         self.layout.prop(context.scene.drgs, "filter_width")
 
 
-CLASSES = (DRGS_PT_presets, DRGS_PT_sampling, DRGS_PT_light, DRGS_PT_blur, DRGS_PT_film)
+class DRGS_PT_bakes(_RenderPanel, bpy.types.Panel):
+    bl_label = "Baked by Cycles"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - read by Blender
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        settings = context.scene.drgs
+        layout.prop(settings, "bake_world_size")
+        layout.prop(settings, "bake_texture_size")
+        text, part = bakes.manager.status()
+        if text:
+            layout.progress(text=bar_text(layout, context, text, part), factor=part)
+            layout.operator("drgs.bakes_cancel", icon="CANCEL")
+
+
+CLASSES = (DRGS_PT_presets, DRGS_PT_sampling, DRGS_PT_light, DRGS_PT_bakes, DRGS_PT_blur, DRGS_PT_film)

@@ -16,7 +16,7 @@ from ...drgs_blender.core.phases import is_preparing
 from ...drgs_blender.ipc.blur import averaged, sample_frame, sharp_frame
 from ...drgs_blender.ipc.protocol import Passes
 from .. import background_render, engine_link, messages
-from ..export import export_frame
+from ..export import export_baked
 from ..export.instances import uncancelled
 from ..view_layer_passes import blender_name, enabled
 from ..viewport import views
@@ -114,10 +114,11 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
         self.update_stats("", "Exporting the scene")
 
         def export(moments: bool) -> Frame:
-            return export_frame(
+            return export_baked(
                 depsgraph,
                 lambda path: engine_link.load_asset(path, self._stopped),
                 warn,
+                self._progress,
                 frame_set=self._frame_set if moments else None,
                 cancelled=self._stopped,
             )

@@ -12,7 +12,8 @@ import bpy
 from ...drgs_blender.core.errors import DrgsError
 from ...drgs_blender.core.frame import Frame
 from ...drgs_blender.ipc.change_detection import reuse_equal
-from .. import messages
+from .. import bakes, messages
+from ..bakes.requests import Wanted
 from ..export import export_frame
 from ..export.camera import NO_CAMERA
 from ..export.export_cache import ExportCache
@@ -59,14 +60,18 @@ def exported(
     key = depsgraph.scene.name_full, depsgraph.view_layer.name, local
     scene = _scenes.setdefault(key, _Scene())
     if not scene.current or scene.exported is None:
-        made = _export(depsgraph, scene.cache, is_visible)
+        made = _export(depsgraph, scene.cache, is_visible, key)
         scene.exported, scene.current = reuse_equal(made, scene.exported), True
     return scene.exported
 
 
 def _export(
-    depsgraph: bpy.types.Depsgraph, cache: ExportCache, is_visible: Callable[[bpy.types.Object], bool] | None
+    depsgraph: bpy.types.Depsgraph,
+    cache: ExportCache,
+    is_visible: Callable[[bpy.types.Object], bool] | None,
+    key: Key = ("", "", ""),
 ) -> Exported:
+    wanted = Wanted.of(depsgraph.scene)
     assets: dict[str, tuple[int, int]] = {}
 
     def key_of(path: Path) -> str:
@@ -74,11 +79,19 @@ def _export(
 
     try:
         frame = export_frame(
-            depsgraph, key_of, messages.Warnings(), camera=NO_CAMERA, cache=cache, is_visible=is_visible
+            depsgraph,
+            key_of,
+            messages.Warnings(),
+            camera=NO_CAMERA,
+            cache=cache,
+            is_visible=is_visible,
+            wanted=wanted,
         )
     except DrgsError as error:
+        bakes.manager.drop(key)
         messages.note("ERROR", str(error))
         return Exported(error=str(error))
+    bakes.manager.want(key, wanted.requests)
     for state in frame.objects:
         status = os.stat(state.asset)
         assets[state.asset] = status.st_mtime_ns, status.st_size
@@ -94,6 +107,15 @@ def changed(depsgraph: bpy.types.Depsgraph) -> None:
             scene.current = False
 
 
+def renew() -> None:
+    """Something was baked: export what is shaded by it again."""
+    for scene in _scenes.values():
+        scene.cache.forget_shading()
+        scene.current = False
+
+
 def forget() -> None:
     """Drop all exported scenes."""
+    for key in _scenes:
+        bakes.manager.drop(key)
     _scenes.clear()

@@ -18,7 +18,7 @@ import bpy
 from ...drgs_blender.core.errors import DrgsError
 from ...drgs_blender.core.frame import Camera, Frame
 from ...drgs_blender.core.phases import STARTING, is_counted, is_preparing
-from .. import engine_link, messages, preferences
+from .. import bakes, engine_link, messages, preferences
 from ..export.camera import check_lens
 from ..export.view import view_camera
 from . import draw, scenes
@@ -32,6 +32,7 @@ STRIP_PIXELS = 1 << 20
 worker = Worker()
 _viewports: dict[str, ViewportState] = {}
 _last_news = 0
+_last_bakes = (0, "")
 #: Seconds that redraws took, and those that Blender's thread worked in them, for `bench/bench_viewport.py`.
 redraws: deque[tuple[float, float]] = deque(maxlen=10_000)
 
@@ -165,13 +166,20 @@ def status(name: str) -> tuple[str, str]:
     error = worker.state(name)[1]
     if viewport is None or error:
         return "", error
+    baking = bakes.manager.status()[0]
+    text = _status(viewport, name)
+    return f"{text}  |  {baking}" if baking else text, ""
+
+
+def _status(viewport: ViewportState, name: str) -> str:
+    """Progress text of a viewport without bakes."""
     phase, part = worker.progress(name)
     if is_counted(phase):
-        return f"{phase}  {part:.0%}", ""
+        return f"{phase}  {part:.0%}"
     if viewport.picture is None or is_preparing(phase):
-        return phase or STARTING, ""
+        return phase or STARTING
     samples = viewport.picture.request.frame.settings.sample_count
-    return f"Sample {round(viewport.picture.fraction * samples)}/{samples}", ""
+    return f"Sample {round(viewport.picture.fraction * samples)}/{samples}"
 
 
 def preparation() -> tuple[str, float]:
@@ -259,17 +267,20 @@ def _start() -> None:
 
 def _poll() -> float | None:
     """Have the viewports drawn again that have news; end when there are none left."""
-    global _last_news
+    global _last_news, _last_bakes
     live = dict(_live())
     for name in set(_viewports) - set(live):
         worker.drop(name)
         del _viewports[name]
     arriving = {name for name, viewport in _viewports.items() if viewport.arriving is not None}
-    news = worker.news  # once: the worker goes on counting
+    # Each is read once: they go on counting.
+    news, baked = worker.news, (bakes.manager.news, bakes.manager.status()[0])
+    if baked[0] != _last_bakes[0]:
+        scenes.renew()
     for name, area in live.items():
-        if news != _last_news or name in arriving:
+        if news != _last_news or baked != _last_bakes or name in arriving:
             area.tag_redraw()
-    _last_news = news
+    _last_news, _last_bakes = news, baked
     if not _viewports:
         return None
     return _BUSY if worker.busy() or arriving else _IDLE

@@ -117,13 +117,14 @@ class Exporter:
         self.link, self.passes = link, tuple(passes) if passes else None
         self.protocol = importlib.import_module(f"{package}.drgs_blender.ipc.protocol")
         self.errors = importlib.import_module(f"{package}.drgs_blender.core.errors")
-        self.export_frame = importlib.import_module(f"{package}.addon.export").export_frame
+        self.export = importlib.import_module(f"{package}.addon.export").export_baked
         self.blur = importlib.import_module(f"{package}.addon.render_engine.blur")
         self.encode_frame = importlib.import_module(f"{package}.drgs_blender.ipc.codec").encode_frame
         self.sent = importlib.import_module(f"{package}.drgs_blender.ipc.slots").SentSlots()
         self.keys: dict[Path, str] = {}
         self.requests = 0
         self.error: Exception | None = None
+        self.baking = ""
 
     def key_of(self, path: Path) -> str:
         """The parent's key of the asset at `path`."""
@@ -162,7 +163,7 @@ class Exporter:
         def export(moments: bool) -> Any:
             set_moments = frame_set if moments else None
             passes = self.passes
-            return self.export_frame(depsgraph, self.key_of, warn, frame_set=set_moments, passes=passes)
+            return self.export(depsgraph, self.key_of, warn, self.report, frame_set=set_moments, passes=passes)
 
         frame = export(True)
         scene = depsgraph.scene_eval
@@ -176,6 +177,12 @@ class Exporter:
         while isinstance(self.submit(frame, about, warnings), self.protocol.Render):
             for picture in self.blur.pictures(frame, steps, depsgraph, lambda: export(False), frame_set):
                 self.submit(picture, {}, warnings)
+
+    def report(self, text: str, part: float) -> None:
+        """Show in Blender's output what is being baked; `send_heartbeats` keeps the parent waiting."""
+        if text != self.baking:
+            self.baking = text
+            sys.stderr.write(f"{text}\n")
 
     def submit(self, frame: Any, about: dict[str, Any], warnings: list[str]) -> Any:
         """Send a frame with its number, layer and count of pictures, `about`; return the answer."""

@@ -12,13 +12,13 @@ import re
 import shlex
 import shutil
 import stat
-import sys
 import tempfile
 import time
 import uuid
 from pathlib import Path
 
 from ..core.file_lock import FileLock
+from ..core.user_cache import named_cache, user_cache
 
 log = logging.getLogger(__name__)
 _MONTH = 30 * 24 * 3600.0
@@ -94,16 +94,7 @@ def wanted_folder() -> Path:
     RuntimeError
         When the user has no home folder.
     """
-    if override := os.environ.get("DRGS_CACHE_DIR"):
-        return Path(override).expanduser().absolute()
-    if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData/Local")
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library/Caches"
-    else:
-        named = Path(os.environ.get("XDG_CACHE_HOME", ""))
-        base = named if named.is_absolute() else Path.home() / ".cache"
-    return base / "drgs" / "kernels"
+    return named_cache() or user_cache() / "drgs" / "kernels"
 
 
 @functools.cache

@@ -516,6 +516,8 @@ class Frame:
     history : str
         Name of the sequence of pictures that this one continues. With the denoiser SVGF, what the engine rendered
         before under this name is mixed in; "" stands alone, as every final frame must.
+    background : World, optional
+        What the camera sees where it meets nothing, instead of ``world``, which still lights; None: the same.
     """
 
     noise_index: int
@@ -530,3 +532,4 @@ class Frame:
     previous: MotionStep | None = None
     next: MotionStep | None = None
     history: str = ""
+    background: World | None = None

@@ -102,6 +102,8 @@ class SceneCache:
         Of the last frame.
     environment : EnvironmentLight, optional
         Of the last frame.
+    background : EnvironmentLight, optional
+        Of the last frame, where the camera sees another world than the one that lights.
     lights : Lights
         Of the last frame.
     captured : tuple of CapturedObject
@@ -120,6 +122,8 @@ class SceneCache:
         self._current = True
         self.world: World | None = None
         self.environment: EnvironmentLight | None = None
+        self.background: EnvironmentLight | None = None
+        self._background: World | None = None
         self.lights = Lights([])
         self.captured: tuple[CapturedObject, ...] = ()
         self._emitters = Emitters()
@@ -128,7 +132,7 @@ class SceneCache:
     @property
     def static_state(self) -> tuple[object, ...]:
         """All but the lights that a picture of the last frame depends on."""
-        return *(item.state for item in self.objects), self.meshes, self.images, self.world
+        return *(item.state for item in self.objects), self.meshes, self.images, self.world, self._background
 
     def load_asset(self, path: str | os.PathLike[str]) -> str:
         """Map the asset file at `path` unless it is mapped and unchanged; return its key.
@@ -170,7 +174,9 @@ class SceneCache:
         """Copy of a frame that is safe from later changes of its arrays; those of the scene are copies already."""
         states = [item.state for item in self.objects]
         world = frame.world if self.world is None else self.world
-        return reuse_equal(replace(frame, objects=states, meshes=self.meshes, images=self.images, world=world), None)
+        background = frame.background if self._background is None else self._background
+        known = replace(frame, objects=states, meshes=self.meshes, images=self.images, world=world)
+        return reuse_equal(replace(known, background=background), None)
 
     def pose(self, frame: Frame, backend: RenderBackend = CPU) -> PosedSurfels:
         """Bring the trace scene up to date; return the surfels of all objects, posed where they will be needed."""
@@ -306,9 +312,10 @@ class SceneCache:
             found += item.faults
         found += self.scene.mesh_materials.warnings
         found += self.lights.warnings
-        if self.environment is not None and self.environment.bad_texels:
+        bad = sum(light.bad_texels for light in (self.environment, self.background) if light is not None)
+        if bad:
             found.append(
-                f"world: {self.environment.bad_texels} pixels of the environment are negative, infinite or no "
+                f"world: {bad} pixels of the environment are negative, infinite or no "
                 f"number, and "
                 "give no light; where that shows, repair the image"
             )
@@ -316,16 +323,17 @@ class SceneCache:
 
     def environment_of(self, world: World) -> EnvironmentLight:
         """The light of `world`, made again only when something about it changed; a rotation costs nothing."""
-        known, kept = self.world, reuse_equal(world, self.world)
-        if self.environment is None or known is None:
-            self.environment = EnvironmentLight(kept)
-        elif kept is not known:
-            if all(getattr(kept, name) is getattr(known, name) for name in ("environment", "colour", "strength")):
-                self.environment.rotation = np.ascontiguousarray(kept.rotation, np.float32)
-            else:
-                self.environment = EnvironmentLight(kept)
+        kept = reuse_equal(world, self.world)
+        self.environment = _light_of(kept, self.world, self.environment)
         self.world = kept
         return self.environment
+
+    def background_of(self, world: World | None) -> EnvironmentLight | None:
+        """What the camera sees of the world, as `environment_of`; None where that is what lights."""
+        kept = None if world is None else reuse_equal(world, self._background)
+        self.background = None if kept is None else _light_of(kept, self._background, self.background)
+        self._background = kept
+        return self.background
 
     def lights_of(self, lights: list[Light]) -> Lights:
         """Blender's lights and surfaces that emit, and what they send to the middle of the scene."""
@@ -345,6 +353,17 @@ def _begun(state: ObjectState, loaded: _Loaded, mode: tuple[bool, bool]) -> Cach
     if shown and len(loaded.asset.mesh.faces):
         item.glowing = glowing_mesh(state, item.traced, loaded.glow_of(state.asset))
     return item
+
+
+def _light_of(world: World, known: World | None, light: EnvironmentLight | None) -> EnvironmentLight:
+    """The light of `world`: `light`, that of `known`, where only the rotation changed."""
+    if light is None or known is None:
+        return EnvironmentLight(world)
+    if any(getattr(world, name) is not getattr(known, name) for name in ("environment", "colour", "strength")):
+        return EnvironmentLight(world)
+    if world is not known:
+        light.rotation = np.ascontiguousarray(world.rotation, np.float32)
+    return light
 
 
 def _check_surface(state: ObjectState, asset: Asset, settings: RenderSettings, captured: bool) -> None:

@@ -275,10 +275,13 @@ class Session:
         posed = self._scene_cache.pose(frame, backend)
         timer("deform")
         environment, lights = self._scene_cache.environment_of(frame.world), self._scene_cache.lights_of(frame.lights)
+        background = self._scene_cache.background_of(frame.background)
         timer("light")
         cache = self._scene_cache
-        seen = cache.seen_tree
-        return PreparedScene(cache.scene, environment, posed, lights, cache.tree, seen, captured=cache.captured)
+        seen, captured = cache.seen_tree, cache.captured
+        return PreparedScene(
+            cache.scene, environment, posed, lights, cache.tree, seen, captured=captured, background=background
+        )
 
     def _warnings(self, settings: RenderSettings) -> list[str]:
         trouble = cache_folder().trouble
@@ -325,11 +328,15 @@ def _ignored_settings(settings: RenderSettings) -> list[str]:
 
 def _check(frame: Frame) -> None:
     """Refuse what no stage would notice by itself."""
-    for name, rows in (("environment rotation", frame.world.rotation), ("camera matrix", frame.camera.matrix_world)):
+    turns = [world.rotation for world in (frame.world, frame.background) if world is not None]
+    for name, rows in (
+        *(("environment rotation", turn) for turn in turns),
+        ("camera matrix", frame.camera.matrix_world),
+    ):
         if not np.isfinite(rows).all():
             raise UsageError(name, "is not finite", "Check the transform and its drivers")
-    rotation = frame.world.rotation
-    if rotation.shape != (3, 3):
-        raise UsageError("environment rotation", f"has shape {rotation.shape}", "Give a 3 x 3 matrix")
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
-        raise UsageError("environment rotation", "scales or shears", "Give a matrix that only turns")
+    for rotation in turns:
+        if rotation.shape != (3, 3):
+            raise UsageError("environment rotation", f"has shape {rotation.shape}", "Give a 3 x 3 matrix")
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+            raise UsageError("environment rotation", "scales or shears", "Give a matrix that only turns")

@@ -35,6 +35,8 @@ class PreparedScene:
         The surfels that light meets, where ``frame.settings.rays_see`` is "surfels".
     seen_surfels : SurfelBVH, optional
         The surfels that the camera sees along its rays, where it is panoramic.
+    background : EnvironmentLight, optional
+        What the camera sees of the world, where that differs from ``environment``.
     previous, following : SceneState, optional
         The scene one frame earlier and later, for motion vectors; None: nothing moves.
     captured : tuple of CapturedObject
@@ -50,6 +52,7 @@ class PreparedScene:
     previous: SceneState | None = None
     following: SceneState | None = None
     captured: tuple[CapturedObject, ...] = ()
+    background: EnvironmentLight | None = None
 
     @property
     def pass_index(self) -> Array:
@@ -64,3 +67,8 @@ class PreparedScene:
         index = index.copy()
         index[unlit] = -1 - index[unlit]
         return index
+
+    @property
+    def seen(self) -> EnvironmentLight:
+        """The world as the camera sees it."""
+        return self.environment if self.background is None else self.background

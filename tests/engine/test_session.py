@@ -152,6 +152,31 @@ def test_nothing_is_made_again_when_nothing_changed(session, make_frame):
     assert session._scene_cache.environment is light
 
 
+def test_another_background_is_seen_and_does_not_light(session, make_frame, asset_path):
+    def opaque():
+        frame = make_frame(film_transparent=False)
+        frame.passes = ("Combined", "Depth", "DiffDir", "GlossDir", "Env")
+        return frame
+
+    plain, frame = session.render(opaque()), opaque()
+    frame.background = World(colour=(0.2, 0.4, 0.8))
+    seen = session.render(frame)
+    empty = seen["Depth"][..., 0] > 1e9
+    assert 0 < empty.sum() < empty.size
+    np.testing.assert_allclose(seen["Env"][empty], [(0.2, 0.4, 0.8)] * empty.sum(), rtol=1e-6)
+    for name in ("DiffDir", "GlossDir"):
+        np.testing.assert_array_equal(plain[name], seen[name])
+    light = session._scene_cache.background
+    frame = replace(frame, background=World(colour=(0.2, 0.4, 0.8)))
+    assert_same_bits(session.render(frame), fresh(asset_path, frame))
+    assert session._scene_cache.background is light, "it did not change"
+    assert_same_bits(session.render(opaque()), plain)
+    assert session._scene_cache.background is None
+    frame.background.rotation = np.eye(3) * 2
+    with pytest.raises(UsageError, match=r"rotation.*scales"):
+        session.render(frame)
+
+
 def test_vanished_objects_are_dropped(session, make_frame):
     frame = make_frame()
     session.render(frame)

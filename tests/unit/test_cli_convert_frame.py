@@ -91,8 +91,7 @@ def test_fields_that_came_after_format_2_have_their_defaults() -> None:
 
 
 def test_frame_files_of_a_later_format_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    later = frame_file.FORMAT + 1
-    monkeypatch.setattr(frame_file, "FORMAT", later)
+    monkeypatch.setattr(frame_file, "FORMAT", later := frame_file.FORMAT + 1)
     write_frame_file(tmp_path / "a.drgsframe", frame_of([]))
     monkeypatch.undo()
     with pytest.raises(VersionError, match=rf"has format {later}.*Use a later DR-GS"):
