@@ -84,10 +84,10 @@ def report(options: argparse.Namespace, rows: list[tuple[str, ...]]) -> str:
     columns = ("Scene", "", "No noise, dB", "PSNR dB", "Mean light", "Cycles itself")
     return (
         f"Foreground PSNR in sRGB (mask of Cycles, eroded by 2 px), {options.size} x {options.size}, of .blend files "
-        f"rendered by Cycles of bpy 5.0.1 and through the extension, *Camera Sees: Mesh*, 16 sub-pixel samples, {BOUNCES} "
-        f"bounces in both. Each picture is the mean of {options.seeds} with independent random numbers, of {options.spp} "
-        f"spp and {options.samples} samples. Cycles' shadow terminator offsets and clamps are off. *No noise* and "
-        "*Cycles itself* as in the section on parity.\n\n" + table(columns, rows)
+        "rendered by Cycles of bpy 5.0.1 and through the extension, *Camera Sees: Mesh*, 16 sub-pixel samples, "
+        f"{BOUNCES} bounces in both. Each picture is the mean of {options.seeds} with independent random numbers, of "
+        f"{options.spp} spp and {options.samples} samples. Cycles' shadow terminator offsets and clamps are off. "
+        "*No noise* and *Cycles itself* as in the section on parity.\n\n" + table(columns, rows)
     )
 
 
