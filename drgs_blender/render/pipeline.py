@@ -124,7 +124,7 @@ def render(
         buffer = visible.rows(y0, y1)
         check()
         radiance = batches.light(buffer)
-        film.add(buffer, radiance, prepared.pass_index, prepared.seen)
+        film.add(buffer, radiance, scene.pass_index, prepared.seen)
         for matte in mattes:
             matte.add(buffer)
         if lights is not None and lights.seen:

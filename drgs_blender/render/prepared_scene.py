@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from ..core.asset.model import PosedSurfels
 from .film.motion_vectors import SceneState
 from .lights.environment import EnvironmentLight
@@ -13,8 +11,6 @@ from .lights.light_sampler import Lights
 from .scene.trace_scene import TraceScene
 from .surfels.captured import CapturedObject
 from .surfels.surfel_bvh import SurfelBVH
-
-Array = np.ndarray
 
 
 @dataclass(slots=True)
@@ -53,20 +49,6 @@ class PreparedScene:
     following: SceneState | None = None
     captured: tuple[CapturedObject, ...] = ()
     background: EnvironmentLight | None = None
-
-    @property
-    def pass_index(self) -> Array:
-        """(objects,) int32 pass index of all objects of the scene; -1 - index of those that are unlit.
-
-        So the denoiser, which parts objects by their pass index, brings no light of others to them.
-        """
-        index = self.scene.pass_index
-        if not self.captured:
-            return index
-        unlit = np.concatenate([item.posed.object_index[:1] for item in self.captured])
-        index = index.copy()
-        index[unlit] = -1 - index[unlit]
-        return index
 
     @property
     def seen(self) -> EnvironmentLight:

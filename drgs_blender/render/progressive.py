@@ -256,7 +256,7 @@ class Progressive:
             radiance = strip.radiance(buffer.points, exact)
             if prepared.captured:  # points that have no light yet were given that of their pixel
                 radiance.components[buffer.points.flags & UNLIT != 0] = 0.0
-            film.add(buffer, radiance, prepared.pass_index, prepared.seen)
+            film.add(buffer, radiance, prepared.scene.pass_index, prepared.seen)
             if lights is not None and lights.seen:
                 rows = slice(strip.rows[0] - camera.window[1], strip.rows[1] - camera.window[1])
                 film.pixels.emission[rows] += visible_lights(lights, self._parameters, camera.window[0], buffer)

@@ -28,7 +28,7 @@ from ..camera import FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, sample_ray
 from ..gbuffer.gbuffer import GBuffer
 from ..lights.environment import EnvironmentLight, envmap_radiance, map_at
 from ..sampling import luminance
-from ..shading_points import CATCHER, Radiance
+from ..shading_points import CATCHER, UNLIT, Radiance
 from .guides import Guides
 
 Array = np.ndarray
@@ -36,7 +36,8 @@ Array = np.ndarray
 EMPTY_DEPTH = 1e10
 #: Samples of one pixel within this many pixel widths of depth are of one surface (a slope of 83 degrees).
 SAME_SURFACE = 8.0
-
+#: Coverage that is only the rounding of a sum.
+_ROUNDING = np.float32(1e-4)
 
 COMPONENTS = ("DiffDir", "DiffInd", "GlossDir", "GlossInd")
 
@@ -49,7 +50,7 @@ class Pixels(NamedTuple):
     coverage, roughness, metallic : (h, w) array
         In [0, 1].
     pass_index : (h, w) array
-        Of the nearest sample's object, Blender's IndexOB; -1 - index where that is unlit.
+        Of the nearest sample's object, Blender's IndexOB.
     depth : (h, w) array
         Metres along the view axis; `EMPTY_DEPTH` where the pixel is empty.
     position : (h, w, 3) array
@@ -105,6 +106,8 @@ class Film:
         Light straight from the world, as if catchers had no shadow.
     veiled : (h, w, 3) float32 array
         The part of ``environment`` that is seen through catchers.
+    unlit : (h, w) float32 array, optional
+        The part of the coverage that is of unlit objects; None: there are none.
     """
 
     def __init__(self, camera: Camera, settings: RenderSettings, parameters: Array) -> None:
@@ -116,6 +119,7 @@ class Film:
         self.round = camera.panorama in ("fisheye", "equisolid")
         self.pixels = Pixels.empty(size)
         self.environment, self.veiled = (np.zeros((*size, 3), np.float32) for _ in range(2))
+        self.unlit: Array | None = None
 
     def add(self, buffer: GBuffer, radiance: Radiance, pass_index: Array, environment: EnvironmentLight) -> None:
         """Take the strip `buffer` with the light of its points.
@@ -125,7 +129,6 @@ class Film:
         buffer : GBuffer
         radiance : Radiance
         pass_index : (objects,) int32 array
-            As of `PreparedScene.pass_index`.
         environment : EnvironmentLight
             Background, unless the film is transparent.
         """
@@ -133,6 +136,11 @@ class Film:
         y0, y1 = buffer.rows
         rows = slice(y0 - top, y1 - top)
         points = buffer.points
+        unlit = np.flatnonzero(points.flags & UNLIT)
+        if len(unlit):
+            row, column = np.divmod(points.pixel[unlit], int(self.parameters[WIDTH]))
+            self.unlit = np.zeros_like(self.pixels.coverage) if self.unlit is None else self.unlit
+            np.add.at(self.unlit, (row - top, column - x0), points.weight[unlit])
         unshadowed = np.zeros(len(points), np.float32) if radiance.unshadowed is None else radiance.unshadowed
         light = radiance.components, radiance.variance, unshadowed
         over_range(
@@ -150,8 +158,11 @@ class Film:
                 )  # fmt: skip
 
     def guides(self) -> Guides:
-        """The denoiser's guides: what differs from surface to surface."""
+        """The denoiser's guides: what differs from surface to surface. Of unlit objects there is no light to guide."""
         known = self.pixels._asdict()
+        if self.unlit is not None:
+            lit = known["coverage"] - self.unlit
+            known["coverage"] = np.where(lit > _ROUNDING, lit, np.float32(0.0))
         shared = {name: known[name] for name in Guides._fields if name in known}
         return Guides(**shared, footprint=footprints(self.pixels.depth, self.parameters))
 
@@ -188,9 +199,6 @@ class Film:
             "Coverage": seen.coverage,
             "IndexOB": seen.pass_index,
         }
-        if "IndexOB" in names:
-            index = seen.pass_index
-            scalars["IndexOB"] = np.where(index < 0, -1 - index, index)
         made |= {name: values[..., None] for name, values in scalars.items()}
         if "Combined" in names:
             made["Combined"] = self._beauty(light, made["Env"], shadow)
