@@ -191,6 +191,14 @@ def test_colours_turn_with_the_mesh_that_is_bent(shiny_path, frame_of):
     assert np.abs(a - b).max() < 1e-3
 
 
+def test_a_mirrored_object_is_seen_as_in_a_mirror(shiny_path, frame_of):
+    session = session_of(shiny_path)
+    plain, mirrored = (frame_of(shiny_path, samples=64, subpixel_samples=32) for _ in range(2))
+    mirrored.objects[0].matrix_world = np.diag([-1.0, 1.0, 1.0, 1.0])
+    a, b = (session.render(frame)["Combined"] for frame in (plain, mirrored))
+    assert np.abs(a - b[:, ::-1]).mean() < 2e-3 < 0.02 < np.abs(a - b).mean()
+
+
 def test_steps_end_in_the_whole_picture(shiny_path, asset_path, frame_of):
     for threshold in (0.0, 0.1):
         frame = frame_of(shiny_path, ("Combined", "Emit"), samples=32, noise_threshold=threshold)
