@@ -14,9 +14,30 @@ _FULL_NAMES = {
     "DiffInd": "Diffuse Indirect",
     "GlossDir": "Glossy Direct",
     "GlossInd": "Glossy Indirect",
+    "DiffCol": "Diffuse Color",
+    "GlossCol": "Glossy Color",
+    "IndexMA": "Material Index",
     "Env": "Environment",
     "Emit": "Emission",
 }
+
+
+#: Blender's other passes, by the properties of view layers that switch them on.
+_NOT_RENDERED = {
+    "use_pass_shadow": "Shadow",
+    "use_pass_ambient_occlusion": "Ambient Occlusion",
+    **{f"use_pass_transmission_{part}": f"Transmission {part.title()}" for part in ("direct", "indirect", "color")},
+    **{f"use_pass_subsurface_{part}": f"Subsurface {part.title()}" for part in ("direct", "indirect", "color")},
+    **{f"use_pass_volume_{part}": f"Volume {part.title()}" for part in ("direct", "indirect")},
+    "use_pass_shadow_catcher": "Shadow Catcher",
+    "use_pass_cryptomatte_asset": "Cryptomatte Asset",
+}
+
+
+def not_rendered(view_layer: bpy.types.ViewLayer) -> list[str]:
+    """Names of passes that are switched on in a view layer, for other engines, and that DR-GS does not make."""
+    owners = [view_layer, *filter(None, (getattr(view_layer, name, None) for name in ("cycles", "eevee")))]
+    return [text for name, text in _NOT_RENDERED.items() if any(getattr(owner, name, False) for owner in owners)]
 
 
 def label(render_pass: Pass) -> str:

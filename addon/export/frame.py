@@ -9,11 +9,11 @@ from pathlib import Path
 import bpy
 
 from ...drgs_blender.core.errors import UsageError
-from ...drgs_blender.core.frame import Camera, Frame
+from ...drgs_blender.core.frame import Camera, Frame, Mist
 from .. import assets, compositing, preferences
 from ..bakes.requests import Wanted
 from ..property_limits import Limited
-from ..view_layer_passes import enabled
+from ..view_layer_passes import enabled, not_rendered
 from .camera import export_camera, picture_of
 from .export_cache import ExportCache, uid
 from .images import end_export
@@ -25,6 +25,8 @@ from .motion_steps import FrameSet, add_moments
 from .objects import DrgsObjects
 from .world import export_world
 
+#: Powers of the distance by the World's Falloff.
+FALLOFFS = {"LINEAR": 1.0, "QUADRATIC": 2.0, "INVERSE_QUADRATIC": 0.5}
 #: Colour space of everything the engine gets and gives.
 WORKING_SPACE = "Linear Rec.709"
 
@@ -76,7 +78,9 @@ def export_frame(
     world = getattr(layer, "world_override", None) or scene.world
     materials, unrendered, lights = Materials(warn, layer.material_override), Unrendered(), []
     cache = ExportCache() if cache is None else cache
-    objects, meshes = DrgsObjects(depsgraph, key_of, warn, cache), Meshes(depsgraph, materials, warn, cache)
+    passes = passes or tuple(p.name for p in enabled(scene, depsgraph.view_layer))
+    objects = DrgsObjects(depsgraph, key_of, warn, cache)
+    meshes = Meshes(depsgraph, materials, warn, cache, with_uv_map="UV" in passes)
     others = Limited(depsgraph.view_layer.drgs, f'View layer "{depsgraph.view_layer.name}"', warn).others
     for item in uncancelled(visible(depsgraph), cancelled):
         if is_visible is not None and not is_visible(item.object):
@@ -110,11 +114,14 @@ def export_frame(
         world=sky.world,
         background=sky.background,
         settings=settings.to_settings(scene.render.film_transparent, preferences.read("threads", 0), warn),
-        passes=passes or tuple(p.name for p in enabled(scene, depsgraph.view_layer)),
+        passes=passes,
         meshes=meshes.states(),
         lights=lights,
         images=list(materials.images.values()),
+        mist=_mist(scene.world),
     )
+    if "UV" in passes and objects.states:
+        warn("The pass UV is 0 on DR-GS objects: surfels have no texture coordinates")
     cache.end()
     end_export()
     if wanted is not None:
@@ -122,6 +129,14 @@ def export_frame(
     if frame_set is not None and own_camera:
         add_moments(frame, depsgraph, frame_set, objects.keys, meshes.keys(), cancelled)
     return frame
+
+
+def _mist(world: bpy.types.World | None) -> Mist:
+    """Limits of the pass Mist."""
+    if world is None:
+        return Mist()
+    settings = world.mist_settings
+    return Mist(settings.start, settings.depth, FALLOFFS[settings.falloff])
 
 
 def _unseen(item: Visible, others: str) -> Visible:
@@ -151,5 +166,5 @@ def _check_features(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, war
     if scene.drgs.background_scene is not None and (changed := compositing.differences(scene)):
         below = f'Scene "{scene.drgs.background_scene.name}"'
         warn(f"{below} has another {', '.join(changed)} now: press Set Up Compositing again")
-    if view_layer.use_pass_cryptomatte_asset:
-        warn(f'Cryptomatte of assets of view layer "{view_layer.name}" is not rendered by DR-GS')
+    if lacking := not_rendered(view_layer):
+        warn(f'View layer "{view_layer.name}": DR-GS has no pass {", ".join(lacking)}')

@@ -88,7 +88,9 @@ class Materials:
             if value.texture is not None:
                 values[f"{name}_texture"] = self._texture(value.texture, label(value.texture.layer))
         details = [self._detail(tree, detail, label) for detail in surface.details]
-        return ExportedMaterial(Material(material.name, **values, details=details), uv_map, layers)
+        return ExportedMaterial(
+            Material(material.name, **values, details=details, pass_index=material.pass_index), uv_map, layers
+        )
 
     def _detail(self, tree: SurfaceWalker, detail: DetailRef, label: Callable[[LayerRef], str]) -> SurfaceDetail:
         texture, numbers = detail.value.texture, (*detail.value.colour, detail.strength, detail.distance)

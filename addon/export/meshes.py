@@ -55,7 +55,15 @@ class _Arrays:
 class Meshes:
     """Collects the meshes of one export. Those with the same data, materials and visibility are one shape."""
 
-    def __init__(self, depsgraph: bpy.types.Depsgraph, materials: Materials, warn: Warn, cache: ExportCache) -> None:
+    def __init__(
+        self,
+        depsgraph: bpy.types.Depsgraph,
+        materials: Materials,
+        warn: Warn,
+        cache: ExportCache,
+        with_uv_map: bool = False,
+    ) -> None:
+        self._with_uv_map = with_uv_map
         self._depsgraph, self._materials, self._warn, self._cache = depsgraph, materials, warn, cache
         self._shapes: dict[tuple[object, ...], _Shape] = {}
 
@@ -67,6 +75,7 @@ class Meshes:
             obj.data.as_pointer(),
             *(m.as_pointer() if m else 0 for m in slots),
             *(getattr(rays, name) for name in rays.__slots__),
+            self._with_uv_map,
         )
         shape = self._shapes.get(key)
         if shape is None:
@@ -129,6 +138,7 @@ class Meshes:
             pass_indices=np.empty(0, np.int32),
             corner_normals=None if normals is None else _frozen(normals[corners]),
             uvs=self._uvs(item.object.name, mesh, corners, index, exported),
+            uv_map=self._uv_map(mesh, corners),
             material_index=None if index is None or not index.any() else _frozen(index.astype(np.int32)),
             materials=[material.material or DEFAULT_MATERIAL for material in exported],
             visibility=item.visibility,
@@ -154,6 +164,11 @@ class Meshes:
             f'"{name}": its textures need {which}, which it has not; they show a single texel. Unwrap it, or '
             "choose a map that it has"
         )
+
+    def _uv_map(self, mesh: bpy.types.Mesh, corners: Array) -> Array | None:
+        """(m, 3, 2) float32 frozen: the UV map that renders, for the pass UV; None without one."""
+        values = mesh_arrays.read_uvs(mesh, "") if self._with_uv_map else None
+        return None if values is None else _frozen(values[corners])
 
     def _uvs(
         self, name: str, mesh: bpy.types.Mesh, corners: Array, index: Array | None, exported: list[ExportedMaterial]

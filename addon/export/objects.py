@@ -48,11 +48,13 @@ class DrgsObjects:
             (uid(obj), uid(obj.data)),
             lambda: _shape(obj, self._depsgraph, self._key_of, self._warn),
         )
+        material = obj.material_slots[0].material if obj.material_slots else None
         self.states.append(
             replace(
                 shape,
                 matrix_world=item.matrix_world,
                 pass_index=obj.pass_index,
+                material_pass_index=0 if material is None else material.pass_index,
                 visibility=item.visibility,
                 captured_colours=obj.drgs.captured_colours,
             )

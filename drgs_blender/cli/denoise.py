@@ -25,7 +25,7 @@ import numpy as np
 from ..core.cryptomatte import METADATA
 from ..core.errors import AssetError, EngineError, UsageError
 from ..core.frame_sequences import frame_path
-from ..core.passes import BY_NAME
+from ..core.passes import BY_NAME, COLOURS, without_colour
 from ..core.version import __version__
 from . import sampling, session_link
 from .frame_lines import FrameLines
@@ -200,7 +200,8 @@ class _Source:
             pictures.append(replace(picture, motion=picture.motion if linked else None))
         wanted = passes or _held(middle)
         light = window(pictures, split=any(name in COMPONENTS for name in wanted))
-        made = {name: light[:, :, i] for i, name in enumerate(COMPONENTS)}
+        colours = middle.passes
+        made = {name: without_colour(light[:, :, i], colours[COLOURS[name]]) for i, name in enumerate(COMPONENTS)}
         made |= middle.passes | {"Combined": middle.beauty(light), "Noisy Image": middle.passes["Combined"]}
         absent = [name for name in wanted if name not in made]
         if absent:

@@ -135,8 +135,8 @@ class ObjectState:
         Per-vertex overrides; None keeps the asset's.
     roughness, metallic : (n,) array, optional
         Per-vertex overrides; None keeps the asset's.
-    pass_index : int
-        Blender's object index pass.
+    pass_index, material_pass_index : int
+        Blender's object index pass, and that of its material.
     visibility : Visibility
         Which rays meet it.
     adjustment : Adjustment, optional
@@ -160,6 +160,7 @@ class ObjectState:
     roughness: Array | None = None
     metallic: Array | None = None
     pass_index: int = 0
+    material_pass_index: int = 0
     visibility: Visibility = field(default_factory=Visibility)
     adjustment: Adjustment | None = None
     tear: float = 0.0
@@ -256,6 +257,8 @@ class Material:
         Linear Rec.709 radiance, colour times strength.
     details : list of SurfaceDetail
         Done to the shading normal one after the other.
+    pass_index : int
+        Blender's material index pass.
     """
 
     name: str
@@ -268,6 +271,7 @@ class Material:
     metallic_texture: Texture | None = None
     emission_texture: Texture | None = None
     details: list[SurfaceDetail] = field(default_factory=list)
+    pass_index: int = 0
 
 
 @dataclass(slots=True)
@@ -313,6 +317,8 @@ class MeshState:
         Never empty.
     visibility : Visibility
         Of all its instances.
+    uv_map : (m, 3, 2) float32 array, optional
+        What the pass UV shows, one per face corner; None: 0.
     """
 
     name: str
@@ -326,6 +332,7 @@ class MeshState:
     materials: list[Material] = field(default_factory=lambda: [Material("Default")])
     visibility: Visibility = field(default_factory=Visibility)
     layers: list[Layer] = field(default_factory=list)
+    uv_map: Array | None = None
 
 
 @dataclass(slots=True)
@@ -400,6 +407,19 @@ class World:
     rotation: Array = field(default_factory=lambda: np.eye(3))
     colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
     strength: float = 1.0
+
+
+@dataclass(slots=True)
+class Mist:
+    """Limits of the pass Mist.
+
+    It is 0 nearer than ``start`` metres, 1 beyond ``start + depth``, in between the part of the way to the power of
+    ``falloff``. The distance is from the camera, of an orthographic one from its plane.
+    """
+
+    start: float = 0.0
+    depth: float = 100.0
+    falloff: float = 1.0
 
 
 @dataclass(slots=True)
@@ -518,6 +538,8 @@ class Frame:
         before under this name is mixed in; "" stands alone, as every final frame must.
     background : World, optional
         What the camera sees where it meets nothing, instead of ``world``, which still lights; None: the same.
+    mist : Mist
+        Limits of the pass Mist.
     """
 
     noise_index: int
@@ -533,3 +555,4 @@ class Frame:
     next: MotionStep | None = None
     history: str = ""
     background: World | None = None
+    mist: Mist = field(default_factory=Mist)

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+Array = np.ndarray
+
 
 @dataclass(frozen=True, slots=True)
 class Pass:
@@ -23,6 +27,8 @@ class Pass:
         Tooltip.
     exact : bool
         Its numbers can be neither averaged nor rounded.
+    colour : str
+        Of a pass of light, the pass with the colour of its surfaces, by which it is divided; "" for others.
     """
 
     name: str
@@ -31,6 +37,7 @@ class Pass:
     blender: str
     about: str
     exact: bool = False
+    colour: str = ""
 
 
 def _cryptomatte(of: str, index: int) -> Pass:
@@ -55,10 +62,18 @@ PASSES: tuple[Pass, ...] = (
     Pass("Metallic", "X", "VALUE", "", "Metallic"),
     Pass("Coverage", "X", "VALUE", "", "Part of the pixel that surfaces cover"),
     Pass("IndexOB", "X", "VALUE", "use_pass_object_index", "Pass index of the nearest object"),
-    Pass("DiffDir", "RGB", "COLOR", "use_pass_diffuse_direct", "Direct diffuse light, colour included"),
-    Pass("DiffInd", "RGB", "COLOR", "use_pass_diffuse_indirect", "Indirect diffuse light, colour included"),
-    Pass("GlossDir", "RGB", "COLOR", "use_pass_glossy_direct", "Direct glossy light, colour included"),
-    Pass("GlossInd", "RGB", "COLOR", "use_pass_glossy_indirect", "Indirect glossy light, colour included"),
+    Pass("IndexMA", "X", "VALUE", "use_pass_material_index", "Pass index of the nearest surface's material"),
+    Pass("UV", "UVA", "VECTOR", "use_pass_uv", "Texture coordinates of meshes by their active UV map, and coverage"),
+    Pass("Mist", "Z", "VALUE", "use_pass_mist", "Distance between the limits of the World's Mist Pass, 0 to 1"),
+    *(
+        Pass(f"{short}{name}", "RGB", "COLOR", f"use_pass_{lobe}_{part}", f"{about} of {lobe} light", colour=colour)
+        for short, lobe in (("Diff", "diffuse"), ("Gloss", "glossy"))
+        for name, part, about, colour in (
+            ("Dir", "direct", "Direct part, without the surface's colour,", f"{short}Col"),
+            ("Ind", "indirect", "Indirect part, without the surface's colour,", f"{short}Col"),
+            ("Col", "color", "Colour of the surface, the factor", ""),
+        )
+    ),
     Pass("Emit", "RGB", "COLOR", "use_pass_emit", "Light that seen surfaces emit"),
     Pass("Env", "RGB", "COLOR", "use_pass_environment", "Light straight from the world"),
     Pass("Variance", "XY", "VECTOR", "", "Variance of the luminance of diffuse and glossy light in the pixel"),
@@ -70,8 +85,26 @@ PASSES: tuple[Pass, ...] = (
 #: What ``drgs denoise`` needs of every frame.
 TEMPORAL: tuple[str, ...] = (
     *("Combined", "Depth", "Position", "Normal", "Albedo", "Roughness", "Metallic", "Coverage", "IndexOB"),
-    *("DiffDir", "DiffInd", "GlossDir", "GlossInd", "Emit", "Env", "Variance", "Previous Position"),
+    *("DiffDir", "DiffInd", "DiffCol", "GlossDir", "GlossInd", "GlossCol", "Emit", "Env", "Variance"),
+    "Previous Position",
 )
 
 #: name -> Pass
 BY_NAME: dict[str, Pass] = {p.name: p for p in PASSES}
+
+#: Light pass -> colour pass of its surfaces. As in Cycles, (direct + indirect) colour, of both lobes, + Emit + Env
+#: is Combined.
+COLOURS: dict[str, str] = {p.name: p.colour for p in PASSES if p.colour}
+
+
+def with_colours(names: tuple[str, ...]) -> tuple[str, ...]:
+    """`names` and the colours by which passes of light among them are divided."""
+    return tuple(dict.fromkeys((*names, *(COLOURS[name] for name in names if name in COLOURS))))
+
+
+def without_colour(light: Array, colour: Array) -> Array:
+    """(h, w, 3) float32 `light` / `colour`; where a channel has none, the mean of the others, as in Cycles."""
+    known = colour != 0
+    out = np.where(known, light / np.where(known, colour, 1), 0)
+    grey = out.sum(axis=-1, keepdims=True) / np.maximum(known.sum(axis=-1, keepdims=True), 1)
+    return np.where(known, out, grey).astype(np.float32)

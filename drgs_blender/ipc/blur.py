@@ -11,14 +11,16 @@ from dataclasses import replace
 import numpy as np
 
 from ..core.frame import Camera, Frame, RenderSettings
-from ..core.passes import BY_NAME
+from ..core.passes import BY_NAME, COLOURS, with_colours, without_colour
 from .messages import Passes
 
 Array = np.ndarray
 
 #: Passes that are not blurred: what they say of a surface has no mean.
 SHARP = frozenset(
-    name for name, p in BY_NAME.items() if (p.kind != "COLOR" or p.exact or name == "Albedo") and name != "Variance"
+    name
+    for name, p in BY_NAME.items()
+    if (p.kind != "COLOR" or p.exact or name == "Albedo") and name not in ("Variance", "Mist")
 )
 
 
@@ -48,7 +50,11 @@ def sample_frame(frame: Frame, count: int, index: int) -> Frame:
     """One of the `count` pictures that are averaged, of a frame at its time and place on the lens."""
     names = tuple(name for name in frame.passes if name not in SHARP)
     return replace(
-        frame, passes=names, settings=sample_settings(frame.settings, count, index), previous=None, next=None
+        frame,
+        passes=with_colours(names),
+        settings=sample_settings(frame.settings, count, index),
+        previous=None,
+        next=None,
     )
 
 
@@ -65,8 +71,11 @@ def sample_settings(settings: RenderSettings, count: int, index: int) -> RenderS
     )
 
 
-def averaged(parts: Iterable[Passes], count: int) -> Passes:
-    """One picture of the sharp passes and `count` that are averaged; seconds and samples are added up."""
+def averaged(parts: Iterable[Passes], count: int, names: tuple[str, ...]) -> Passes:
+    """The passes `names` of the sharp picture and `count` that are averaged; seconds and samples are added up.
+
+    Light is averaged with the surfaces' colour, of which the mean is then taken out.
+    """
     sums: dict[str, Array] = {}
     kept: dict[str, Array] = {}
     statistics: dict[str, float] = {}
@@ -76,6 +85,8 @@ def averaged(parts: Iterable[Passes], count: int) -> Passes:
             if name in SHARP:
                 kept[name] = values
             else:
+                if name in COLOURS:
+                    values = values * part[COLOURS[name]]
                 sums[name] = values.astype(np.float64) if name not in sums else sums[name] + values
         warnings += [text for text in part.warnings if text not in warnings]
         for name, value in part.statistics.items():
@@ -83,4 +94,6 @@ def averaged(parts: Iterable[Passes], count: int) -> Passes:
             statistics[name] = statistics.get(name, 0.0) + value if added else value
     # The pictures' noise is independent.
     means = {name: total / (count**2 if name == "Variance" else count) for name, total in sums.items()}
-    return Passes(kept | {name: mean.astype(np.float32) for name, mean in means.items()}, warnings, statistics)
+    means |= {name: without_colour(means[name], means[colour]) for name, colour in COLOURS.items() if name in means}
+    made = kept | {name: mean.astype(np.float32) for name, mean in means.items()}
+    return Passes({name: made[name] for name in names if name in made}, warnings, statistics)

@@ -23,6 +23,7 @@ from .denoise.svgf_temporal import History, NoisyPicture
 from .film.cryptomatte import CryptoFilm
 from .film.film import COMPONENTS, Film
 from .film.motion_vectors import MotionFilm, SceneState, vector_pass
+from .film.surface_film import SurfaceFilm
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.mesh import primary_mesh
 from .gbuffer.surfel_rays import SurfelRays, blend_along_rays
@@ -106,6 +107,7 @@ def render(
         for kind, name in KINDS.items()
         if any(wanted.startswith(name) for wanted in frame.passes)
     ]
+    surfaces = SurfaceFilm(scene, frame, parameters)
     if settings.denoise != "svgf":
         history = None
     left, top, right, bottom = camera.window
@@ -127,6 +129,7 @@ def render(
         film.add(buffer, radiance, scene.pass_index, prepared.seen)
         for matte in mattes:
             matte.add(buffer)
+        surfaces.add(buffer)
         if lights is not None and lights.seen:
             film.pixels.emission[y0 - top : y1 - top] += visible_lights(lights, parameters, left, buffer)
         for motion in moving:
@@ -147,8 +150,10 @@ def render(
         history.signal = signal
     before, after = motions[:2]
     made = {name: values for matte in mattes for name, values in matte.passes().items()}
+    made |= surfaces.passes()
     made |= film.passes(
         tuple(name for name in frame.passes if name not in made),
+        made,
         components,
         vector_pass(before, after, seen.coverage.shape) if "Vector" in frame.passes else None,
         None if before is None else before.previous,

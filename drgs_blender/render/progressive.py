@@ -22,6 +22,7 @@ from ..core.frame import Frame, RenderSettings
 from .backend import CPU, RenderBackend
 from .camera import camera_parameters
 from .film.film import Film
+from .film.surface_film import SurfaceFilm
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.visible_lights import visible_lights
 from .integrator.adaptive import Sampling, part_count
@@ -249,6 +250,7 @@ class Progressive:
     def _develop(self, prepared: PreparedScene, check: Callable[[], None]) -> dict[str, Array]:
         camera, lights = self.frame.camera, prepared.lights
         film = Film(camera, self.frame.settings, self._parameters)
+        surfaces = SurfaceFilm(prepared.scene, self.frame, self._parameters)
         for strip in self._strips:
             buffer = self._samples(strip)
             check()
@@ -257,10 +259,14 @@ class Progressive:
             if prepared.captured:  # points that have no light yet were given that of their pixel
                 radiance.components[buffer.points.flags & UNLIT != 0] = 0.0
             film.add(buffer, radiance, prepared.scene.pass_index, prepared.seen)
+            surfaces.add(buffer)
             if lights is not None and lights.seen:
                 rows = slice(strip.rows[0] - camera.window[1], strip.rows[1] - camera.window[1])
                 film.pixels.emission[rows] += visible_lights(lights, self._parameters, camera.window[0], buffer)
-        return film.passes(self.frame.passes, denoised(film, self.frame, check, self._backend))
+        made = surfaces.passes()
+        names = tuple(name for name in self.frame.passes if name not in made)
+        made |= film.passes(names, made, denoised(film, self.frame, check, self._backend))
+        return {name: made[name] for name in self.frame.passes}
 
 
 def _bytes_of(buffer: GBuffer) -> int:

@@ -123,7 +123,7 @@ def test_rays_are_divided_and_surface_passes_stay_sharp(white, captured, ball):
     assert not any("Cryptomatte" in m.text for m in history)
     white.view_layers[0].use_pass_cryptomatte_asset = True
     bpy.ops.render.render()
-    assert any("Cryptomatte of assets" in m.text for m in history)
+    assert any("no pass Cryptomatte Asset" in m.text for m in history)
 
 
 def test_the_line_above_the_picture_says_what_it_is_made_of(white, captured):

@@ -140,6 +140,7 @@ def _paint(obj, colour, roughness, metallic):
     shader.inputs["Base Color"].default_value = colour
     shader.inputs["Roughness"].default_value = roughness
     shader.inputs["Metallic"].default_value = metallic
+    shader.distribution = "GGX"  # ours has no multiple scattering
     obj.data.materials.append(material)
 
 

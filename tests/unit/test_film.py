@@ -9,11 +9,14 @@ from drgs_blender.core.frame import Camera, RenderSettings, World
 from drgs_blender.core.passes import BY_NAME
 from drgs_blender.render.camera import camera_parameters, sample_ray
 from drgs_blender.render.film.film import EMPTY_DEPTH, Film
+from drgs_blender.render.film.surface_film import CHANNELS
 from drgs_blender.render.gbuffer.gbuffer import GBuffer, compact
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.shading_points import Radiance
 
-ALL = tuple(name for name in BY_NAME if not name.startswith("Crypto"))  # these have a film of their own
+#: These have films of their own.
+ALL = tuple(name for name in BY_NAME if not name.startswith("Crypto") and name not in CHANNELS)
+WHITE = {name: np.ones((10, 12, 3), np.float32) for name in ("DiffCol", "GlossCol")}
 AA = 4
 
 
@@ -61,7 +64,7 @@ def some_coverage(seed: int = 3) -> np.ndarray:
 @pytest.mark.parametrize("transparent", [False, True])
 def test_combined_is_the_sum_of_its_parts_to_the_last_bit(transparent: bool) -> None:
     film, _, _ = expose(some_coverage(), transparent, World(colour=(0.3, 0.7, 1.9)))
-    p = film.passes(ALL)
+    p = film.passes(ALL, WHITE)
     assert [p[n].shape for n in ALL] == [(10, 12, len(BY_NAME[n].channels)) for n in ALL]
     assert all(v.dtype == np.float32 for v in p.values())
     total = p["DiffDir"] + p["DiffInd"] + p["GlossDir"] + p["GlossInd"] + p["Env"] + p["Emit"]
@@ -90,7 +93,7 @@ def test_light_is_the_weighted_sum_of_the_samples() -> None:
 
 def test_surface_passes_have_no_dark_rim_and_no_holes() -> None:
     film, _, _ = expose(some_coverage(), True)
-    p = film.passes(ALL)
+    p = film.passes(ALL, WHITE)
     covered = p["Coverage"][..., 0] > 0
     assert covered.any() and (~covered).any()
     depth = p["Depth"][..., 0]
@@ -104,7 +107,7 @@ def test_surface_passes_have_no_dark_rim_and_no_holes() -> None:
     faint = np.zeros((10, 12, AA))
     faint[4, 5, 2] = 0.01
     film, buffer, _ = expose(faint, True)
-    p = film.passes(ALL)
+    p = film.passes(ALL, WHITE)
     assert np.allclose(p["Albedo"][4, 5], buffer.points.albedo[0], atol=1e-6)
     assert np.allclose(p["Position"][4, 5], buffer.position[0], atol=1e-6)
     assert np.isclose(p["Coverage"][4, 5, 0], 0.0025)
@@ -120,7 +123,7 @@ def test_depth_and_index_at_an_edge_are_of_the_nearest_surface() -> None:
     buffer.position[:] = np.where(near, 1.0, -30.0)[:, None]
     buffer.object_index[:] = np.where(near, 1, 0)
     film.add(buffer, random_light(len(near)), np.array([7, 9], np.int32), EnvironmentLight(World()))
-    p = film.passes(ALL)
+    p = film.passes(ALL, WHITE)
     assert (p["Depth"] == 2).all() and (p["Position"] == 1).all() and (p["IndexOB"] == 9).all()
 
 
@@ -137,12 +140,12 @@ def test_background_is_the_mean_over_the_sub_pixel_rays() -> None:
         direction = np.array(sample_ray(parameters, (2 + y) * 12 + 3 + x, k))[3:]
         seen = light.lookup((direction / np.linalg.norm(direction))[None])[0]
         expected[y, x] += (1 - alpha[y, x, k]) / AA * seen
-    assert np.allclose(film.passes(("Env",))["Env"], expected, atol=1e-5)
+    assert np.allclose(film.passes(("Env",), {})["Env"], expected, atol=1e-5)
 
 
 def test_denoised_light_replaces_all_but_the_noisy_image() -> None:
     film, _, _ = expose(some_coverage(), True)
-    p = film.passes(ALL, 2 * film.pixels.components)
+    p = film.passes(ALL, WHITE, 2 * film.pixels.components)
     assert np.allclose(p["Combined"][..., :3], 2 * p["Noisy Image"][..., :3], rtol=1e-6)
     assert np.array_equal(p["Combined"][..., 3], p["Noisy Image"][..., 3])
     total = p["DiffDir"] + p["DiffInd"] + p["GlossDir"] + p["GlossInd"] + p["Env"] + p["Emit"]

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...core.errors import AssetError
 from ...core.frame import Camera, Frame, RenderSettings
-from ...core.passes import TEMPORAL
+from ...core.passes import COLOURS, TEMPORAL
 from ..camera import camera_parameters
 from ..film.film import COMPONENTS, add_light, footprints
 from ..film.frame_files import read_frame
@@ -101,7 +101,7 @@ def read_noisy(path: str | Path) -> NoisyFrame:
         _one(passes, "IndexOB"),
         footprints(_one(passes, "Depth"), now),
     )
-    components = np.stack([passes.pop(name) for name in COMPONENTS], axis=2)
+    components = np.stack([passes.pop(name) * passes[COLOURS[name]] for name in COMPONENTS], axis=2)
     moved: Motion = motion(position, passes.pop("Previous Position"), coverage, now, before)
     return NoisyFrame(
         NoisyPicture(components, passes.pop("Variance"), guides, moved), passes, metadata, now, before, window

@@ -8,7 +8,8 @@ by coverage. Passes that describe the surface are not premultiplied, so that the
 - Normal, Albedo, Roughness, Metallic: mean of all covered samples by weight;
 - IndexOB: of the nearest sample.
 
-Combined is DiffDir + DiffInd + GlossDir + GlossInd + Env + Emit, added in this order, to the last bit.
+Combined is the light of `Pixels.components` + environment + emission, added in this order. The passes of light are
+these components divided by the colours of the surfaces, as in Cycles (`core.passes.COLOURS`).
 
 A holdout leaves black, and alpha 0 where the film is transparent. A shadow catcher is seen by its shadow alone, a black
 veil as dense as the part of its light that the rest of the scene takes from it: 1 - (light in the scene) / (light among
@@ -24,6 +25,7 @@ import numpy as np
 from ...compute.jit import njit
 from ...compute.threads import ROWS, over_range
 from ...core.frame import Camera, RenderSettings
+from ...core.passes import COLOURS, without_colour
 from ..camera import FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, sample_ray
 from ..gbuffer.gbuffer import GBuffer
 from ..lights.environment import EnvironmentLight, envmap_radiance, map_at
@@ -169,6 +171,7 @@ class Film:
     def passes(
         self,
         names: tuple[str, ...],
+        colours: dict[str, Array],
         components: Array | None = None,
         vector: Array | None = None,
         previous: Array | None = None,
@@ -178,6 +181,8 @@ class Film:
         Parameters
         ----------
         names : tuple of str
+        colours : dict of str to array
+            DiffCol and GlossCol (h, w, 3), where passes of light are wanted.
         components : (h, w, 4, 3) array, optional
             Denoised light; that of the film when None.
         vector, previous : array, optional
@@ -185,7 +190,11 @@ class Film:
         """
         seen = self.pixels
         light = seen.components if components is None else components
-        made = {name: np.ascontiguousarray(light[:, :, i]) for i, name in enumerate(COMPONENTS)}
+        made = {
+            name: without_colour(light[:, :, i], colours[COLOURS[name]])
+            for i, name in enumerate(COMPONENTS)
+            if name in names
+        }
         shadow = self._shadow()
         made["Env"] = self.environment - self.veiled * shadow[..., None] if shadow.any() else self.environment
         made["Emit"] = seen.emission

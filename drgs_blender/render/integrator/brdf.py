@@ -329,6 +329,27 @@ def layer_table() -> Array:
     0, at 16 values each of roughness, cosine and z = F0^(1/4), and returns F0 + (1 - F0) s. For IOR 1.5, z lies between
     the sixth and the seventh value.
     """
+    vh, above = _reflections()
+    lower, part = divmod(0.04**0.25 * (_NODES - 1), 1.0)
+    s = np.zeros(vh.shape[:2])
+    for node, share in ((lower, 1 - part), (lower + 1, part)):
+        f0 = (node / (_NODES - 1)) ** 4
+        eta = (1 + math.sqrt(f0)) / (1 - math.sqrt(f0))
+        g = np.sqrt(eta * eta - 1 + vh * vh)
+        f = 0.5 * ((g - vh) / (g + vh)) ** 2 * (1 + ((vh * (g + vh) - 1) / (vh * (g - vh) + 1)) ** 2)
+        s += share * np.where(above, (f - f0) / (1 - f0), 0.0).mean(axis=-1)
+    return (0.04 + 0.96 * np.clip(s, 0, 1)).astype(np.float32)
+
+
+@functools.cache
+def schlick_table() -> Array:
+    """(16, 16) float32, rows n . v, columns roughness: mean of Schlick's (1 - v . h)^5 over visible normals."""
+    vh, above = _reflections()
+    return np.where(above, np.maximum(0, 1 - vh) ** 5, 0.0).mean(axis=-1).astype(np.float32)
+
+
+def _reflections() -> tuple[Array, Array]:
+    """Cosines of viewer and visible normals, (16, 16, n) by n . v and roughness, and whether reflections stay above."""
     n = 2048
     i = np.arange(n)
     u = (i + 0.5) / n
@@ -345,13 +366,4 @@ def layer_table() -> Array:
     hx, hy, hz = alpha * (sx + ring * np.cos(angle)), alpha * ring * np.sin(angle), sz + z
     length = np.sqrt(hx**2 + hy**2 + hz**2)
     vh = (vx * hx + vz * hz) / length
-    above = 2 * vh * hz / length - vz > 0
-    lower, part = divmod(0.04**0.25 * (_NODES - 1), 1.0)
-    s = np.zeros_like(mu)
-    for node, share in ((lower, 1 - part), (lower + 1, part)):
-        f0 = (node / (_NODES - 1)) ** 4
-        eta = (1 + math.sqrt(f0)) / (1 - math.sqrt(f0))
-        g = np.sqrt(eta * eta - 1 + vh * vh)
-        f = 0.5 * ((g - vh) / (g + vh)) ** 2 * (1 + ((vh * (g + vh) - 1) / (vh * (g - vh) + 1)) ** 2)
-        s += share * np.where(above, (f - f0) / (1 - f0), 0.0).mean(axis=-1)
-    return (0.04 + 0.96 * np.clip(s, 0, 1)).astype(np.float32)
+    return vh, 2 * vh * hz / length - vz > 0

@@ -72,6 +72,7 @@ class MeshMaterials:
         self._given: list[Any] = []  # lists of materials, images
         self._first: list[int] = []  # of each mesh, in `table`
         self._names: list[Any] = []  # of the layers of each mesh
+        self._shapes: list[tuple[slice, MeshState]] = []  # and the faces of each
         self.clear(0)
 
     def clear(self, count: int) -> None:
@@ -94,6 +95,12 @@ class MeshMaterials:
         """`addresses` of arrays that lie elsewhere; who calls it keeps what it returns."""
         tables = self._tables if address_of is address else self.layers.tables(self._first_face, address_of)
         return np.array([*self.table.addresses_at(address_of, tables[0]), address_of(tables[1])], np.int64)
+
+    @property
+    def pass_indices(self) -> Array:
+        """(k,) int32 pass index of each of `names`."""
+        given = self._given[: max(len(self._first) - 1, 0)]
+        return np.array([material.pass_index for materials in given for material in materials], np.int32)
 
     def of(self, face: Array) -> Array:
         """(n,) int64 place in `names` of the materials of faces; one behind the last for negative ones."""
@@ -165,6 +172,11 @@ class MeshMaterials:
         self._first_face, self._tables = first_face, self.layers.tables(first_face)
         self.table.take_layers(self._tables[0])
         self.addresses = self.addresses_at(address)
+        self._shapes = [
+            (slice(part.face.start - first_face, part.face.stop - first_face), part.item)
+            for part in parts
+            if isinstance(part.item, MeshState)
+        ]
 
     def _make_table(self, meshes: Sequence[MeshState], images: Sequence[Image]) -> None:
         owner = [index for index, mesh in enumerate(meshes) for _ in mesh.materials]
@@ -176,6 +188,21 @@ class MeshMaterials:
 
         materials = [m for mesh in meshes for m in mesh.materials]
         self.table = MaterialTable(materials, list(images), self.table, layer_row, owner)
+
+    def uv_maps(self) -> Array:
+        """(k, 3, 3) float32: u, v and 1 at the corners of each face, for the pass UV; 0 of meshes without a UV map.
+
+        Raises
+        ------
+        AssetError
+            Where a map does not fit its mesh; names it.
+        """
+        found = np.zeros((len(self.index), 3, 3), np.float32)
+        for rows, mesh in self._shapes:
+            if mesh.uv_map is not None:
+                found[rows, :, :2] = as_float(mesh.uv_map, (rows.stop - rows.start, 3, 2), f"UV map of {mesh.name}")
+                found[rows, :, 2] = 1
+        return found
 
 
 def _material_index(mesh: MeshState, count: int) -> Array | int:

@@ -1,0 +1,163 @@
+"""Passes of seen surfaces that pictures rarely ask for: colours of the lobes, Mist, UV and material index.
+
+They are those of Cycles. All but the material index, which is that of the nearest sample, are means over a pixel's
+samples premultiplied by coverage: in a pixel half covered, UV is half of what the surface has, with a third channel
+that says so, and Mist is 1 where nothing is. Diffuse and glossy colour are the directional albedos of the lobes,
+for a viewer as flat to the surface as the camera: colour passes, by which light passes are divided
+(`core.passes.COLOURS`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...compute.jit import njit
+from ...compute.threads import ELEMENTS, ROWS, over_range
+from ...core.frame import Frame
+from ...core.passes import COLOURS
+from ..camera import POSITION
+from ..gbuffer.gbuffer import GBuffer
+from ..integrator import brdf
+from ..sampling import ONE, ZERO, F
+from ..scene.trace_scene import TraceScene
+from ..shading_points import CATCHER
+
+Array = np.ndarray
+
+#: Name -> channels.
+CHANNELS = {"DiffCol": 3, "GlossCol": 3, "UV": 3, "Mist": 1, "IndexMA": 1}
+
+
+class SurfaceFilm:
+    """These passes of the camera's window, as far as a frame needs them.
+
+    Parameters
+    ----------
+    scene : TraceScene
+    frame : Frame
+    parameters : array
+        `camera.camera_parameters`.
+    """
+
+    def __init__(self, scene: TraceScene, frame: Frame, parameters: Array) -> None:
+        x0, y0, x1, y1 = frame.camera.window
+        wanted = {*frame.passes, *(COLOURS[name] for name in frame.passes if name in COLOURS)}
+        self._scene, self._frame, self._parameters, self._origin = scene, frame, parameters, (x0, y0)
+        self.pixels = {
+            name: np.zeros((y1 - y0, x1 - x0, channels), np.float32)
+            for name, channels in CHANNELS.items()
+            if name in wanted
+        }
+        self._uvs = scene.mesh_materials.uv_maps() if "UV" in self.pixels else None
+
+    def add(self, buffer: GBuffer) -> None:
+        """Take the samples of a strip."""
+        if not self.pixels:
+            return
+        x0, top = self._origin
+        y0, y1 = buffer.rows
+        rows = buffer.point_rows(x0, self._frame.camera.width)
+        values: dict[str, Array] = {}
+        if "DiffCol" in self.pixels or "GlossCol" in self.pixels:
+            values["DiffCol"], values["GlossCol"] = self._colours(buffer)
+        if self._uvs is not None:
+            values["UV"] = self._places(buffer, self._uvs)
+        if "Mist" in self.pixels:
+            values["Mist"] = 1 - self._mist(buffer)
+        for name in self.pixels.keys() & values.keys():
+            over_range(_mean, y1 - y0, rows, values[name], self.pixels[name][y0 - top : y1 - top], fewest=ROWS)
+        if "IndexMA" in self.pixels:
+            out = self.pixels["IndexMA"][y0 - top : y1 - top, :, 0]
+            over_range(_nearest, y1 - y0, rows, self._material_index(buffer), out, fewest=ROWS)
+
+    def passes(self) -> dict[str, Array]:
+        """Name -> (h, w, channels) float32."""
+        return {name: 1 - pixels if name == "Mist" else pixels for name, pixels in self.pixels.items()}
+
+    def _colours(self, buffer: GBuffer) -> tuple[Array, Array]:
+        """(n, 3) float32 colour of the diffuse and of the glossy lobe at each point."""
+        points = buffer.points
+        diffuse, glossy = (np.empty((len(points), 3), np.float32) for _ in range(2))
+        model = brdf.SHADING_DATABLOCKS[self._frame.settings.shading_model]
+        tables = brdf.layer_table(), brdf.schlick_table()
+        over_range(_lobe_colours, len(points), points.arrays, model, tables, diffuse, glossy, fewest=ELEMENTS)
+        return diffuse, glossy
+
+    def _places(self, buffer: GBuffer, uvs: Array) -> Array:
+        """(n, 3) float32: u, v and 1 at each point; 0 where there is no UV map."""
+        out = np.zeros((len(buffer.face), 3), np.float32)
+        own = buffer.face - self._scene.vertex_faces
+        meshes = own >= 0
+        if len(uvs):
+            corners, (u, v) = uvs[own[meshes]], buffer.barycentric[meshes].T
+            weights = np.stack([1 - u - v, u, v], axis=1)[:, :, None]
+            out[meshes] = (weights * corners).sum(axis=1)
+        return out
+
+    def _mist(self, buffer: GBuffer) -> Array:
+        """(n, 1) float32 mist of each point in [0, 1]."""
+        mist, p = self._frame.mist, self._parameters
+        if self._frame.camera.orthographic:
+            far = np.abs(buffer.depth).astype(np.float64)
+        else:
+            far = np.linalg.norm(buffer.position - p[POSITION : POSITION + 3], axis=1)
+        part = np.clip((far - mist.start) / mist.depth if mist.depth > 0 else 0 * far, 0, 1)
+        return (part**mist.falloff)[:, None].astype(np.float32)
+
+    def _material_index(self, buffer: GBuffer) -> Array:
+        """(n,) float32 pass index of the material at each point."""
+        scene, objects = self._scene, [item.material_pass_index for item in self._frame.objects]
+        numbers = np.array([*scene.mesh_materials.pass_indices, 0, *objects], np.float32)
+        row = scene.mesh_materials.of(buffer.face - scene.vertex_faces)
+        source = scene.source[buffer.object_index]
+        none = len(scene.mesh_materials.names)
+        return numbers[np.where(row == none, np.where(source < len(objects), none + 1 + source, none), row)]
+
+
+@njit
+def _lobe_colours(first, last, points, shading_model, tables, diffuse, glossy):  # type: ignore[no-untyped-def]
+    """Directional albedo of both lobes at some points; diffuse is exactly what the integrator multiplies with."""
+    layers, schlick = tables
+    normal, geometric, view = points.normal, points.geometric_normal, points.viewer
+    for i in range(first, last):
+        vx, vy, vz = view[i, 0], view[i, 1], view[i, 2]
+        mx, my, mz = brdf.glossy_normal(
+            normal[i, 0], normal[i, 1], normal[i, 2], geometric[i, 0], geometric[i, 1], geometric[i, 2], vx, vy, vz
+        )
+        nv, rough, metal = mx * vx + my * vy + mz * vz, points.roughness[i], points.metallic[i]
+        kd = brdf.diffuse_weight(rough, metal, nv, shading_model, layers)
+        s = brdf.layer_albedo(rough, nv, schlick)
+        for c in range(3):
+            albedo = points.albedo[i, c]
+            diffuse[i, c] = kd * albedo
+            cut = min(albedo, ONE)
+            if shading_model == brdf.PAPER:
+                base = F(0.04) * (ONE - metal) + metal * cut
+                glossy[i, c] = base + (ONE - base) * s
+            else:
+                layer = brdf.layer_albedo(rough, nv, layers)
+                glossy[i, c] = (ONE - metal) * layer + metal * (cut + (ONE - cut) * s)
+
+
+@njit
+def _mean(y0, y1, points, values, out):  # type: ignore[no-untyped-def]
+    """Add the values of points to their pixels, by weight."""
+    for y in range(y0, y1):
+        for i in range(points.start[y], points.start[y + 1]):
+            if points.flags[i] & CATCHER:
+                continue
+            x = points.pixel[i] % points.width - points.x0
+            for c in range(values.shape[1]):
+                out[y, x, c] += points.weight[i] * values[i, c]
+
+
+@njit
+def _nearest(y0, y1, points, values, out):  # type: ignore[no-untyped-def]
+    """Give each pixel the value of its nearest point."""
+    for y in range(y0, y1):
+        before, depth = np.int32(-1), ZERO
+        for i in range(points.start[y], points.start[y + 1]):
+            if points.flags[i] & CATCHER or (points.pixel[i] == before and points.depth[i] >= depth):
+                continue
+            before, depth = points.pixel[i], points.depth[i]
+            out[y, before % points.width - points.x0] = values[i]
