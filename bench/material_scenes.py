@@ -66,7 +66,7 @@ def stage() -> None:
     floor(material("Floor", (0.5, 0.5, 0.5), 0.7))
     add_light("SUN", 2.5, (2.5, -2, 3), angle=math.radians(8))
     world((0.7, 0.85, 1.0), 0.3)
-    camera((0.5, -3.6, 1.6))
+    camera((0.5, -3.6, 1.6), lens=72)
 
 
 def waves(normals: bool, size: int = 256) -> bpy.types.Image:
@@ -199,8 +199,8 @@ def sky(job: dict) -> None:
     texture.sky_type = next(kind for kind in ("MULTIPLE_SCATTERING", "NISHITA") if kind in kinds)
     texture.sun_elevation, texture.sun_rotation = math.radians(35), math.radians(130)
     tree.links.new(texture.outputs[0], tree.nodes["Background"].inputs["Color"])
-    tree.nodes["Background"].inputs["Strength"].default_value = 0.12
-    camera((0.5, -3.6, 1.6))
+    tree.nodes["Background"].inputs["Strength"].default_value = 0.025
+    camera((0.5, -3.6, 1.6), lens=72)
 
 
 def procedural_world(job: dict) -> None:
@@ -216,7 +216,7 @@ def procedural_world(job: dict) -> None:
     ramp.color_ramp.elements[0].color, ramp.color_ramp.elements[1].color = (0.02, 0.05, 0.2, 1), (2.0, 1.4, 0.8, 1)
     tree.links.new(ramp.outputs[0], tree.nodes["Background"].inputs["Color"])
     tree.nodes["Background"].inputs["Strength"].default_value = 0.7
-    camera((0.5, -3.6, 1.6))
+    camera((0.5, -3.6, 1.6), lens=72)
 
 
 def procedural(job: dict) -> None:

@@ -18,7 +18,7 @@ from ..formats.gltf_nodes import Pose
 from ..formats.mesh import check_extent
 from .refine import MAX_TRIANGLES, TOLERANCE, refine
 from .surface_detail import MAX_SURFELS, CornerFrames, SurfaceDetail
-from .texture import CHANNELS, Materials
+from .texture import ALPHA, CUT_OUT, Materials
 from .topology import Net, weld
 
 Array = np.ndarray
@@ -140,22 +140,48 @@ def detailed_mesh(
         file = mesh_to_z_up(file, turned)
     report: dict[str, Any] = {"source_vertices": len(file.vertices), "source_faces": len(file.faces)}
     report["notes"] = list(file.notes)
-    net, (source, corners), frames = _net(file, name, report)
-    faces = len(net.faces)
     materials = Materials(file.materials, coloured=file.vertex_colours is not None)
+    net, (source, corners), frames = _net(file, name, report, materials.width)
+    faces = len(net.faces)
     net, values, report["rounds"], report["unresolved_edges"] = refine(net, materials, tolerance, max_triangles)
-    report["vertices"], report["faces"] = len(net.vertices), len(net.faces)
     channels = values[:, :3], values[:, 3], values[:, 4]
     count = file.file_count or len(file.vertices)
     origin = _source(net, file.vertex_numbers[source], file.vertex_numbers[corners], count)
+    divided = len(net.faces) > faces
+    if materials.width > ALPHA:
+        _cut_out(net, values[:, ALPHA], materials.cut_out, name, report)
+    report["notes"] += [f"{material}: partly transparent, shown as opaque" for material in materials.veiled]
+    report["vertices"], report["faces"] = len(net.vertices), len(net.faces)
     mesh = Mesh(net.vertices, net.faces, *channels, _groups(net, file), origin)
     if turned not in (None, "z"):
         mesh.source = (mesh.source or SourceVertices.identity(count)).turned(UP_AXES[turned])
     log.info("mesh of %s: %s", name, report)
-    return mesh, report, SurfaceDetail(net, materials, frames, len(net.faces) > faces)
+    return mesh, report, SurfaceDetail(net, materials, frames, divided)
 
 
-def _net(file: MeshFile, name: str, report: dict[str, Any]) -> tuple[Net, tuple[Array, Array], CornerFrames]:
+def _cut_out(net: Net, alpha: Array, which: Array, name: str, report: dict[str, Any]) -> None:
+    """Leave out the transparent faces of `net`; their vertices stay, so that poses of the source fit.
+
+    Parameters
+    ----------
+    alpha : (n,) array
+        Of the vertices.
+    which : (materials + 1,) bool array
+        Materials that are cut out.
+    """
+    keep = (alpha[net.faces].mean(axis=1) >= CUT_OUT) | ~which[net.tags[:, 0]]
+    if not keep.any():
+        raise AssetError(name, "is transparent everywhere", "Make its materials opaque")
+    if cut := int((~keep).sum()):
+        report["notes"].append(f"{cut} transparent faces of {len(keep)} are cut out")
+    net.faces, net.uvs, net.tags, net.inside = (
+        net.faces[keep], net.uvs[keep], net.tags[keep], net.inside[keep],
+    )  # fmt: skip
+
+
+def _net(
+    file: MeshFile, name: str, report: dict[str, Any], width: int
+) -> tuple[Net, tuple[Array, Array], CornerFrames]:
     """Proper faces of the file, welded, with tags (material, part, number).
 
     Returns
@@ -188,7 +214,7 @@ def _net(file: MeshFile, name: str, report: dict[str, Any]) -> tuple[Net, tuple[
     source, point, welded = weld(file.vertices[used].astype(np.float64), faces, material, normals)
     source = used[source]
     n = len(source)
-    values = np.full((n, CHANNELS), np.nan)
+    values = np.full((n, width), np.nan)
     values[:, :3] = 1 if file.vertex_colours is None else file.vertex_colours[source]
     if file.vertex_roughness is not None:
         values[:, 3] = file.vertex_roughness[source]

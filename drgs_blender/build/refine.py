@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .texture import CHANNELS, Materials, perceived
+from .texture import Materials, perceived
 from .topology import Net, close_marks, edge_lengths, edges, subdivide, survivors
 
 Array = np.ndarray
@@ -32,7 +32,7 @@ def refine(net: Net, materials: Materials, tolerance: float, max_triangles: int)
     -------
     net : Net
         The divided mesh.
-    values : (n, CHANNELS) float32 array
+    values : (n, channels) float32 array
         Of its vertices: the mean over their corners of the textures around them.
     rounds : int
         Rounds done.
@@ -96,7 +96,7 @@ class _TextureFit:
 
     Attributes
     ----------
-    values : (n, CHANNELS) float32 array
+    values : (n, channels) float32 array
         Of the vertices.
     errors : (m, 3) array
         Largest difference between textures and interpolated vertex values along each edge of each face. The middle of
@@ -115,7 +115,7 @@ class _TextureFit:
         m = len(net.faces)
         if before is None or kept is None:
             new = np.ones(m, bool)
-            self._corners = np.empty((CHANNELS, m, 3), np.float32)
+            self._corners = np.empty((materials.width, m, 3), np.float32)
             self._along, self._middle = np.zeros((m, 3)), np.zeros(m)
         else:
             new = kept < 0
@@ -145,16 +145,16 @@ class _TextureFit:
 
 
 def _at_corners(net: Net, materials: Materials, some: Array) -> Array:
-    """Values (CHANNELS, s, 3) of the textures around the corners of the faces `some`."""
+    """Values (channels, s, 3) of the textures around the corners of the faces `some`."""
     uvs = net.uvs[some]
     size = _corner_size(uvs)
     material = np.repeat(net.tags[some, 0], 3)
     found = materials.sample(material, uvs.reshape(-1, 2), FOOTPRINT * size.reshape(-1, 2))
-    return found.T.reshape(CHANNELS, len(some), 3)
+    return found.T.reshape(materials.width, len(some), 3)
 
 
 def _at_vertices(net: Net, corners: Array) -> Array:
-    """Values (n, CHANNELS) float32 of the vertices: the mean over all their corners, channel by channel in memory."""
+    """Values (n, channels) float32 of the vertices: the mean over all their corners, channel by channel in memory."""
     flat, n = net.faces.reshape(-1), len(net.vertices)
     count = np.maximum(np.bincount(flat, minlength=n), 1)
     values = np.stack([np.bincount(flat, channel.reshape(-1), n) / count for channel in corners])
@@ -177,7 +177,7 @@ class _Comparison:
     ----------
     net : Net
     materials : Materials
-    values : (n, CHANNELS) float32 array
+    values : (n, channels) float32 array
         Of the vertices.
     """
 

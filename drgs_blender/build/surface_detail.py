@@ -15,7 +15,7 @@ from ..core.asset.model import Binding, Mesh, Surfels
 from ..deform.face_frames import Faces, dot, shading_frames
 from ..geometry.distinct_rows import distinct_row_indices
 from ..geometry.normals import VertexNormals, unit
-from .texture import Materials, perceived
+from .texture import ALPHA, Materials, perceived
 from .topology import Net
 
 Array = np.ndarray
@@ -118,10 +118,11 @@ class SurfaceDetail:
     def any(self) -> bool:
         """Whether it knows more than the vertices do."""
         used = np.unique(self._net.tags[:, 0])
-        return self._divided or bool((self._materials.textured | self._materials.bumpy)[used].any())
+        shown = self._materials.textured | self._materials.bumpy
+        return self._divided or bool(self._materials.cut_out[used].any()) or bool(shown[used].any())
 
     def values_at(self, face: Array, weights: Array, extent: Array) -> Array:
-        """Materials (n, CHANNELS) of points, averaged over an extent (n, 2) in texture coordinates."""
+        """Materials (n, channels) of points, averaged over an extent (n, 2) in texture coordinates."""
         net = self._net
         values = self._materials.sample(net.tags[face, 0], self._uvs(face, weights), FOOTPRINT * extent)
         own = np.einsum("nk,nkc->nc", weights, net.values[net.faces[face]])
@@ -185,6 +186,8 @@ class SurfaceDetail:
         surfels.albedo, surfels.roughness, surfels.metallic = (
             np.ascontiguousarray(values[:, :3]), np.ascontiguousarray(values[:, 3]), np.ascontiguousarray(values[:, 4]),
         )  # fmt: skip
+        if values.shape[1] > ALPHA:
+            surfels.opacity *= values[:, ALPHA]
         faces = Faces.of(mesh.vertices, mesh.faces)
         normals = self.normals_at(face, weights, extent)
         inward = dot(normals, faces.normal[face]) < LEAST_FACING

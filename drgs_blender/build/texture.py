@@ -11,8 +11,13 @@ from ..formats.files import Image, MaterialFile
 
 Array = np.ndarray
 
-#: Columns of sampled materials: albedo (linear Rec.709), roughness, metallic.
+#: Columns of sampled materials: albedo (linear Rec.709), roughness, metallic; then alpha, where any material has some.
 CHANNELS = 5
+ALPHA = CHANNELS
+#: Alpha below which there is no surface, where a material is cut out.
+CUT_OUT = 0.5
+#: A material is cut out where this part of its alpha is at most .1 or at least .9, and some of it the former.
+CLEAR_CUT = 0.8
 #: Points looked up at a time: what is found on the way stays in the processor's cache.
 TOGETHER = 16384
 
@@ -151,17 +156,31 @@ class Materials:
         Of the file.
     coloured : bool
         The vertices have colours: the base colour of faces without a material (-1) is then white.
+
+    Attributes
+    ----------
+    textured, bumpy : (materials + 1,) bool array
+        Which have images, and which normal maps.
+    cut_out : (materials + 1,) bool array
+        Whose alpha says where there is a surface.
+    veiled : list of str
+        Names of those that are partly transparent in another way, which is not sampled.
+    width : int
+        Columns of `sample`.
     """
 
     def __init__(self, materials: list[MaterialFile], coloured: bool = False) -> None:
         self._pyramids: dict[int, Pyramid] = {}
         plain = MaterialFile("", base_colour=(1.0, 1.0, 1.0)) if coloured else MaterialFile("")
         self._materials = [*materials, plain]  # index -1 finds the last
-        self.textured = np.array([bool(self._images(m)) for m in self._materials])
         self.bumpy = np.array([m.normal_image is not None for m in self._materials])
+        self.cut_out = np.array([_is_cut_out(m) for m in self._materials])
+        self.textured = np.array([bool(self._images(k)) for k in range(len(self._materials))])
+        self.veiled = [m.name for m, cut in zip(self._materials, self.cut_out) if not cut and _alpha_of(m).mean() < 1]
+        self.width = CHANNELS + int(self.cut_out.any())
 
     def sample(self, material: Array, uvs: Array, scale: Array) -> Array:
-        """Values (n, CHANNELS) of points, channel by channel in memory.
+        """Values (n, width) of points, channel by channel in memory.
 
         Parameters
         ----------
@@ -172,20 +191,22 @@ class Materials:
         scale : (n, 2) array
             Width of the area to average, in texture coordinates.
         """
-        result = np.empty((CHANNELS, len(material)), np.float32)
+        result = np.empty((self.width, len(material)), np.float32)
         for index in np.unique(material):
             of_material = np.flatnonzero(material == index)
             for first in range(0, len(of_material), TOGETHER):
                 rows = of_material[first : first + TOGETHER]
-                result[:, rows] = self._of_material(self._materials[index], uvs[rows], scale[rows])
+                result[:, rows] = self._of_material(index, uvs[rows], scale[rows])
         return np.clip(result, 0, 1, out=result).T
 
-    def _of_material(self, m: MaterialFile, uvs: Array, scale: Array) -> Array:
-        """Values (CHANNELS, n) of points of one material."""
-        values = np.empty((CHANNELS, len(uvs)), np.float32)
-        values[:] = np.array((*m.base_colour, m.roughness, m.metallic))[:, None]
+    def _of_material(self, index: int, uvs: Array, scale: Array) -> Array:
+        """Values (width, n) of points of one material."""
+        m = self._materials[index]
+        values = np.empty((self.width, len(uvs)), np.float32)
+        alpha = m.alpha if self.cut_out[index] else 1.0
+        values[:] = np.array((*m.base_colour, m.roughness, m.metallic, alpha)[: self.width])[:, None]
         taps: dict[tuple[object, ...], TrilinearTaps] = {}
-        for image, columns, channels in self._images(m):
+        for image, columns, channels in self._images(index):
             pyramid = self._pyramid(image)
             if pyramid.layout not in taps:
                 footprint = np.abs(scale) * pyramid.levels[0].shape[1::-1] * _zoom(image)
@@ -228,16 +249,17 @@ class Materials:
         sizes = np.ones(len(self._materials))
         for k, m in enumerate(self._materials):
             maps = [m.normal_image] if bumps and m.normal_image is not None else []
-            for image in [*maps, *(image for image, _, _ in self._images(m))]:
+            for image in [*maps, *(image for image, _, _ in self._images(k))]:
                 sizes[k] = min(sizes[k], 1 / (max(image.pixels.shape[:2]) * _zoom(image).max()))
         return sizes
 
-    @staticmethod
-    def _images(m: MaterialFile) -> list[tuple[Image, slice, slice]]:
-        """(image, columns of the values it multiplies, its channels)."""
+    def _images(self, index: int) -> list[tuple[Image, slice, slice]]:
+        """(image, columns of the values it multiplies, its channels) of a material."""
+        m = self._materials[index]
         images = (
             (m.base_colour_image, slice(0, 3), slice(0, 3)),
             (m.metallic_roughness_image, slice(3, 5), slice(1, 3)),
+            (m.alpha_image if self.cut_out[index] else None, slice(ALPHA, ALPHA + 1), slice(0, 1)),
         )
         return [(image, columns, channels) for image, columns, channels in images if image is not None]
 
@@ -245,6 +267,21 @@ class Materials:
         if id(image) not in self._pyramids:
             self._pyramids[id(image)] = Pyramid(image)
         return self._pyramids[id(image)]
+
+
+def _alpha_of(m: MaterialFile) -> Array:
+    """All alpha that a material has."""
+    return np.array([m.alpha]) if m.alpha_image is None else m.alpha * to_unit(m.alpha_image.pixels)
+
+
+def _is_cut_out(m: MaterialFile) -> bool:
+    """Whether a material's alpha says where there is a surface, also where its file only says that it has alpha."""
+    if m.cut_out:
+        return m.alpha_image is not None or m.alpha < CUT_OUT
+    if m.alpha_image is None:
+        return False
+    alpha = _alpha_of(m)
+    return bool((alpha <= 0.1).any()) and float(((alpha <= 0.1) | (alpha >= 0.9)).mean()) >= CLEAR_CUT
 
 
 def _zoom(image: Image) -> Array:
@@ -285,7 +322,7 @@ def _wrap(index: Array, size: Array, mode: str) -> Array:
 
 
 def perceived(values: Array) -> Array:
-    """Values (CHANNELS, n) with the square root of albedo, in which equal steps look about equal."""
+    """Values (channels, n) with the square root of albedo, in which equal steps look about equal."""
     result = values.copy()
     result[:3] = np.sqrt(np.maximum(values[:3], 0))
     return result

@@ -6,13 +6,14 @@ Colours are linear Rec.709 already; positions are in the axes of the file unless
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from ..core.asset import Environment, Surfels
+from ..core.color import to_unit
 
 Array = np.ndarray
 
@@ -67,6 +68,13 @@ class Image:
     uv_transform: Array = field(default_factory=lambda: np.eye(2, 3))
     wrap: tuple[str, str] = ("repeat", "repeat")
 
+    @property
+    def alpha(self) -> Image | None:
+        """Its last channel as an image of its own; None without alpha."""
+        if self.pixels.ndim < 3 or self.pixels.shape[2] not in (2, 4):
+            return None
+        return replace(self, pixels=to_unit(self.pixels[..., -1]), srgb=False)
+
 
 @dataclass(slots=True)
 class MaterialFile:
@@ -84,6 +92,12 @@ class MaterialFile:
         Normals in tangent space (MikkTSpace), 2 * RGB - 1, green upwards; never sRGB.
     normal_strength : float
         Of the normal map, as of Blender's node.
+    alpha : float
+        In [0, 1]: how much of what lies behind it the surface hides.
+    alpha_image : Image, optional
+        First channel multiplies `alpha`; never sRGB.
+    cut_out : bool
+        Whether alpha is 0 or 1 by intent, as of leaves: then what is mostly transparent is not there.
     """
 
     name: str
@@ -94,6 +108,9 @@ class MaterialFile:
     metallic_roughness_image: Image | None = None
     normal_image: Image | None = None
     normal_strength: float = 1.0
+    alpha: float = 1.0
+    alpha_image: Image | None = None
+    cut_out: bool = False
 
 
 @dataclass(slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -257,8 +258,7 @@ class _Materials:
             self.notes.append(f"{material.name}: textures on two UV maps; the one of the base colour is used for both")
         if get(entry, "emissiveTexture", dict) or document.numbers(entry, "emissiveFactor", (0.0, 0.0, 0.0)).any():
             self.notes.append(f"{material.name}: emission ignored")
-        if get(entry, "alphaMode", str, "OPAQUE") != "OPAQUE":
-            self.notes.append(f"{material.name}: alpha ignored, the surface is opaque")
+        self._alpha(entry, material, float(colour[3]))
         self._normal_map(entry, material, (colour_set if material.base_colour_image else other_set))
         for name in extensions:
             if name.startswith("KHR_materials_"):
@@ -266,6 +266,21 @@ class _Materials:
         if material.base_colour_image or material.metallic_roughness_image or material.normal_image is None:
             return colour_set if material.base_colour_image else other_set
         return self._normal_set
+
+    def _alpha(self, entry: dict[str, Any], material: MaterialFile, factor: float) -> None:
+        """Read the alpha of the base colour, cut at the cutoff where the material says so."""
+        mode = self.document.get(entry, "alphaMode", str, "OPAQUE")
+        if mode not in ("MASK", "BLEND"):
+            return
+        alpha = None if material.base_colour_image is None else material.base_colour_image.alpha
+        factor = float(np.clip(factor, 0, 1)) if np.isfinite(factor) else 1.0
+        material.cut_out = mode == "MASK"
+        if material.cut_out:
+            cutoff = float(self.document.numbers(entry, "alphaCutoff", (0.5,))[0])
+            if alpha is not None:
+                alpha = replace(alpha, pixels=(alpha.pixels * factor >= cutoff).astype(np.float32))
+            factor = float(factor >= cutoff) if alpha is None else 1.0
+        material.alpha, material.alpha_image = factor, alpha
 
     def _normal_map(self, entry: dict[str, Any], material: MaterialFile, uv_set: int) -> None:
         """Read the normal map; it is left out, with a note, where it has another UV set than other textures."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -179,6 +179,13 @@ def _read_mtl(path: Path, notes: list[str]) -> dict[str, MaterialFile]:
                 current.base_colour_image = _image(line, path, notes)
                 if current.base_colour_image is not None:
                     current.base_colour = (1.0, 1.0, 1.0)
+            elif keyword in ("d", "tr"):
+                hides = float(words[-1])
+                current.alpha = float(np.clip(hides if keyword == "d" else 1 - hides, 0, 1))
+            elif keyword == "map_d":
+                picture = _image(line, path, notes)
+                if picture is not None:
+                    current.alpha_image = picture.alpha or replace(picture, srgb=False)
             elif keyword in ("norm", "map_bump", "bump"):
                 _read_normal_map(current, line, path, notes)
             elif keyword in ("map_pr", "map_pm", "map_ns"):

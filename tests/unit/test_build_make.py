@@ -8,7 +8,7 @@ import trimesh
 
 from drgs_blender.build.make import _net, make_asset, mesh_with_materials
 from drgs_blender.build.refine import _TextureFit
-from drgs_blender.build.texture import Materials, Pyramid
+from drgs_blender.build.texture import CHANNELS, Materials, Pyramid
 from drgs_blender.build.topology import Net, close_marks, edge_lengths, edges, subdivide, survivors, weld
 from drgs_blender.core.errors import AssetError
 from drgs_blender.formats.files import Image, MaterialFile, MeshFile
@@ -158,7 +158,7 @@ def test_what_a_division_leaves_is_known_and_looked_up_once():
     pixels = rng.random((64, 64, 3)).astype(np.float32)
     file = plane(6, Image(pixels, srgb=False), vertex_roughness=np.linspace(0, 1, 49).astype(np.float32))
     materials = Materials(file.materials)
-    net, _, _ = _net(file, "plane", {"notes": []})
+    net, _, _ = _net(file, "plane", {"notes": []}, CHANNELS)
     edge, count = edges(net)
     fit, known = _TextureFit(net, edge, edge_lengths(net), materials), 0
     for _ in range(5):
@@ -182,7 +182,7 @@ def test_what_a_division_leaves_is_known_and_looked_up_once():
 def test_an_edge_that_both_faces_see_alike_is_looked_up_once_and_a_seam_twice():
     rng = np.random.default_rng(5)
     file = plane(6, Image(rng.random((64, 64, 3)).astype(np.float32), srgb=False))
-    net, _, _ = _net(file, "plane", {"notes": []})
+    net, _, _ = _net(file, "plane", {"notes": []}, CHANNELS)
     net.uvs[::5] += 0.3  # islands of their own
     edge, count = edges(net)
     materials = Materials(file.materials)

@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image as Pillow
 from test_build_make import plane, ramp
 
-from drgs_blender.build.make import make_asset
+from drgs_blender.build.make import make_asset, read_mesh_file
 from drgs_blender.build.surface_detail import CornerFrames
 from drgs_blender.core.asset.model import Asset
+from drgs_blender.core.errors import AssetError
 from drgs_blender.deform.face_frames import Faces, shading_frames
 from drgs_blender.formats.files import Image, MaterialFile, MeshFile
 
@@ -154,3 +156,69 @@ def test_bad_texture_coordinates_do_no_harm() -> None:
         found = shading_normals(asset)
         np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-3)
         assert (found[:, 2] > 0).all()
+
+
+def leaf(size: int = 128) -> np.ndarray:
+    """(size, size) bool, row 0 at the top: a disc of radius .3 in the middle."""
+    y, x = (np.mgrid[0:size, 0:size] + 0.5) / size - 0.5
+    return np.hypot(x, y) < 0.3
+
+
+def card(material: MaterialFile) -> MeshFile:
+    file = plane(2)
+    file.materials = [material]
+    return file
+
+
+def alpha_image(alpha: np.ndarray) -> Image:
+    return Image(alpha.astype(np.float32)[..., None], srgb=False, wrap=("clamp", "clamp"))
+
+
+@pytest.mark.parametrize("said", [True, False])
+def test_cut_out_cards_keep_the_leaf_alone(said: bool) -> None:
+    """Whether the file says so, or only that it has alpha."""
+    asset = make_asset(card(MaterialFile("leaf", alpha_image=alpha_image(leaf()), cut_out=said)))
+    mesh = asset.mesh
+    area = Faces.of(mesh.vertices, mesh.faces).area.sum()
+    assert area == pytest.approx(np.pi * 0.09, rel=0.01)
+    far = np.hypot(*(mesh.vertices[mesh.faces].mean(axis=1)[:, :2] - 0.5).T)
+    assert far.max() < 0.305
+    inside = np.hypot(*(asset.surfels.centre[:, :2] - 0.5).T) < 0.28
+    assert asset.surfels.opacity[inside].min() > 0.95
+    assert mesh.source_count == 9 and len(mesh.in_own_order(np.ones((9, 3)))) == len(mesh.vertices)
+    assert any("cut out" in note for note in asset.provenance["report"]["notes"])
+
+
+def test_glass_stays_and_is_told() -> None:
+    asset = make_asset(card(MaterialFile("lens", alpha=0.3)))
+    assert asset.surfels.opacity.min() > 0.95
+    assert "lens: partly transparent, shown as opaque" in asset.provenance["report"]["notes"]
+    veil = make_asset(card(MaterialFile("veil", alpha_image=alpha_image(np.full((4, 4), 0.4)))))
+    assert veil.surfels.opacity.min() > 0.95 and len(veil.mesh.faces) == 8
+
+
+def test_nothing_but_holes_is_refused() -> None:
+    with pytest.raises(AssetError, match="transparent everywhere"):
+        make_asset(card(MaterialFile("gone", alpha_image=alpha_image(np.zeros((4, 4))), cut_out=True)))
+
+
+def test_obj_knows_alpha_and_normal_maps(tmp_path) -> None:
+    pixels = (leaf(32) * 255).astype(np.uint8)
+    Pillow.fromarray(np.dstack([np.full((32, 32, 3), 90, np.uint8), pixels])).save(tmp_path / "leaf.png")
+    bumps = np.tile(np.uint8([160, 128, 230]), (8, 8, 1))
+    bumps[0, 0] = 128, 128, 255
+    Pillow.fromarray(bumps).save(tmp_path / "bumps.png")
+    Pillow.fromarray(np.full((8, 8), 90, np.uint8)).save(tmp_path / "heights.png")
+    (tmp_path / "card.mtl").write_text(
+        "newmtl leaf\nKd 1 1 1\nmap_d leaf.png\nnorm -bm 0.5 bumps.png\nnewmtl glass\nd 0.25\nmap_Bump heights.png\n"
+    )
+    corners = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+    (tmp_path / "card.obj").write_text(
+        f"mtllib card.mtl\n{corners}usemtl leaf\nf 1/1 2/2 3/3 4/4\nusemtl glass\nf 1 2 3\n"
+    )
+    file = read_mesh_file(tmp_path / "card.obj")
+    material, glass = file.materials
+    np.testing.assert_array_equal(material.alpha_image.pixels > 0.5, leaf(32))
+    assert material.normal_strength == 0.5 and material.normal_image.pixels.shape == (8, 8, 3)
+    assert glass.alpha == 0.25 and glass.normal_image is None
+    assert any("heights" in note and "ignored" in note for note in file.notes)
