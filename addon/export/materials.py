@@ -66,13 +66,12 @@ class Materials:
         surface = tree.surface()
         if surface is None:
             return ExportedMaterial(None)
-        # A surface is there or not; one that is there scatters as if it were there entirely.
-        base = surface.base.times(1 / (1 - surface.clear)) if surface.clear < 1 else surface.base
         paints = {
-            "base_colour": base,
+            "base_colour": surface.base,
             "roughness": surface.roughness,
             "metallic": surface.metallic,
             "emission": surface.emission,
+            "alpha": surface.alpha,
         }
         textures = [value.texture for value in (*paints.values(), *(d.value for d in surface.details)) if value.texture]
         wanted = [t.layer for t in textures] + [d.tangents for d in surface.details if d.kind == "tangent"]
@@ -121,6 +120,6 @@ def _usable(tree: SurfaceWalker, name: str, value: SocketValue, default: tuple[f
         tree.report(f"its {name.replace('_', ' ')} is not finite; Blender's default is used. Check its drivers")
         colour = np.broadcast_to(default, 3)
     colour = np.maximum(colour, 0)
-    if name in ("roughness", "metallic") and value.texture is None:
+    if name in ("roughness", "metallic", "alpha") and value.texture is None:
         colour = np.minimum(colour, 1)
     return tuple(map(float, colour)) if name in ("base_colour", "emission") else float(colour[0])

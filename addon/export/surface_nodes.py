@@ -12,6 +12,8 @@ from .normal_nodes import DetailRef, NormalWalker
 from .socket_value import Array, SocketValue, constant, once, uniform
 from .sockets import SocketRef, surface_of
 
+#: Least alpha of a surface that gives off light and lets all light pass, which no alpha says.
+_LEAST_ADDED = 0.25
 #: Of the Principled BSDF: inputs that must be zero, and what they are called in the warning.
 _LOBES = {
     "Subsurface Weight": "subsurface",
@@ -26,9 +28,13 @@ _LOBES = {
 
 @dataclass(slots=True)
 class Surface:
-    """Result of a shader: reflected and emitted light, scattered share, transparent share.
+    """Result of a shader.
 
-    ``base`` is already times the share that is scattered.
+    Attributes
+    ----------
+    base, emission : light reflected and given off by the part that is there; ``base`` is times `scattered`
+    scattered : share of that part that is scattered
+    alpha : share that is there; light passes the rest
     """
 
     base: SocketValue = field(default_factory=lambda: uniform(0))
@@ -36,7 +42,7 @@ class Surface:
     metallic: SocketValue = field(default_factory=lambda: uniform(0))
     emission: SocketValue = field(default_factory=lambda: uniform(0))
     scattered: float = 0.0
-    clear: float = 0.0
+    alpha: SocketValue = field(default_factory=lambda: uniform(1))
     details: tuple[DetailRef, ...] = ()
 
 
@@ -63,10 +69,7 @@ class SurfaceWalker(NormalWalker):
             self.report("has no surface, which is black in Blender; its viewport colour is used")
             return Surface(uniform(material.diffuse_color[:3]), uniform(material.roughness), scattered=1)
         surface = self.shader(ref)
-        if 0 < surface.clear < 1:
-            state = "left out" if surface.clear > 0.5 else "opaque"
-            self.report(f"is {surface.clear:.0%} transparent, which is not rendered; it is {state}")
-        return None if surface.clear > 0.5 and surface.emission.black else surface
+        return None if surface.alpha.black else surface
 
     # Shaders
 
@@ -81,7 +84,7 @@ class SurfaceWalker(NormalWalker):
 
     def shader_bsdf_principled(self, output: SocketRef) -> Surface:
         node = output.node
-        alpha = float(np.clip(self.opacity(output.input("Alpha")), 0, 1))
+        alpha = _unit(self.number(output.input("Alpha")))
         strength = self.number(output.input("Emission Strength"))
         emission = uniform(0)
         if not strength.black:
@@ -91,12 +94,12 @@ class SurfaceWalker(NormalWalker):
             unsupported.append("specular other than that of IOR 1.5")
         self.warn_unsupported(output, unsupported)
         return Surface(
-            self.colour(output.input("Base Color")).times(alpha),
+            self.colour(output.input("Base Color")),
             self.number(output.input("Roughness")),
             self.number(output.input("Metallic")),
-            emission.times(alpha),
-            scattered=alpha,
-            clear=1 - alpha,
+            emission,
+            scattered=1,
+            alpha=alpha,
             details=self.normal_of(output),
         )
 
@@ -106,14 +109,6 @@ class SurfaceWalker(NormalWalker):
         if ior.is_output or level.is_output:
             return float("nan")
         return reflectance(ior.default_value) * 2 * level.default_value
-
-    def opacity(self, ref: SocketRef) -> float:
-        """A constant alpha; where it varies, the surface is there."""
-        alpha, origin = self.number(ref), ref.origin()
-        if alpha.texture is None:
-            return float(alpha.colour[0])
-        self.warn(origin.node, "transparency that varies over the surface is not rendered; it is opaque")
-        return 1.0
 
     def warn_unsupported(self, output: SocketRef, unsupported: list[str]) -> None:
         """One warning for all that a shader node does beyond the supported."""
@@ -148,7 +143,7 @@ class SurfaceWalker(NormalWalker):
         colour = self.fixed(output.input("Color"))
         if np.ptp(colour) > 0.01 or colour.mean() < 0.99:
             self.warn(output.node, "coloured transparency is not rendered; it is clear")
-        return Surface(clear=1)
+        return Surface(alpha=uniform(0))
 
     def shader_mix_shader(self, output: SocketRef) -> Surface:
         factor = output.input(0).origin()
@@ -156,24 +151,38 @@ class SurfaceWalker(NormalWalker):
         if factor.socket.is_output and factor.node.type == "LIGHT_PATH":
             self.warn(output.node, f'"{factor.socket.name}" is not evaluated per ray; the first shader is used')
             return first
-        share = self.number(output.input(0))
-        if share.texture is None:
-            share = uniform(np.clip(share.colour, 0, 1))
-        elif first.clear or second.clear:
-            self.warn(output.node, "transparency that varies over the surface is not rendered; it is opaque")
-            return min(first, second, key=lambda surface: surface.clear)
-        return self.mixed(output.node, first, second, share)
+        return self.joined(output.node, first, second, _unit(self.number(output.input(0))))
+
+    def joined(self, node: bpy.types.Node, first: Surface, second: Surface, share: SocketValue) -> Surface:
+        """`share` of the second surface, the rest of the first, with what light passes of either."""
+        if second.alpha.black:
+            return replace(first, alpha=self.combine(node, lambda f, a: (1 - f) * a, share, first.alpha))
+        if first.alpha.black:
+            return replace(second, alpha=self.combine(node, np.multiply, second.alpha, share))
+        a, b = first.alpha, second.alpha
+        if a.texture == b.texture and (a.colour == b.colour).all():
+            return replace(self.mixed(node, first, second, share), alpha=a)
+        alpha = self.combine(node, lambda f, x, y: x + f * (y - x), share, a, b)
+        if any(value.texture is not None for value in (a, b, share)):
+            self.warn(node, "both shaders let light pass, one more than the other; what is there is mixed as if alike")
+        else:
+            share = uniform(b.colour * share.colour / np.maximum(alpha.colour, 1e-9))
+        return replace(self.mixed(node, first, second, share), alpha=alpha)
 
     def shader_add_shader(self, output: SocketRef) -> Surface:
         node, first, second = output.node, self.shader(output.input(0)), self.shader(output.input(1))
-        half = self.mixed(node, first, second, uniform(0.5))
+        if first.alpha.black and second.alpha.black:
+            return first
+        a, b = (float(self.flat(node, surface.alpha)[0]) for surface in (first, second))
+        sum_ = self.mixed(node, first, second, uniform(b / (a + b)))
+        alpha = max(1 - (2 - a - b), _LEAST_ADDED)
+        if a + b < 2:
+            self.warn(node, f"light added to what passes: the surface hides {alpha:.0%} of what is behind it")
+        scale = (a + b) / alpha
         return replace(
-            half,
-            base=half.base.times(2),
-            emission=half.emission.times(2),
-            scattered=min(1.0, first.scattered + second.scattered),
-            clear=min(1.0, first.clear + second.clear),
-        )
+            sum_, base=sum_.base.times(scale), emission=sum_.emission.times(scale), alpha=uniform(alpha),
+            scattered=min(1.0, sum_.scattered * scale),
+        )  # fmt: skip
 
     def mixed(self, node: bpy.types.Node, first: Surface, second: Surface, share: SocketValue) -> Surface:
         """`share` of the second surface, the rest of the first; of roughness and metallic by what each scatters."""
@@ -193,7 +202,6 @@ class SurfaceWalker(NormalWalker):
             self.combine(node, mix, rough_share, first.metallic, second.metallic),
             self.combine(node, mix, share, first.emission, second.emission),
             scattered=sum(weights),
-            clear=(1 - mean) * first.clear + mean * second.clear,
             details=self.stronger_details(node, first, second, weights),
         )
 
@@ -216,6 +224,11 @@ class SurfaceWalker(NormalWalker):
         rough = output.input("Roughness") if "Roughness" in node.inputs else None
         rough_value = self.number(rough) if rough else uniform(1)
         return Surface(base, rough_value, scattered=1, details=self.normal_of(output))
+
+
+def _unit(value: SocketValue) -> SocketValue:
+    """Within [0, 1]; what a texture says is so where it is looked up."""
+    return value if value.texture is not None else uniform(np.clip(np.nan_to_num(value.colour, nan=1.0), 0, 1))
 
 
 def _used(ref: SocketRef) -> bool:

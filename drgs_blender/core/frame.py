@@ -255,6 +255,8 @@ class Material:
         In [0, 1]; with a texture factors that may be larger.
     emission : tuple of float
         Linear Rec.709 radiance, colour times strength.
+    alpha : float
+        Share of the surface that is there, in [0, 1]; light passes the rest in a straight line.
     details : list of SurfaceDetail
         Done to the shading normal one after the other.
     pass_index : int
@@ -270,8 +272,15 @@ class Material:
     roughness_texture: Texture | None = None
     metallic_texture: Texture | None = None
     emission_texture: Texture | None = None
+    alpha: float = 1.0
+    alpha_texture: Texture | None = None
     details: list[SurfaceDetail] = field(default_factory=list)
     pass_index: int = 0
+
+    @property
+    def clear(self) -> bool:
+        """Whether light may pass it."""
+        return not self.alpha >= 1.0 or self.alpha_texture is not None
 
 
 @dataclass(slots=True)

@@ -25,6 +25,7 @@ from ..render.lights.environment import EnvironmentLight
 from ..render.lights.light_sampler import Lights
 from ..render.lights.mesh_lights import Emitters
 from ..render.scene.ray_masks import group_mask
+from ..render.scene.see_through import MOST
 from ..render.scene.trace_scene import TraceObject, TraceScene
 from ..render.surfels.captured import CapturedObject
 from ..render.surfels.surfel_bvh import SurfelBVH
@@ -308,6 +309,11 @@ class SceneCache:
                 found.append(
                     f"{fault.name}: {fault.bad_instances} instances are flat, not finite or too far away; left out"
                 )
+        for name in dict.fromkeys(self._name(index) for index in sorted(self.scene.cut)):
+            found.append(
+                f"{name}: rays pass {MOST} see-through surfaces up to it, and end there; what is behind is not seen. "
+                "Use fewer layers"
+            )
         for item in self.objects:
             found += item.faults
         found += self.scene.mesh_materials.warnings
@@ -320,6 +326,12 @@ class SceneCache:
                 "give no light; where that shows, repair the image"
             )
         return found
+
+    def _name(self, index: int) -> str:
+        """Of an object as the trace scene numbers them."""
+        source = int(self.scene.source[index])
+        count = len(self.objects)
+        return self.objects[source].state.name if source < count else self.meshes[source - count].name
 
     def environment_of(self, world: World) -> EnvironmentLight:
         """The light of `world`, made again only when something about it changed; a rotation costs nothing."""

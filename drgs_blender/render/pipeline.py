@@ -184,6 +184,7 @@ class VisibleSurfaces:
         self._splats: Splats | SurfelRays | None = None
         self._captured: captured.CapturedSplats | None = None
         self._rasterise: Callable[..., SurfelSamples] = backend.rasterise
+        prepared.scene.cut.clear()
         if frame.settings.camera_sees == "surfels":
             if frame.camera.panorama:
                 assert prepared.seen_surfels is not None

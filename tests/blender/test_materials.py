@@ -282,7 +282,7 @@ def test_pixels_are_those_of_cycles(scene, export, tmp_path, data, use_alpha, fl
     swatch(bpy.data.materials["Material"]).scale = (4, 1, 1)
     look_down(scene, 8, 8, 4, 2.001, 0.001)
     frame, warnings = export()
-    assert len(warnings) == use_alpha and all("transparency" in w for w in warnings)
+    assert not warnings
     (state,), (pixels,) = frame.meshes, frame.images
     assert pixels.pixels.dtype == (np.float32 if float_buffer else np.uint8)
     assert pixels.encoding == ("linear" if float_buffer or data else "srgb")
@@ -594,33 +594,6 @@ def test_principled_values_and_those_out_of_range(scene, export):
         value.default_value = given
         frame, warnings = export()
         assert frame.meshes[0].materials[0].roughness == expected and len(warnings) == count
-
-
-@pytest.mark.parametrize("alpha", [0.8, 0.2, 0.0])
-@pytest.mark.parametrize("mixed", [False, True])
-def test_transparent_surfaces_are_there_or_not(scene, export, alpha, mixed):
-    tree, principled = material()
-    principled.inputs["Base Color"].default_value = (*A, 1)
-    if mixed:
-        shaded(tree, add(tree, "MixShader", alpha, add(tree, "BsdfTransparent"), principled.outputs[0]))
-    else:
-        principled.inputs["Alpha"].default_value = alpha
-    swatch(bpy.data.materials["Material"])
-    frame, warnings = export()
-    assert len(frame.meshes) == (alpha > 0.5)
-    assert len(warnings) == (alpha > 0)
-    if alpha > 0.5:
-        np.testing.assert_allclose(frame.meshes[0].materials[0].base_colour, A, rtol=1e-5)
-
-
-def test_transparency_by_an_image_is_named_and_opaque(scene, export):
-    tree, principled = material()
-    node = texture_node(tree, picture(alpha=True))
-    tree.links.new(node.outputs["Color"], principled.inputs["Base Color"])
-    tree.links.new(node.outputs["Alpha"], principled.inputs["Alpha"])
-    swatch(bpy.data.materials["Material"])
-    frame, warnings = export()
-    assert len(frame.meshes) == 1 and len(warnings) == 1 and "transparency" in warnings[0]
 
 
 def test_smoke_without_a_surface_is_not_a_solid_block(scene, export):

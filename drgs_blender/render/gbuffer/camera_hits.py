@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from ...compute.jit import njit
 from ...compute.threads import over_strided
-from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
+from ..camera import CLIP_END, CLIP_START, WIDTH, pixel_shift, sample_ray
 from ..sampling import F
 from ..scene.interaction import nearest, position_at, surface_at
 from ..scene.ray import Hit, Ray
+from ..scene.see_through import MOST, nearest_there
 from ..scene.trace_scene import TraceScene
 from .gbuffer import GBuffer, face_viewer
 
@@ -19,6 +21,9 @@ Array = np.ndarray
 
 #: Samples or points of a block.
 _BLOCK = 256
+#: Step of the third coordinate of a pixel's lattice, and what makes another hash of its first.
+_SILVER, _HASHED = 0.41421356237309503, 65521.0
+_BELOW_ONE = F(1.0 - 2.0**-24)
 
 
 @dataclass(slots=True)
@@ -70,6 +75,13 @@ def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: 
     owners = scene.face_object, scene.instance_object
     blocks = -(-owner.size // _BLOCK)
     view_of = parameters, x0, y0
+    if scene.mesh_materials.table.clear:
+        # Another kernel, so that scenes without see-through surfaces do not wait for it to be compiled.
+        cut = np.zeros(len(scene.pass_index), np.int32)
+        seen = scene.tracer, scene.geometry
+        over_strided(_trace_through, blocks, seen, view_of, np.int32(mask), owners, (*hits.arrays, cut), calls=8)
+        scene.cut.update(np.flatnonzero(cut).tolist())
+        return hits
     over_strided(_trace, blocks, scene.tracer, view_of, np.int32(mask), owners, hits.arrays, calls=8)
     return hits
 
@@ -97,6 +109,12 @@ def arrays_of(buffer: GBuffer) -> tuple[tuple[Array, ...], tuple[tuple[Array, ..
 def _trace(first, last, stride, tracer, view_of, mask, owners, out):  # type: ignore[no-untyped-def]
     for thread in range(first, last):
         trace_samples(thread, stride, None, tracer, view_of, mask, owners, out)
+
+
+@njit
+def _trace_through(first, last, stride, seen, view_of, mask, owners, out):  # type: ignore[no-untyped-def]
+    for thread in range(first, last):
+        trace_through_samples(thread, stride, None, seen, view_of, mask, owners, out)
 
 
 @njit
@@ -148,6 +166,52 @@ def trace_samples(thread, stride, scratch, tracer, view_of, mask, owners, out): 
                 owner[y, x, k] = instance_object[i]
             elif f >= 0:
                 owner[y, x, k] = face_object[f]
+
+
+@njit
+def trace_through_samples(thread, stride, scratch, seen, view_of, mask, owners, out):  # type: ignore[no-untyped-def]
+    """`trace_samples` in a scene with surfaces that light may pass: by chance, a sample sees what is behind them.
+
+    The numbers of a pixel's samples are a lattice with the two of their positions, see `camera`.
+
+    Parameters
+    ----------
+    thread, stride, scratch, view_of, mask, owners : int64, tuple or int32
+        As of `trace_samples`.
+    seen : tuple
+        Tracer and geometry.
+    out : tuple
+        `MeshHits.arrays`, and (objects,) int32, 1 where samples end for having passed too many surfaces.
+    """
+    tracer, geometry = seen
+    p, x0, y0 = view_of
+    face_object, instance_object = owners
+    depth, owner, face, instance, where, cut = out
+    width = np.int64(p[WIDTH])
+    rows, columns, subpixels = depth.shape
+    near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
+    count = rows * columns * subpixels
+    for block in range(thread, (count + _BLOCK - 1) // _BLOCK, stride):
+        for n in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
+            x, y, k = n // subpixels % columns, n // (subpixels * columns), n % subpixels
+            pixel = (y0 + y) * width + x0 + x
+            ox, oy, oz, dx, dy, dz = sample_ray(p, pixel, k)
+            number = pixel_shift(p, pixel)[0] * _HASHED + k * _SILVER
+            number = number - math.floor(number)
+            ray = Ray((F(ox), F(oy), F(oz)), (F(dx), F(dy), F(dz)), near, far, mask)
+            hit, passed = nearest_there(tracer, ray, geometry, min(F(number), _BELOW_ONE))
+            t, f, i, u, v, gx, gy, gz = hit
+            depth[y, x, k], face[y, x, k], instance[y, x, k] = t, f, i
+            where[y, x, k, 0], where[y, x, k, 1] = u, v
+            where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4] = gx, gy, gz
+            who = np.int32(-1)
+            if f >= 0 and i >= 0:
+                who = instance_object[i]
+            elif f >= 0:
+                who = face_object[f]
+            owner[y, x, k] = who
+            if who >= 0 and passed >= MOST:
+                cut[who] = 1
 
 
 @njit

@@ -26,6 +26,7 @@ def _constants(module: ModuleType, name: str, value: Any) -> Any:
 
 
 TRACE = WarpKernel(camera_hits.trace_samples, (), NATIVES, _constants)
+TRACE_THROUGH = WarpKernel(camera_hits.trace_through_samples, (), NATIVES, _constants)
 SHADE = WarpKernel(camera_hits.shade_hits, (), NATIVES, _constants)
 
 
@@ -64,8 +65,15 @@ def trace(
         depth, where = zeros(shape), zeros((*shape, 5))
         owner, face, instance = (zeros(shape, "int32") for _ in range(3))
     on_device = depth, owner, face, instance, where
-    arguments = tracer, (parameters, x0, y0), np.int32(mask), owners
-    launcher.launch(TRACE, int(np.prod(shape)), arguments, on_device)
+    view_of, count = (parameters, x0, y0), int(np.prod(shape))
+    if scene.mesh_materials.table.clear:
+        with launcher.failures("copying the scene"):
+            seen, cut = (tracer, mirror.geometry(scene)), zeros((max(len(scene.pass_index), 1),), "int32")
+        launcher.launch(TRACE_THROUGH, count, (seen, view_of, np.int32(mask), owners), (*on_device, cut))
+        with launcher.failures("tracing the camera's rays"):
+            scene.cut.update(np.flatnonzero(cut.numpy()).tolist())
+    else:
+        launcher.launch(TRACE, count, (tracer, view_of, np.int32(mask), owners), on_device)
     with launcher.failures("tracing the camera's rays"):
         return DeviceHits(depth.numpy(), owner.numpy(), face, instance, where, on_device, on_cpu)
 

@@ -12,7 +12,7 @@ from ..lights.environment import ROTATION, EnvironmentLight, EnvMap
 from ..lights.light_sampler import Lights
 from ..memory import AddressOf, address
 from ..scene.interaction import Geometry
-from ..scene.ray_masks import CAMERA, DIFFUSE, GLOSSY, ORDINARY, SHADOW, SURFELS, WITHOUT
+from ..scene.ray_masks import CAMERA, CLEAR, DIFFUSE, GLOSSY, ORDINARY, SHADOW, SURFELS, WITHOUT
 from ..scene.trace_scene import TraceScene
 from .bvhs import Trees
 from .native_functions import MeshTracer
@@ -22,6 +22,7 @@ Array = np.ndarray
 _KINDS = DIFFUSE | GLOSSY | SHADOW
 #: Rays that are cast here.
 _RAYS = CAMERA | ORDINARY | _KINDS | _KINDS << WITHOUT | SURFELS
+_RAYS |= (_RAYS & ~SURFELS) << CLEAR
 
 
 class Mirror:

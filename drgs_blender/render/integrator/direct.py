@@ -132,9 +132,7 @@ def _trace_lights(rays, count, scene, settings, sums):  # type: ignore[no-untype
         others, glossy_others = s[i + w.WC] * s[i + w.PC], s[i + w.WG] * s[i + w.PG]
         if not scene.traits.lobes_apart:
             others = glossy_others = others + glossy_others
-        dr, dg, db, gr, gg, gb = light_radiance(
-            rays, slot, others, glossy_others, s[i + w.WL], scene.lights, scene.tracer, mask
-        )
+        dr, dg, db, gr, gg, gb = light_radiance(rays, slot, others, glossy_others, s[i + w.WL], scene, mask)
         if dr + dg + db + gr + gg + gb > ZERO:
             _reflect(sums, rays, slot, 0, (dr, dg, db), (gr, gg, gb))
 
@@ -169,7 +167,7 @@ def _trace_envmap(rays, count, scene, settings, sums):  # type: ignore[no-untype
     for slot in range(count):
         i, _ = w.at(slot)
         if s[i + w.LIVE] > ZERO:
-            s[i + w.LIVE] = passed(scene.tracer, rays, slot, FAR, mask)
+            s[i + w.LIVE] = passed(scene, rays, slot, FAR, mask)
     _see_envmap(rays, count, scene.envmap, sums)
 
 
@@ -226,7 +224,7 @@ def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: igno
         if not s[i + w.LIVE] > ZERO:
             continue
         position, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
-        through, reach, hit = meet(tracer, rays, slot, mask)
+        through, reach, hit = meet(scene, rays, slot, mask)
         if see_lights:
             _see_lights(rays, slot, reach, hit, (cosine, ggx), scene, sums)
             mis.balance_heuristic_at(s, i, cosine, ggx)

@@ -91,7 +91,7 @@ def _evaluate(rays, count, scene, shading_model):  # type: ignore[no-untyped-def
 def _towards_envmap(rays, count, scene, shift, found):  # type: ignore[no-untyped-def]
     """The environment samples that `environment_directions` drew and `path_weights` weighed."""
     s, ints = rays
-    tracer, envmap = scene.tracer, scene.envmap
+    envmap = scene.envmap
     for slot in range(count):
         i, c = w.at(slot)
         if not s[i + w.LIVE] > ZERO:
@@ -100,7 +100,7 @@ def _towards_envmap(rays, count, scene, shift, found):  # type: ignore[no-untype
         weight = ONE / s[i + w.PE]
         red, green, blue = red * s[i + w.QR] * weight, green * s[i + w.QG] * weight, blue * s[i + w.QB] * weight
         if red + green + blue > ZERO:
-            through = passed(tracer, rays, slot, FAR, np.int32(ray_masks.SHADOW << shift))
+            through = passed(scene, rays, slot, FAR, np.int32(ray_masks.SHADOW << shift))
             owner = np.int64(ints[c + w.OWNER])
             found[owner, INDIRECT] += red * through
             found[owner, INDIRECT + 1] += green * through
@@ -111,12 +111,11 @@ def _towards_envmap(rays, count, scene, shift, found):  # type: ignore[no-untype
 def _towards_lights(rays, count, scene, shift, found):  # type: ignore[no-untyped-def]
     """The light samples that `light_directions` drew."""
     s, ints = rays
-    tracer, lights = scene.tracer, scene.lights
     for slot in range(count):
         i, c = w.at(slot)
         others = s[i + w.SHARE] * s[i + w.PC] + (ONE - s[i + w.SHARE]) * s[i + w.PG]
         dr, dg, db, gr, gg, gb = light_radiance(
-            rays, slot, others, others, ONE, lights, tracer, np.int32(ray_masks.SHADOW << shift)
+            rays, slot, others, others, ONE, scene, np.int32(ray_masks.SHADOW << shift)
         )
         if dr + dg + db + gr + gg + gb > ZERO:
             owner = np.int64(ints[c + w.OWNER])
@@ -142,9 +141,9 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
         mask = np.int32((ray_masks.DIFFUSE if diffuse else ray_masks.GLOSSY) << shift)
         ends = last and not any_lights and not emissive
         if ends:
-            through = passed(tracer, rays, slot, FAR, mask)
+            through = passed(scene, rays, slot, FAR, mask)
         else:
-            through, reach, hit = meet(tracer, rays, slot, mask)
+            through, reach, hit = meet(scene, rays, slot, mask)
         owner = np.int64(ints[c + w.OWNER])
         fr, fg, fb = s[i + w.QR], s[i + w.QG], s[i + w.QB]
         if any_lights:

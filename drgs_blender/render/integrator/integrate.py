@@ -130,8 +130,9 @@ def integrate(
         tracer = tracer._replace(**tracer_of(surfels)._asdict())
     extent = F(scene.extent if surfels is None else max(scene.extent, surfels.extent))
     apart = scene.rays_differ and (auto or min(counts[:2]) > 0)
-    detailed = scene.mesh_materials.table.detailed
-    traits = Traits(extent, not environment.black, lights.count > 0, emissive, lights.rays_differ, apart, detailed)
+    shines = not environment.black, lights.count > 0, emissive
+    table = scene.mesh_materials.table
+    traits = Traits(extent, *shines, lights.rays_differ, apart, table.detailed, table.clear)
     given = Scene(tracer, geometry, envmap, light_tables, traits)
     clamp = F(settings.clamp_indirect * settings.subpixel_count * part[1] / sum(counts))
     how = Settings(settings.bounces, brdf.SHADING_DATABLOCKS[settings.shading_model], brdf.layer_table(), clamp, 0)

@@ -21,6 +21,7 @@ from ..sampling import ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
 from ..scene.interaction import Tracer, nearest, shadowed, surface_at
 from ..scene.ray import Hit, Ray
+from ..scene.see_through import nearest_there, transmitted
 from ..surfels.raster import GAP
 from ..surfels.surfel_query import RayStart
 from ..surfels.surfel_tracer import trace_surfels, transmittance
@@ -122,12 +123,12 @@ def _start_of(rays, slot):  # type: ignore[no-untyped-def]
 
 
 @njit
-def passed_meshes(tracer, rays, slot, far, mask):  # type: ignore[no-untyped-def]
+def passed_meshes(scene, rays, slot, far, mask):  # type: ignore[no-untyped-def]
     """`passed` where there are meshes alone.
 
     Parameters
     ----------
-    tracer : MixedTracer
+    scene : Scene
         Or a device's.
     rays, slot, far, mask : Batch, int64, float32 or int32
         As of `ray_of`.
@@ -135,45 +136,65 @@ def passed_meshes(tracer, rays, slot, far, mask):  # type: ignore[no-untyped-def
     Returns
     -------
     float32
-        Visibility, 0 or 1.
+        Visibility; 0 or 1 where light passes no mesh.
     """
-    hidden = shadowed(tracer, ray_of(rays, slot, far, mask))
+    ray = ray_of(rays, slot, far, mask)
+    hidden = shadowed(scene.tracer, ray)
+    if scene.traits.clear:
+        if hidden:
+            return ZERO
+        return transmitted(scene.tracer, ray, scene.geometry)
     return ZERO if hidden else ONE
 
 
 @njit
-def passed(tracer, rays, slot, far, mask):  # type: ignore[no-untyped-def]
+def passed(scene, rays, slot, far, mask):  # type: ignore[no-untyped-def]
     """Shadow ray: the share of light that reaches a slot's position from its direction, from no farther than `far`.
 
     Parameters
     ----------
-    tracer : MixedTracer
+    scene : Scene
     rays, slot, far, mask : Batch, int64, float32 or int32
         As of `ray_of`.
 
     Returns
     -------
     float32
-        0 behind a mesh, else the transmittance of the surfels, see `surfel_tracer.transmittance`.
+        0 behind an opaque mesh, else the transmittance of the surfels, see `surfel_tracer.transmittance`, and of
+        meshes that light may pass.
     """
-    ray = ray_of(rays, slot, far, mask)
+    tracer, ray = scene.tracer, ray_of(rays, slot, far, mask)
     if shadowed(tracer, ray):
         return ZERO
-    if tracer.surfel_scene == 0:
-        return ONE
-    return transmittance(tracer, ray, _start_of(rays, slot))
+    share = ONE
+    if scene.traits.clear:
+        share = transmitted(tracer, ray, scene.geometry)
+    if tracer.surfel_scene == 0 or share == ZERO:
+        return share
+    return share * transmittance(tracer, ray, _start_of(rays, slot))
 
 
 @njit
-def meet_meshes(tracer, rays, slot, mask):  # type: ignore[no-untyped-def]
+def _nearest(scene, rays, slot, mask):  # type: ignore[no-untyped-def]
+    """The mesh that a slot's ray meets."""
+    ray = ray_of(rays, slot, FAR, mask)
+    if scene.traits.clear:
+        _, c = w.at(slot)
+        hit, _ = nearest_there(scene.tracer, ray, scene.geometry, unit(mix(U(rays.ints[c + w.KEY] + U(0x1B56C4E9)))))
+        return hit
+    return nearest(scene.tracer, ray)
+
+
+@njit
+def meet_meshes(scene, rays, slot, mask):  # type: ignore[no-untyped-def]
     """`meet` where there are meshes alone.
 
     Parameters
     ----------
-    tracer : MixedTracer
+    scene : Scene
         Or a device's.
     rays, slot, mask : Batch, int64 or int32
-        As of `ray_of`.
+        As of `ray_of`; KEY is read, too.
 
     Returns
     -------
@@ -183,17 +204,17 @@ def meet_meshes(tracer, rays, slot, mask):  # type: ignore[no-untyped-def]
         Distance of the hit, m.
     hit : Hit
     """
-    hit = nearest(tracer, ray_of(rays, slot, FAR, mask))
-    return (ONE if hit.face < 0 else ZERO), hit.t, hit
+    t, face, instance, u, v, gx, gy, gz = _nearest(scene, rays, slot, mask)
+    return (ONE if face < 0 else ZERO), t, Hit(t, face, instance, u, v, gx, gy, gz)
 
 
 @njit
-def meet(tracer, rays, slot, mask):  # type: ignore[no-untyped-def]
+def meet(scene, rays, slot, mask):  # type: ignore[no-untyped-def]
     """Closest hit of a slot's ray, of meshes and surfels together.
 
     Parameters
     ----------
-    tracer : MixedTracer
+    scene : Scene
     rays, slot, mask : Batch, int64 or int32
         As of `ray_of`; KEY is read, too.
 
@@ -206,8 +227,8 @@ def meet(tracer, rays, slot, mask):  # type: ignore[no-untyped-def]
     hit : MixedHit
         For `put_hit`; not to be used where `through` is 1.
     """
-    ray = ray_of(rays, slot, FAR, mask)
-    t, face, instance, u, v, gx, gy, gz = nearest(tracer, ray)
+    tracer, ray = scene.tracer, ray_of(rays, slot, FAR, mask)
+    t, face, instance, u, v, gx, gy, gz = _nearest(scene, rays, slot, mask)
     none = np.int32(-1)
     blank = (ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, none)
     if tracer.surfel_scene == 0:
@@ -384,7 +405,7 @@ def put_start(tracer, rays, slot, points, point):  # type: ignore[no-untyped-def
 
 
 @njit
-def light_radiance(rays, slot, others, glossy_others, share, lights, tracer, mask):  # type: ignore[no-untyped-def]
+def light_radiance(rays, slot, others, glossy_others, share, scene, mask):  # type: ignore[no-untyped-def]
     """Radiance of a light sample times visibility and MIS weight over pdf, for the diffuse and the glossy lobe.
 
     Parameters
@@ -396,8 +417,7 @@ def light_radiance(rays, slot, others, glossy_others, share, lights, tracer, mas
         Sum over the other strategies of count times pdf (sr^-1), for the diffuse and the glossy lobe.
     share : float32
         Number of light samples.
-    lights : LightTables
-    tracer : MixedTracer
+    scene : Scene
     mask : int32
         Of the shadow ray, see `ray_masks`.
 
@@ -412,12 +432,12 @@ def light_radiance(rays, slot, others, glossy_others, share, lights, tracer, mas
     r, g, b = s[i + w.ER], s[i + w.EG], s[i + w.EB]
     if not (s[i + w.LIVE] > ZERO and r + g + b > ZERO and density != ZERO):
         return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    flags = light_flags(np.int64(ints[c + w.CELL]), lights)
+    flags = light_flags(np.int64(ints[c + w.CELL]), scene.lights)
     if flags & ABSENT and mask >> ray_masks.WITHOUT:
         return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
     bright = ONE
     if flags & SHADOWED:
-        bright = passed(tracer, rays, slot, s[i + w.MU] * F(0.9999), mask)
+        bright = passed(scene, rays, slot, s[i + w.MU] * F(0.9999), mask)
         if not bright > ZERO:
             return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
     if density < ZERO:

@@ -32,6 +32,8 @@ class Traits(NamedTuple):
         The same of objects: cosine samples are of the diffuse lobe alone, GGX samples of the specular one.
     detailed : bool
         Whether surfaces have normal or bump maps.
+    clear : bool
+        Whether light may pass surfaces.
     """
 
     extent: np.float32
@@ -41,6 +43,7 @@ class Traits(NamedTuple):
     lights_differ: bool
     lobes_apart: bool
     detailed: bool
+    clear: bool
 
 
 class Scene(NamedTuple):

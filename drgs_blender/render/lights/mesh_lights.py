@@ -15,6 +15,7 @@ from ..memory import AddressOf, address, load_float, load_int32, load_int64
 from ..sampling import ONE, ZERO, F, unit
 from ..scene.interaction import Geometry, emitted
 from ..scene.mesh_materials import EmissiveMesh
+from ..scene.see_through import opacity_at
 from ..scene.trace_scene import TraceScene
 from .light_shapes import DIFFUSE, GLOSSY, SHADOW
 from .mesh_light_tree import Tree, build, emitter_probability, emitters_weight, morton_order, pick_emitter
@@ -330,7 +331,12 @@ def sample_emitter(rest, n1, n2, px, py, pz, emitters):  # type: ignore[no-untyp
     pdf = F(probability * density)
     if not (t > ZERO and pdf > ZERO and pdf < F(np.inf)):
         return ZERO, ZERO, ONE, ZERO, ZERO, ZERO, ZERO, ZERO, i
-    r, g, b = emitted(load_int32(tables.faces, i), u, v, tables.geometry)
+    face = load_int32(tables.faces, i)
+    r, g, b = emitted(face, u, v, tables.geometry)
+    # Rays that look for surfaces stop here by chance.
+    alpha = opacity_at(face, u, v, tables.geometry)
+    if alpha < ONE:
+        r, g, b = r * alpha, g * alpha, b * alpha
     return lx, ly, lz, t, r, g, b, pdf, i
 
 

@@ -23,10 +23,10 @@ _TANGENT, _OBJECT, _WORLD, _BLENDER_OBJECT, _BLENDER_WORLD, _BUMP = range(6)
 #: Columns of a step's integers and numbers; of a material's slots; of a mesh's frame.
 KIND, TEXTURE, TANGENTS, STEP_INTS = 0, 1, 2, 4
 STRENGTH, DISTANCE, COLOUR, STEP_FLOATS = 0, 1, 2, 8
-FIRST_STEP, STEPS, FRAME, SLOTS = 5, 6, 7, 8
+ALPHA, FIRST_STEP, STEPS, FRAME, SLOTS = 4, 5, 6, 7, 8
 NORMALS, EDGES, MATRICES, TURNS, FRAME_INTS = 0, 1, 2, 3, 4
 #: Places of the tables in ``Geometry.materials``.
-STEP_TABLE, NUMBER_TABLE, FRAME_TABLE = 7, 8, 9
+STEP_TABLE, NUMBER_TABLE, ALPHA_TABLE, FRAME_TABLE = 7, 8, 9, 10
 _TINY = F(1e-30)
 
 
@@ -81,9 +81,9 @@ def _mapped(kind, strength, colour, normal, side, frame_of, at):  # type: ignore
         z = ONE + share * (z - ONE)
         bx, by, bz = sign * (ay * tz - az * ty), sign * (az * tx - ax * tz), sign * (ax * ty - ay * tx)
         x, y, z = x * tx + y * bx + z * ax, x * ty + y * by + z * ay, x * tz + y * bz + z * az
-    elif kind == _BLENDER_OBJECT or kind == _BLENDER_WORLD:
+    elif kind in (_BLENDER_OBJECT, _BLENDER_WORLD):
         y, z = -y, -z
-    if kind == _TANGENT or kind == _OBJECT or kind == _BLENDER_OBJECT:
+    if kind in (_TANGENT, _OBJECT, _BLENDER_OBJECT):
         x, y, z = _unit(x, y, z, ZERO, ZERO, ZERO)
         x, y, z = _turned(load_int64(frames, frame + TURNS), 9 * instance, 3, x, y, z)
     x, y, z = _unit(side * x, side * y, side * z, nx, ny, nz)

@@ -67,7 +67,7 @@ class Geometry(NamedTuple):
     instance_object : int
         (p,) int32.
     materials : int
-        (10,) int64, ``mesh_materials.MeshMaterials.addresses``.
+        (11,) int64, ``mesh_materials.MeshMaterials.addresses``.
     """
 
     shading_faces: int
@@ -149,8 +149,21 @@ def _normal_of_instance(normals, i, j, k, w, u, v, matrices, instance):  # type:
 
 
 @njit
-def _place(face, u, v, geometry):  # type: ignore[no-untyped-def]
-    """A point of a mesh's face as `texture_lookup` takes it."""
+def place_of(face, u, v, geometry):  # type: ignore[no-untyped-def]
+    """A point of a mesh's face as `texture_lookup` takes it.
+
+    Parameters
+    ----------
+    face : int32
+        Of the scene.
+    u, v : float32
+        Barycentric coordinates of the second and third corner.
+    geometry : Geometry
+
+    Returns
+    -------
+    tuple
+    """
     own = np.int64(face) - geometry.vertex_faces
     if geometry.uvs == 0:
         return ZERO, ZERO, own, u, v
@@ -160,7 +173,17 @@ def _place(face, u, v, geometry):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _tables(geometry):  # type: ignore[no-untyped-def]
+def tables_of(geometry):  # type: ignore[no-untyped-def]
+    """Addresses of the tables as `texture_lookup` takes them.
+
+    Parameters
+    ----------
+    geometry : Geometry
+
+    Returns
+    -------
+    tuple of int64
+    """
     m = geometry.materials
     return (
         load_int64(m, 0), load_int64(m, 1), load_int64(m, 2), load_int64(m, 3), load_int64(m, 4), load_int64(m, 5),
@@ -188,10 +211,10 @@ def emitted(face, u, v, geometry):  # type: ignore[no-untyped-def]
     if face < geometry.vertex_faces:
         return ZERO, ZERO, ZERO
     own = np.int64(face) - geometry.vertex_faces
-    material, tables = load_int32(geometry.material, own), _tables(geometry)
+    material, tables = load_int32(geometry.material, own), tables_of(geometry)
     if not emits(material, tables):
         return ZERO, ZERO, ZERO
-    return emission_at(material, _place(face, u, v, geometry), tables)
+    return emission_at(material, place_of(face, u, v, geometry), tables)
 
 
 @njit
@@ -244,9 +267,9 @@ def surface_at(hit, direction, geometry):  # type: ignore[no-untyped-def]
         roughness = blend(rows, i + 6, j + 6, k + 6, w, u, v)
         metallic = blend(rows, i + 7, j + 7, k + 7, w, u, v)
     else:
-        place = _place(face, u, v, geometry)
+        place = place_of(face, u, v, geometry)
         material = load_int32(geometry.material, place[2])
-        r, g, b, roughness, metallic, er, eg, eb = material_at(material, place, _tables(geometry))
+        r, g, b, roughness, metallic, er, eg, eb = material_at(material, place, tables_of(geometry))
         rows = geometry.normals
         i, j, k = 3 * i, 3 * j, 3 * k
         if instance < 0:
@@ -275,7 +298,7 @@ def surface_at(hit, direction, geometry):  # type: ignore[no-untyped-def]
     if material >= 0:
         slots = load_int64(geometry.materials, 1)
         if load_int32(slots, SLOTS * np.int64(material) + STEPS) > 0:
-            place = _place(face, u, v, geometry)
+            place = place_of(face, u, v, geometry)
             nx, ny, nz = detailed_normal(material, (i, j, k), place, instance, (ux, uy, uz), side, geometry)
     return nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, ux, uy, uz, owner
 

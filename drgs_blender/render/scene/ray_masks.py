@@ -13,14 +13,17 @@ ORDINARY = 32
 #: ``kind << WITHOUT``: rays of that kind in a world of shadow catchers alone, without what throws shadows on them.
 WITHOUT = 8
 
+#: ``mask << CLEAR``: meshes that light may pass, in place of the bits of others.
+CLEAR = 16
+
 #: Bits of ``TraceScene.object_flags``.
 HOLDOUT, CATCHER = 1, 2
 
 
-def group_mask(visibility: Visibility, surfels: bool, seen_only: bool = False) -> int:
+def group_mask(visibility: Visibility, surfels: bool, seen_only: bool = False, clear: bool = False) -> int:
     """Mask of what has this visibility; `surfels` is true for DR-GS meshes.
 
-    Of a DR-GS mesh that is `seen_only`, light does not meet the triangles.
+    Of a DR-GS mesh that is `seen_only`, light does not meet the triangles; light may pass what is `clear`.
     """
     v = visibility
     kinds = DIFFUSE * v.diffuse | GLOSSY * v.glossy | SHADOW * v.shadow
@@ -29,7 +32,8 @@ def group_mask(visibility: Visibility, surfels: bool, seen_only: bool = False) -
         mask |= kinds << WITHOUT
     if surfels:
         return (mask & CAMERA if seen_only else mask) | SURFELS
-    return mask | ORDINARY * v.camera
+    mask |= ORDINARY * v.camera
+    return mask << CLEAR if clear else mask
 
 
 def object_flags(visibility: Visibility) -> int:

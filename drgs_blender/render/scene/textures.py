@@ -56,7 +56,7 @@ Array = np.ndarray
 #: Function of a material's index, a layer's name and whether tangents are meant, to the row of `MeshLayers`; or None.
 LayerRow = Callable[[int, str, bool], int | None]
 
-_SLOTS = ("base_colour_texture", "roughness_texture", "metallic_texture", "emission_texture")
+_SLOTS = ("base_colour_texture", "roughness_texture", "metallic_texture", "emission_texture", "alpha_texture")
 #: Strengths, distances and colours of normal and bump maps above this are no use.
 _STRONGEST = 1e12
 #: What Blender shows of an image that is not there.
@@ -122,7 +122,7 @@ class MaterialTable:
     arrays : tuple of array
         Arrays that ``material_at`` reads:
         constants (k, 8) float32, the eight results without textures;
-        slots (k, 8) int32, rows of textures for base colour, roughness, metallic and emission, or -1; nothing; first
+        slots (k, 8) int32, rows of textures for base colour, roughness, metallic, emission and alpha, or -1; first
         step and number of steps of its details, row of its mesh's frame;
         textures (t, 5) int32, image or -1, channel, interpolation, extension, layer or -1;
         transforms (t, 6) float32;
@@ -130,7 +130,10 @@ class MaterialTable:
         decode (256,) float32, linear value of each sRGB byte;
         layers (l, 2) int64, see `mesh_layers.MeshLayers`, which fills it;
         steps (d, 4) int32, kind, texture or -1, layer of the tangents or -1, nothing;
-        numbers (d, 8) float32, strength, distance, colour.
+        numbers (d, 8) float32, strength, distance, colour;
+        alphas (k,) float32, without texture.
+    clear : bool
+        Whether light may pass anything.
     detailed : bool
         Whether anything has a normal or a bump map.
     emissive : bool
@@ -181,7 +184,9 @@ class MaterialTable:
             np.empty((0, 2), np.int64),
             np.array([step for step, _ in self._steps], np.int32).reshape(-1, STEP_INTS),
             np.array([numbers for _, numbers in self._steps], np.float32).reshape(-1, STEP_FLOATS),
+            np.array([self._alpha(material) for material in materials] or [1.0], np.float32),
         )
+        self.clear = any(material.clear for material in materials)
         self.emissive = bool((constants[:, 5:] > 0.0).any())
         self.addresses = self.addresses_at(address)[:7]
         # Only needed above; they would keep the pixels of the frame before alive.
@@ -249,6 +254,14 @@ class MaterialTable:
             if not np.array_equal(given[where], kept[where]):
                 self.warnings.append(f"{material.name}: {name} {given[where]} is out of range, taken as {kept[where]}")
         return kept.astype(np.float32)
+
+    def _alpha(self, material: Material) -> float:
+        alpha = float(material.alpha)
+        highest = float(WHITEST) if material.alpha_texture else 1.0
+        kept = min(max(alpha, 0.0), highest) if alpha == alpha else 1.0
+        if kept != alpha:
+            self.warnings.append(f"{material.name}: alpha {alpha} is out of range, taken as {kept}")
+        return kept
 
     def _step(self, detail: SurfaceDetail, name: str, material: int) -> tuple[Array, Array]:
         """A normal or bump map as a row of integers and one of numbers."""

@@ -180,7 +180,7 @@ def mask_of(item: TraceObject | MeshState) -> int:
     """Group mask of an object or a mesh."""
     if isinstance(item, TraceObject):
         return group_mask(item.visibility, True, item.seen_only)
-    return group_mask(item.visibility, False)
+    return group_mask(item.visibility, False, clear=any(material.clear for material in item.materials))
 
 
 def own_faces(item: TraceObject | MeshState) -> Array:

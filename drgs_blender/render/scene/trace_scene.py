@@ -92,6 +92,8 @@ class TraceScene:
         Materials and texture coordinates of the meshes, whose faces begin at `vertex_faces`.
     extent : float
         Metres: the largest absolute coordinate, the scale of rounding errors.
+    cut : set of int
+        Objects at which rays of the camera ended for having passed too many surfaces.
     faults : list of ObjectFaults
         Problems, one entry per object, then one per mesh.
     """
@@ -112,6 +114,7 @@ class TraceScene:
         self.any_ordinary = False
         self.mesh_materials = MeshMaterials()
         self.extent = 0.0
+        self.cut: set[int] = set()
         self.faults: list[ObjectFaults] = []
         self._parts: list[Part] = []
         self._known: list[tuple[MeshState, Instances]] = []
@@ -252,6 +255,7 @@ class TraceScene:
         self.mesh_materials.update(parts, before, meshes, images, (len(objects), self.vertex_faces), placed)
         self._commit(parts, vertices, instances, moved, elsewhere, died)
         self.version = object()
+        self.cut = set()
         self.faults = [ObjectFaults(item.name, 0, 0, 0, p.bad if p else 0) for item, p in zip(items, instances)]
         for part in parts:
             fault = self.faults[part.source]
