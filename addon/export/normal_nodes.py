@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, cast
 
 import numpy as np
@@ -30,7 +30,7 @@ class DetailRef:
     value: SocketValue
     strength: float
     distance: float = 1.0
-    tangents: LayerRef = LayerRef("uv")
+    tangents: LayerRef = field(default_factory=lambda: LayerRef("uv"))
 
     def same(self, other: DetailRef) -> bool:
         """Whether both do the same."""

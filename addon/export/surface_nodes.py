@@ -209,7 +209,7 @@ class SurfaceWalker(NormalWalker):
         self, node: bpy.types.Node, first: Surface, second: Surface, weights: tuple[float, float]
     ) -> tuple[DetailRef, ...]:
         """Normal and bump maps of the surface that scatters more, for both."""
-        more, less = (first, second) if weights[0] >= weights[1] else (second, first)
+        more = first if weights[0] >= weights[1] else second
         alike = len(first.details) == len(second.details) and all(map(DetailRef.same, first.details, second.details))
         if min(weights) > 0 and not alike:
             self.warn(node, "its shaders have other normal or bump maps; those of the stronger one are used for both")

@@ -44,7 +44,6 @@ def test_an_image_as_alpha_and_its_negative(scene, export):
     swatch(bpy.data.materials["Material"])
     frame, warnings = export()
     assert not warnings and (only(frame).alpha, only(frame).alpha_texture.channel) == (1, "a")
-
     tree.links.remove(principled.inputs["Alpha"].links[0])
     shaded(tree, add(tree, "MixShader", node.outputs["Alpha"], principled.outputs[0], add(tree, "BsdfTransparent")))
     frame, warnings = export()
@@ -136,7 +135,7 @@ def furnish(scene) -> None:
     wall = mesh_object("Wall", [(-3, 2, -1), (3, 2, -1), (3, 2, 3), (-3, 2, 3)], [(0, 1, 2, 3)])
     floor = mesh_object("Floor", [(-3, -3, -1), (3, -3, -1), (3, 2, -1), (-3, 2, -1)], [(0, 1, 2, 3)])
     for obj, colour, roughness, metallic in ((wall, B, 0.5, 0), (floor, (0.6, 0.6, 0.6), 0.25, 1)):
-        tree, principled = material(obj.name)
+        _, principled = material(obj.name)
         principled.inputs["Base Color"].default_value = (*colour, 1)
         principled.inputs["Roughness"].default_value, principled.inputs["Metallic"].default_value = roughness, metallic
         obj.data.materials.append(bpy.data.materials[obj.name])

@@ -530,7 +530,7 @@ def test_senseless_numbers_are_named_and_stop_nothing(scene, export):
 
 
 def test_one_warning_names_all_that_a_material_lacks(scene, export):
-    tree, principled = material()
+    _, principled = material()
     for name in ("Coat Weight", "Transmission Weight", "Sheen Weight", "Subsurface Weight"):
         principled.inputs[name].default_value = 0.5
     principled.inputs["IOR"].default_value = 2.4

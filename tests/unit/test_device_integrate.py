@@ -11,7 +11,18 @@ import trimesh
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
-from drgs_blender.core.frame import Image, Light, Material, MeshState, RenderSettings, Texture, Visibility, World
+from drgs_blender.core.frame import (
+    Image,
+    Layer,
+    Light,
+    Material,
+    MeshState,
+    RenderSettings,
+    SurfaceDetail,
+    Texture,
+    Visibility,
+    World,
+)
 from drgs_blender.render.backend import CPU
 from drgs_blender.render.gpu.select_backend import Backends
 from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
@@ -153,6 +164,37 @@ def hidden() -> tuple:
     return scene, sky(), some_lights(), seen()
 
 
+def detailed() -> tuple:
+    """Normal and bump maps, layers, and surfaces that light may pass, with one instance and several."""
+    rng = np.random.default_rng(6)
+    images = [
+        Image("normals", rng.integers(90, 165, (8, 8, 4), dtype=np.uint8)),
+        Image("heights", rng.integers(0, 255, (8, 8, 4), dtype=np.uint8), "srgb"),
+    ]
+    layers = [
+        Layer("other", rng.uniform(0, 1, (2, 3, 2)).astype(np.float32)),
+        Layer("paint", rng.uniform(0, 1, (2, 3, 4)).astype(np.float32)),
+    ]
+    maps = [
+        SurfaceDetail("tangent", Texture("normals", layer="other"), strength=0.8, tangents="other"),
+        SurfaceDetail("bump", Texture("heights", "r", extension="mirror"), distance=0.2),
+        SurfaceDetail("bump", Texture("", "g", layer="paint"), strength=0.5),
+    ]
+    painted = Material("painted", base_colour_texture=Texture("", layer="paint"), details=maps)
+    veil = Material(
+        "veil", alpha_texture=Texture("", "a", layer="paint"), details=[SurfaceDetail("object", Texture("normals"))]
+    )
+    glow = Material("glow", emission=(2.0, 1.0, 0.5), alpha=0.4)
+    meshes = [
+        floor(materials=[painted], layers=layers),
+        floor(placed(1.5, 0, 1.5, 0.3), placed(-1.5, 0, 2.0, -0.3), name="veils", materials=[veil], layers=layers),
+        floor(placed(0, 0, 3.5, 0.4), name="glow", materials=[glow]),
+    ]
+    scene = TraceScene()
+    scene.update([ball((1.6, 0.6, 1.9), 0.3)], meshes, images)
+    return scene, sky(), Lights([], np.array([0, 0, 1.2]), 1.0, Emitters(scene)), seen()
+
+
 def caught() -> tuple:
     scene = TraceScene()
     scene.update([ball((0.6, 0.3, 0.8), 0.5)], [floor(visibility=Visibility(shadow_catcher=True))])
@@ -162,7 +204,7 @@ def caught() -> tuple:
 
 
 SCENES: dict[str, Callable[[], tuple]] = {
-    f.__name__: f for f in (under_sky, under_lights, lights_alone, among_meshes, hidden, caught)
+    f.__name__: f for f in (under_sky, under_lights, lights_alone, among_meshes, hidden, detailed, caught)
 }
 
 

@@ -28,8 +28,7 @@ def _pass(tracer, geometry, origins, numbers, mask, share, face, count):  # type
         start = (origins[i, 0], origins[i, 1], origins[i, 2])
         ray = Ray(start, (F(0.0), F(0.0), F(-1.0)), F(0.0), F(np.inf), mask)
         share[i] = transmitted(tracer, ray, geometry)
-        hit, count[i] = nearest_there(tracer, ray, geometry, numbers[i])
-        face[i] = hit.face
+        _, face[i], _, _, _, _, _, _, count[i] = nearest_there(tracer, ray, geometry, numbers[i])
 
 
 def passed(scene: TraceScene, origins: np.ndarray, numbers: np.ndarray) -> tuple:

@@ -72,7 +72,7 @@ def test_slopes_are_those_of_the_lookup(transform, extension, encoding):
     step = 2e-3
 
     def height(dx: float, dy: float) -> np.ndarray:
-        uv = (where + (dx, dy)) / 2
+        uv = (where + np.array((dx, dy))) / 2
         return table_scene.mesh_materials.table.lookup(np.zeros(len(uv), int), uv)[:, 0].astype(float)
 
     slope_x = (height(step, 0) - height(-step, 0)) / (2 * step)

@@ -199,8 +199,7 @@ def trace_through_samples(thread, stride, scratch, seen, view_of, mask, owners, 
             number = pixel_shift(p, pixel)[0] * _HASHED + k * _SILVER
             number = number - math.floor(number)
             ray = Ray((F(ox), F(oy), F(oz)), (F(dx), F(dy), F(dz)), near, far, mask)
-            hit, passed = nearest_there(tracer, ray, geometry, min(F(number), _BELOW_ONE))
-            t, f, i, u, v, gx, gy, gz = hit
+            t, f, i, u, v, gx, gy, gz, passed = nearest_there(tracer, ray, geometry, min(F(number), _BELOW_ONE))
             depth[y, x, k], face[y, x, k], instance[y, x, k] = t, f, i
             where[y, x, k, 0], where[y, x, k, 1] = u, v
             where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4] = gx, gy, gz

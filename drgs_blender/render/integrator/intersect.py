@@ -180,9 +180,11 @@ def _nearest(scene, rays, slot, mask):  # type: ignore[no-untyped-def]
     ray = ray_of(rays, slot, FAR, mask)
     if scene.traits.clear:
         _, c = w.at(slot)
-        hit, _ = nearest_there(scene.tracer, ray, scene.geometry, unit(mix(U(rays.ints[c + w.KEY] + U(0x1B56C4E9)))))
-        return hit
-    return nearest(scene.tracer, ray)
+        number = unit(mix(U(rays.ints[c + w.KEY] + U(0x1B56C4E9))))
+        t, face, instance, u, v, gx, gy, gz, _ = nearest_there(scene.tracer, ray, scene.geometry, number)
+        return t, face, instance, u, v, gx, gy, gz
+    t, face, instance, u, v, gx, gy, gz = nearest(scene.tracer, ray)
+    return t, face, instance, u, v, gx, gy, gz
 
 
 @njit

@@ -5,8 +5,9 @@ Values stay where they are: compiled code reads them at their address.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,12 +18,35 @@ from ...core.errors import UsageError
 from ...core.frame import MeshState
 from ..memory import AddressOf, address
 from .detailed_normal import EDGES, FRAME_INTS, MATRICES, NORMALS, TURNS
-from .instances import normal_matrices
+from .instances import Instances, normal_matrices
 from .tangents import corner_tangents
 from .trace_mesh import Part
 
-#: Matrices (k, 3, 4) and turns of normals (k, 3, 3) of a part, float32; read at row 0 where it is in world space.
-Placed = Callable[[Part], tuple[Array, Array]]
+
+class Placements(NamedTuple):
+    """Where the meshes of a scene stand.
+
+    Attributes
+    ----------
+    stands : sequence of Instances
+        Of each mesh.
+    matrices, turns : array
+        (p, 3, 4) and (p, 3, 3) float32, of all that have several instances, and of their normals.
+    first : int
+        First source that is a mesh.
+    """
+
+    stands: Sequence[Instances]
+    matrices: Array
+    turns: Array
+    first: int
+
+    def of(self, part: Part) -> tuple[Array, Array]:
+        """Matrices and turns of a part, read at row 0 where it is in world space."""
+        if part.instanced:
+            return self.matrices, self.turns
+        matrix = self.stands[part.source - self.first].matrices[:1]
+        return np.ascontiguousarray(matrix, np.float32), np.ascontiguousarray(normal_matrices(matrix), np.float32)
 
 
 @dataclass(slots=True)
@@ -68,7 +92,7 @@ class MeshLayers:
         return self._rows.setdefault((mesh, name, tangents), len(self._rows))
 
     def update(
-        self, parts: dict[int, Part], meshes: Sequence[MeshState], detailed: Sequence[bool], placed: Placed
+        self, parts: dict[int, Part], meshes: Sequence[MeshState], detailed: Sequence[bool], placed: Placements
     ) -> None:
         """Bring all up to date.
 
@@ -79,8 +103,7 @@ class MeshLayers:
         meshes : sequence of MeshState
         detailed : sequence of bool
             Which of them have normal or bump maps.
-        placed : callable
-            Where a part stands.
+        placed : Placements
         """
         known, self._values, self.warnings = self._values, {}, []
         for key in self._rows:
@@ -95,7 +118,7 @@ class MeshLayers:
             part = parts[mesh]
             assert part.own_normals is not None
             self._frames.append(
-                (part.own_normals, part.row.start, self._edges_of(mesh, state, part), mesh, *placed(part))
+                (part.own_normals, part.row.start, self._edges_of(mesh, state, part), mesh, *placed.of(part))
             )
         self._edges = {mesh: self._edges[mesh] for *_, mesh, _, _ in self._frames}
 
@@ -164,11 +187,6 @@ class MeshLayers:
             what = f'values "{name}"' if name else "texture coordinates"
             self.warnings.append(f"{mesh.name}: {known.bad} {what} are not finite; 0 is used")
         return known
-
-
-def world_placement(matrix: Array) -> tuple[Array, Array]:
-    """`Placed` of a part in world space, whose own (1, 3, 4) matrix is given."""
-    return np.ascontiguousarray(matrix, np.float32), np.ascontiguousarray(normal_matrices(matrix), np.float32)
 
 
 def _given(mesh: MeshState, name: str) -> Array | None:

@@ -13,7 +13,7 @@ from ...core.asset.model import as_float
 from ...core.errors import UsageError
 from ...core.frame import Image, MeshState
 from ..memory import AddressOf, address
-from .mesh_layers import MeshLayers, Placed
+from .mesh_layers import MeshLayers, Placements
 from .textures import MaterialTable
 from .trace_mesh import Part, TraceObject
 
@@ -116,7 +116,7 @@ class MeshMaterials:
         meshes: Sequence[MeshState],
         images: Sequence[Image],
         sources: tuple[int, int],
-        placed: Placed,
+        placed: Placements,
     ) -> None:
         """Bring all up to date.
 
@@ -132,8 +132,7 @@ class MeshMaterials:
             Images of their textures.
         sources : tuple of int
             First source that is a mesh, first face that is of one.
-        placed : callable
-            Where a part of a mesh stands.
+        placed : Placements
 
         Raises
         ------

@@ -17,7 +17,7 @@ from ..sampling import ONE, ZERO, F
 from . import ray_masks
 from .detailed_normal import ALPHA, ALPHA_TABLE, SLOTS
 from .interaction import nearest, place_of, tables_of
-from .ray import Hit, Ray
+from .ray import Ray
 from .texture_lookup import number_at
 
 #: Surfaces on a ray beyond which it is blocked.
@@ -71,7 +71,8 @@ def nearest_there(tracer, ray, geometry, number):  # type: ignore[no-untyped-def
 
     Returns
     -------
-    hit : Hit
+    t, face, instance, u, v, gx, gy, gz : float32 or int32
+        As of `Hit`.
     count : int64
         Surfaces that were passed; `MOST`: it was blocked for having passed too many.
     """
@@ -92,7 +93,7 @@ def nearest_there(tracer, ray, geometry, number):  # type: ignore[no-untyped-def
             t, face, instance, u, v, gx, gy, gz = nearest(tracer, Ray(origin, direction, tnear, tfar, mask))
             step = step * F(4.0)
         step = _BEYOND
-    return Hit(t, face, instance, u, v, gx, gy, gz), count
+    return t, face, instance, u, v, gx, gy, gz, count
 
 
 @njit

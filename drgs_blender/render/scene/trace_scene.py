@@ -18,7 +18,7 @@ from ..sampling import F
 from ..surfel_columns import VERTEX
 from .instances import Instances, normal_matrices, other_matrices, usable_instances
 from .interaction import Geometry, Tracer
-from .mesh_layers import world_placement
+from .mesh_layers import Placements
 from .mesh_materials import EmissiveMesh, MeshMaterials
 from .ray_masks import object_flags
 from .trace_mesh import (
@@ -246,12 +246,7 @@ class TraceScene:
         if not same or elsewhere or len(known) != len(meshes):
             self._list_instances(stands, len(items))
         self._number(objects, meshes, stands)
-
-        def placed(part: Part) -> tuple[Array, Array]:
-            where = instances[part.source]
-            assert where is not None
-            return (self.instances, self._instance_normal) if part.instanced else world_placement(where.matrices[:1])
-
+        placed = Placements(stands, self.instances, self._instance_normal, len(objects))
         self.mesh_materials.update(parts, before, meshes, images, (len(objects), self.vertex_faces), placed)
         self._commit(parts, vertices, instances, moved, elsewhere, died)
         self.version = object()
