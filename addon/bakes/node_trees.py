@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import bpy
@@ -23,6 +23,9 @@ _SCALARS = {"BOOLEAN", "INT", "FLOAT", "STRING", "ENUM"}
 _DEEPEST = 4
 
 
+Follow = Callable[[bpy.types.NodeSocket], bool]
+
+
 class Tree(NamedTuple):
     """A node tree and those of its nodes from which an output is reached, in the order of their names."""
 
@@ -30,12 +33,16 @@ class Tree(NamedTuple):
     nodes: list[bpy.types.Node]
 
 
-def trees(tree: bpy.types.NodeTree, start: bpy.types.Node) -> list[Tree]:
+def trees(tree: bpy.types.NodeTree, start: bpy.types.Node, follow: Follow = lambda socket: True) -> list[Tree]:
     """The trees and nodes on which the node `start` depends: its own tree first, then groups as they are found.
 
     The order is the same for a copy of the trees.
+
+    Parameters
+    ----------
+    follow : whether an input matters
     """
-    found = [Tree(tree, _reachable([start]))]
+    found = [Tree(tree, _reachable([start], follow))]
     known = {tree.as_pointer()}
     for each in found:  # grows
         for node in each.nodes:
@@ -43,16 +50,16 @@ def trees(tree: bpy.types.NodeTree, start: bpy.types.Node) -> list[Tree]:
             if node.bl_idname == "ShaderNodeGroup" and group is not None and group.as_pointer() not in known:
                 known.add(group.as_pointer())
                 ends = [n for n in group.nodes if n.bl_idname == "NodeGroupOutput" and n.is_active_output]
-                found.append(Tree(group, _reachable(ends)))
+                found.append(Tree(group, _reachable(ends, follow)))
     return found
 
 
-def _reachable(ends: list[bpy.types.Node]) -> list[bpy.types.Node]:
+def _reachable(ends: list[bpy.types.Node], follow: Follow) -> list[bpy.types.Node]:
     found = {node.name: node for node in ends}
     pending = list(ends)
     while pending:
         for socket in pending.pop().inputs:
-            for link in socket.links:
+            for link in socket.links if follow(socket) else ():
                 node = link.from_node
                 if node.name not in found:
                     found[node.name] = node
@@ -60,14 +67,14 @@ def _reachable(ends: list[bpy.types.Node]) -> list[bpy.types.Node]:
     return [found[name] for name in sorted(found)]
 
 
-def describe(found: list[Tree]) -> list[dict[str, Any]]:
+def describe(found: list[Tree], follow: Follow = lambda socket: True) -> list[dict[str, Any]]:
     """Everything the output of the trees depends on, JSON-able: a list of nodes by name for each tree."""
-    return [{node.name: _node(node) for node in tree.nodes} for tree in found]
+    return [{node.name: _node(node, follow) for node in tree.nodes} for tree in found]
 
 
-def _node(node: bpy.types.Node) -> dict[str, Any]:
+def _node(node: bpy.types.Node, follow: Follow) -> dict[str, Any]:
     inputs = {}
-    for socket in node.inputs:
+    for socket in filter(follow, node.inputs):
         links = [[k.from_node.name, k.from_socket.identifier, k.is_muted, k.is_valid] for k in socket.links]
         inputs[socket.identifier] = {"value": _value(socket), "links": links, "enabled": socket.enabled}
     outputs = {socket.identifier: _value(socket) for socket in node.outputs if hasattr(socket, "default_value")}
@@ -163,6 +170,52 @@ def _digest(data: bytes) -> str:
 def moves(found: list[Tree]) -> bool:
     """Whether an image is another one in each frame."""
     return any(image.source in ("SEQUENCE", "MOVIE") for _, image in images(found))
+
+
+#: Kind of a shader node -> channel -> its inputs: of a colour, or of a number; or a number. Others are as "".
+SHADERS: dict[str, dict[str, tuple[str, ...] | float]] = {
+    "BSDF_PRINCIPLED": {
+        "base_colour": ("Base Color",),
+        "roughness": ("Roughness",),
+        "metallic": ("Metallic",),
+        "emission": ("Emission Color", "Emission Strength"),
+    },
+    "BSDF_DIFFUSE": {"base_colour": ("Color",), "roughness": 1.0},
+    "BSDF_GLOSSY": {"base_colour": ("Color",), "roughness": ("Roughness",), "metallic": 1.0},
+    "BSDF_METALLIC": {"base_colour": ("Base Color",), "roughness": ("Roughness",), "metallic": 1.0},
+    "EMISSION": {"emission": ("Color", "Strength")},
+    "BACKGROUND": {"emission": ("Color", "Strength")},
+    "BSDF_TRANSPARENT": {},
+    "": {"base_colour": ("Color",), "roughness": ("Roughness",)},
+}
+#: Those that scatter no light.
+UNSCATTERED = ("EMISSION", "BACKGROUND", "BSDF_TRANSPARENT")
+_JOINTS = ("MIX_SHADER", "ADD_SHADER", "GROUP", "REROUTE", "GROUP_INPUT")
+
+
+def is_shader(node: bpy.types.Node) -> bool:
+    """Whether a node is a shader itself, and joins no others."""
+    return node.type not in _JOINTS and any(socket.type == "SHADER" for socket in node.outputs)
+
+
+def shader_inputs(node: bpy.types.Node, channel: str) -> tuple[str, ...] | float:
+    """Inputs of a shader node that make a channel of its surface, or the number that it is."""
+    return SHADERS.get(node.type, SHADERS[""]).get(channel, 0.0)
+
+
+def follow_channel(channel: str) -> Follow:
+    """For `trees`: only what a channel of a material's surface depends on."""
+
+    def follow(socket: bpy.types.NodeSocket) -> bool:
+        node = socket.node
+        if node.type == "OUTPUT_MATERIAL":
+            return socket.name == "Surface"
+        if not is_shader(node):
+            return True
+        names = shader_inputs(node, channel)
+        return isinstance(names, tuple) and socket.name in names
+
+    return follow
 
 
 def apply(found: list[Tree], description: list[dict[str, Any]]) -> None:

@@ -74,6 +74,7 @@ def request(
     about: dict[str, Any],
     change: Callable[[list[dict[str, Any]]], None] | None = None,
     write: Callable[[Path], None] | None = None,
+    follow: node_trees.Follow = lambda socket: True,
 ) -> Request:
     """A bake of a node tree.
 
@@ -85,8 +86,9 @@ def request(
     about : what else the result depends on, JSON-able; part of the job
     change : changes the description of the trees, and with it the values that are baked
     write : writes further files into the folder of the job
+    follow : whether an input matters
     """
-    trees = node_trees.describe(found)
+    trees = node_trees.describe(found, follow)
     if change is not None:
         change(trees)
     frame = bpy.context.scene.frame_current if node_trees.moves(found) else 1

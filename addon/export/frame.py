@@ -80,7 +80,7 @@ def export_frame(
     cache = ExportCache() if cache is None else cache
     passes = passes or tuple(p.name for p in enabled(scene, depsgraph.view_layer))
     objects = DrgsObjects(depsgraph, key_of, warn, cache)
-    meshes = Meshes(depsgraph, materials, warn, cache, with_uv_map="UV" in passes)
+    meshes = Meshes(depsgraph, materials, warn, cache, wanted, with_uv_map="UV" in passes)
     others = Limited(depsgraph.view_layer.drgs, f'View layer "{depsgraph.view_layer.name}"', warn).others
     for item in uncancelled(visible(depsgraph), cancelled):
         if is_visible is not None and not is_visible(item.object):

@@ -45,7 +45,7 @@ class LayerRef:
     change, mark : function of (n, 4) values, and what tells it from others
     """
 
-    source: Literal["uv", "attribute", "generated", "object", "vector"]
+    source: Literal["uv", "attribute", "generated", "object", "vector", "baked"]
     name: str = ""
     matrix: Matrix = _IDENTITY
     mark: str = ""

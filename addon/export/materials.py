@@ -13,6 +13,7 @@ from ...drgs_blender.core.frame import Image, Material, SurfaceDetail, Texture
 from .layers import AttributeRef, LayerRef
 from .normal_nodes import DetailRef
 from .socket_value import SocketValue, Warn
+from .surface_bake import CHANNELS, BakedRef, SurfaceBakes
 from .surface_nodes import SurfaceWalker
 from .texture_refs import TextureRef
 
@@ -25,11 +26,13 @@ class ExportedMaterial:
     ----------
     uv_map : UV map that is the mesh's own, "" the active one
     layers : further coordinates and values that its textures refer to
+    is_baked : whether it is of one mesh alone, since a part of it is baked
     """
 
     material: Material | None
     uv_map: str | None = None
     layers: tuple[LayerRef, ...] = ()
+    is_baked: bool = False
 
 
 DEFAULT_MATERIAL = Material("Default")
@@ -49,22 +52,33 @@ class Materials:
         own = [slot.material for slot in obj.material_slots]
         return own if self.override is None else [self.override] * max(len(own), 1)
 
-    def export(self, material: bpy.types.Material | None, mesh: bpy.types.Mesh) -> ExportedMaterial:
-        """The frame's description of an evaluated material on an evaluated mesh."""
+    def export(
+        self, material: bpy.types.Material | None, mesh: bpy.types.Mesh, bakes: SurfaceBakes | None = None
+    ) -> ExportedMaterial:
+        """The frame's description of an evaluated material on an evaluated mesh.
+
+        Parameters
+        ----------
+        bakes : of the mesh; None: what is not read directly is approximated, with warnings
+        """
         if material is None:
             return DEFAULT
         for key in ((material.as_pointer(), 0), (material.as_pointer(), mesh.as_pointer())):
             if key in self._known:
                 return self._known[key]
-        tree = SurfaceWalker(material, mesh, self._warn)
-        exported = self._build(tree)
+        approximations: list[str] = []
+        tree = SurfaceWalker(material, mesh, self._warn, approximations.append)
+        exported = self._build(tree, bakes, approximations)
+        if exported.is_baked:
+            return exported  # for this mesh and these slots alone
         self._known[material.as_pointer(), mesh.as_pointer() if tree.uses_mesh else 0] = exported
         return exported
 
-    def _build(self, tree: SurfaceWalker) -> ExportedMaterial:
+    def _build(self, tree: SurfaceWalker, bakes: SurfaceBakes | None, approximations: list[str]) -> ExportedMaterial:
         material = tree.material
         surface = tree.surface()
         if surface is None:
+            self._say(approximations)
             return ExportedMaterial(None)
         paints = {
             "base_colour": surface.base,
@@ -73,6 +87,14 @@ class Materials:
             "emission": surface.emission,
             "alpha": surface.alpha,
         }
+        done: set[str] = set()
+        left = {text for detail in surface.details for text in detail.value.approximations}
+        for name, value in paints.items():
+            solved = False
+            if bakes is not None and name in CHANNELS and value.approximations:
+                paints[name], solved = bakes.channel(material, name, value, self._warn)
+            (done if solved else left).update(value.approximations)
+        self._say([text for text in approximations if text in left or text not in done])
         textures = [value.texture for value in (*paints.values(), *(d.value for d in surface.details)) if value.texture]
         wanted = [t.layer for t in textures] + [d.tangents for d in surface.details if d.kind == "tangent"]
         uv_map = next((layer.name for layer in wanted if layer.source == "uv"), None)
@@ -87,9 +109,12 @@ class Materials:
             if value.texture is not None:
                 values[f"{name}_texture"] = self._texture(value.texture, label(value.texture.layer))
         details = [self._detail(tree, detail, label) for detail in surface.details]
-        return ExportedMaterial(
-            Material(material.name, **values, details=details, pass_index=material.pass_index), uv_map, layers
-        )
+        described = Material(material.name, **values, details=details, pass_index=material.pass_index)
+        return ExportedMaterial(described, uv_map, layers, bool(done))
+
+    def _say(self, texts: list[str]) -> None:
+        for text in texts:
+            self._warn(text)
 
     def _detail(self, tree: SurfaceWalker, detail: DetailRef, label: Callable[[LayerRef], str]) -> SurfaceDetail:
         texture, numbers = detail.value.texture, (*detail.value.colour, detail.strength, detail.distance)
@@ -105,7 +130,7 @@ class Materials:
             label(detail.tangents),
         )
 
-    def _texture(self, picture: TextureRef | AttributeRef, layer: str) -> Texture:
+    def _texture(self, picture: TextureRef | AttributeRef | BakedRef, layer: str) -> Texture:
         if isinstance(picture, AttributeRef):
             return picture.texture("", layer)
         exported = picture.export(self._warn)

@@ -11,9 +11,11 @@ import numpy as np
 
 from ...drgs_blender.core.frame import Image, Layer, Material, MeshState
 from .. import mesh_arrays
+from ..bakes.requests import Wanted
 from .export_cache import ExportCache, uid
 from .instances import Key, Visible
 from .materials import DEFAULT_MATERIAL, ExportedMaterial, Materials
+from .surface_bake import SurfaceBakes
 
 Warn = Callable[[str], None]
 Array = np.ndarray
@@ -27,6 +29,7 @@ class _Shape:
     matrices: list[Array] = field(default_factory=list)
     pass_indices: list[int] = field(default_factory=list)
     keys: list[Key] = field(default_factory=list)
+    is_placed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,10 +64,12 @@ class Meshes:
         materials: Materials,
         warn: Warn,
         cache: ExportCache,
+        wanted: Wanted | None = None,
         with_uv_map: bool = False,
     ) -> None:
         self._with_uv_map = with_uv_map
         self._depsgraph, self._materials, self._warn, self._cache = depsgraph, materials, warn, cache
+        self._wanted = wanted
         self._shapes: dict[tuple[object, ...], _Shape] = {}
 
     def add(self, item: Visible) -> None:
@@ -82,11 +87,14 @@ class Meshes:
             owners = uid(obj.data), uid(obj)
             stands = (*owners, obj.data.as_pointer(), obj.data.is_editmode)
             arrays = self._cache.get(("arrays", *stands), owners, lambda: self._arrays(obj))
-            state, pictures = self._cache.get(
+            state, pictures, bakes = self._cache.get(
                 ("mesh", *stands, obj.name, *key), owners, lambda: self._state(item, slots, arrays)
             )
             self._materials.images |= pictures
             shape = self._shapes[key] = _Shape(state)
+            if self._wanted is not None and bakes is not None:
+                self._wanted.again(bakes.requests)
+                shape.is_placed = bakes.is_placed
         shape.matrices.append(item.matrix_world)
         shape.pass_indices.append(obj.pass_index)
         shape.keys.append(item.key)
@@ -97,6 +105,11 @@ class Meshes:
         for shape in self._shapes.values():
             if shape.state is not None:
                 matrices = _frozen(np.array(shape.matrices, np.float64))
+                if shape.is_placed and len(matrices) > 1:
+                    self._warn(
+                        f'"{shape.state.name}": its baked materials depend on where it stands; all of its '
+                        f"{len(matrices)} instances look as the first"
+                    )
                 indices = _frozen(np.array(shape.pass_indices, np.int32))
                 found.append(replace(shape.state, matrices=matrices, pass_indices=indices))
         return found
@@ -111,18 +124,30 @@ class Meshes:
 
     def _state(
         self, item: Visible, slots: list[bpy.types.Material | None], arrays: _Arrays
-    ) -> tuple[MeshState | None, dict[str, Image]]:
-        """What all instances share, and the images on it; None where the mesh has no faces that are seen."""
+    ) -> tuple[MeshState | None, dict[str, Image], SurfaceBakes | None]:
+        """What all instances share, the images on it and its bakes; None where the mesh has no faces that are seen."""
         with _read(item.object, self._depsgraph) as mesh:
-            state = self._describe(item, mesh, slots, arrays)
-        return state, {name: self._materials.images[name] for name in _images_of(state)}
+            bakes = None if self._wanted is None else SurfaceBakes(self._wanted, item.object, mesh, slots)
+            state = self._describe(item, mesh, slots, arrays, bakes)
+        if bakes is not None:
+            bakes.end()
+        return state, {name: self._materials.images[name] for name in _images_of(state)}, bakes
 
     def _describe(
-        self, item: Visible, mesh: bpy.types.Mesh, slots: list[bpy.types.Material | None], arrays: _Arrays
+        self,
+        item: Visible,
+        mesh: bpy.types.Mesh,
+        slots: list[bpy.types.Material | None],
+        arrays: _Arrays,
+        bakes: SurfaceBakes | None,
     ) -> MeshState | None:
         if len(mesh.polygons) == 0:
             return None
-        exported = [self._materials.export(material, mesh) for material in slots or [None]]
+        known: dict[bpy.types.Material | None, ExportedMaterial] = {}
+        for material in slots or [None]:
+            if material not in known:
+                known[material] = self._materials.export(material, mesh, bakes)
+        exported = [known[material] for material in slots or [None]]
         corners, polygons, index = arrays.corners, arrays.polygons, arrays.material_index
         if index is not None:
             index = np.clip(index, 0, len(exported) - 1)[polygons]  # as Cycles reads what is out of range

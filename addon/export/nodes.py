@@ -16,7 +16,7 @@ from mathutils import Euler, Matrix
 
 from ...drgs_blender.core.color import LUMINANCE as REC709
 from .node_math import BLENDS, OPERATIONS, blackbody, by_row, divide, hsl, hsv, hue_saturation, in_system
-from .socket_value import Array, SocketValue, Warn, constant, once, uniform
+from .socket_value import Array, SocketValue, Warn, constant, once, tracked, uniform
 from .sockets import SocketRef
 
 #: Luminance weights of Rec.709.
@@ -37,22 +37,25 @@ class Walker:
         self._warn = warn
         self._approximate = approximate or warn
         self._warned: set[str] = set()
+        #: Of the value that is worked out now, see `tracked`.
+        self.approximated: tuple[str, ...] = ()
         self.found: dict[tuple[str, SocketRef], Any] = {}
         self.depth = 0
 
     def warn(self, node: bpy.types.Node, problem: str) -> None:
         """Say once how a node is approximated."""
-        self._say(node, problem, self._approximate)
+        self.approximated = (*self.approximated, self._say(node, problem, self._approximate))
 
     def note(self, node: bpy.types.Node, problem: str) -> None:
         """Say once what is wrong with a node, and stays so when it is baked."""
         self._say(node, problem, self._warn)
 
-    def _say(self, node: bpy.types.Node, problem: str, say: Warn) -> None:
+    def _say(self, node: bpy.types.Node, problem: str, say: Warn) -> str:
         text = f'{self.owner}, node "{node.label or node.name}": {problem}'
         if text not in self._warned:
             self._warned.add(text)
             say(text)
+        return text
 
     # What a subclass knows of its textures
 
@@ -70,6 +73,7 @@ class Walker:
 
     # Sockets
 
+    @tracked
     @once(lambda self: uniform(self.unknown))
     def colour(self, ref: SocketRef) -> SocketValue:
         """Value of a colour or vector input."""
@@ -79,6 +83,7 @@ class Walker:
         evaluate = getattr(self, f"node_{origin.node.type.lower()}", None)
         return evaluate(origin) if evaluate is not None else self.nearest(origin, ref)
 
+    @tracked
     def number(self, ref: SocketRef) -> SocketValue:
         """Value of a number input; of a colour its luminance, of a vector its mean."""
         value, source = self.colour(ref), ref.origin()
@@ -126,6 +131,7 @@ class Walker:
             return uniform(self.flat(node, value)[index])
         return SocketValue(uniform(value.colour[index]).colour, texture)
 
+    @tracked
     def combine(self, node: bpy.types.Node, function: Callable[..., Array], *values: SocketValue) -> SocketValue:
         """`function` of (..., 3) arrays for values.
 

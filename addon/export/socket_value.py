@@ -21,10 +21,16 @@ DEEPEST = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SocketValue:
-    """A colour, times a texture where there is one."""
+    """A colour, times a texture where there is one.
+
+    Attributes
+    ----------
+    approximations : what of it is not exact, as messages
+    """
 
     colour: Array
     texture: Hashable | None = None
+    approximations: tuple[str, ...] = ()
 
     def times(self, factor: Array | float) -> SocketValue:
         """Scaled."""
@@ -44,6 +50,21 @@ def constant(socket: bpy.types.NodeSocket) -> Array:
     """(3,) float64: a socket's own value."""
     value = socket.default_value
     return np.array(value[:3] if hasattr(value, "__len__") else (value,) * 3, np.float64)
+
+
+def tracked(method: Callable[..., SocketValue]) -> Callable[..., SocketValue]:
+    """Let a method of a `Walker` note on its value what was approximated for it."""
+
+    @wraps(method)
+    def followed(self: Any, *args: Any) -> SocketValue:
+        before, self.approximated = self.approximated, ()
+        value = method(self, *args)
+        given = [text for arg in args if isinstance(arg, SocketValue) for text in arg.approximations]
+        texts = tuple(dict.fromkeys((*self.approximated, *value.approximations, *given)))
+        self.approximated = (*before, *texts)
+        return replace(value, approximations=texts) if texts else value
+
+    return followed
 
 
 def once(fallback: Callable[[Any], Any]) -> Callable[..., Any]:

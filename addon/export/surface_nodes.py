@@ -60,9 +60,9 @@ class SurfaceWalker(NormalWalker):
         linked = ref is not None and ref.origin().socket.is_output
         output = ref and ref.node
         if output and output.inputs["Displacement"].is_linked:
-            self.warn(output, "displacement is not rendered")
+            self.note(output, "displacement is not rendered")
         if output and output.inputs["Volume"].is_linked:
-            self.warn(output, "the volume is not rendered")
+            self.note(output, "the volume is not rendered")
             if not linked:
                 return None
         if not linked:
@@ -113,7 +113,7 @@ class SurfaceWalker(NormalWalker):
     def warn_unsupported(self, output: SocketRef, unsupported: list[str]) -> None:
         """One warning for all that a shader node does beyond the supported."""
         if unsupported:
-            self.warn(output.node, f"not rendered: {', '.join(unsupported)}")
+            self.note(output.node, f"not rendered: {', '.join(unsupported)}")
 
     def shader_bsdf_diffuse(self, output: SocketRef) -> Surface:
         self.warn_unsupported(output, [])
@@ -195,7 +195,7 @@ class SurfaceWalker(NormalWalker):
         if first.scattered == second.scattered:
             rough_share = share
         else:
-            rough_share = uniform(weights[1] / max(sum(weights), 1e-9))
+            rough_share = replace(share, colour=np.full(3, weights[1] / max(sum(weights), 1e-9)), texture=None)
         return Surface(
             self.combine(node, mix, share, first.base, second.base),
             self.combine(node, mix, rough_share, first.roughness, second.roughness),
@@ -218,7 +218,7 @@ class SurfaceWalker(NormalWalker):
     def other_shader(self, output: SocketRef) -> Surface:
         """The nearest to a shader that is not known: its colour, scattered."""
         node = output.node
-        self.warn(node, f"{node.bl_label} is not supported; a surface of its colour is used")
+        self.note(node, f"{node.bl_label} is not supported; a surface of its colour is used")
         colours = [s for s in node.inputs if s.type == "RGBA" and s.enabled]
         base = self.colour(SocketRef(colours[0], output.groups)) if colours else uniform(0.8)
         rough = output.input("Roughness") if "Roughness" in node.inputs else None

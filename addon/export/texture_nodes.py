@@ -21,8 +21,10 @@ from .texture_refs import Channel, TextureRef
 class TextureWalker(Walker):
     """Evaluates the nodes of a material on a mesh, up to its shaders."""
 
-    def __init__(self, material: bpy.types.Material, mesh: bpy.types.Mesh, warn: Warn) -> None:
-        super().__init__(f'Material "{material.name}"', warn)
+    def __init__(
+        self, material: bpy.types.Material, mesh: bpy.types.Mesh, warn: Warn, approximate: Warn | None = None
+    ) -> None:
+        super().__init__(f'Material "{material.name}"', warn, approximate)
         self.material, self.mesh = material, mesh
         self.uses_mesh = False
 

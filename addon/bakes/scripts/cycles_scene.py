@@ -22,10 +22,12 @@ def load(job: dict[str, Any], kind: str) -> bpy.types.ID:
     return loaded
 
 
-def evaluated(owner: bpy.types.ID, job: dict[str, Any]) -> list[node_trees.Tree]:
+def evaluated(
+    owner: bpy.types.ID, job: dict[str, Any], follow: node_trees.Follow = lambda socket: True
+) -> list[node_trees.Tree]:
     """The trees behind the output of a datablock, with the values and loose images of the job."""
     output = output_of(owner)
-    found = node_trees.trees(owner.node_tree, output)
+    found = node_trees.trees(owner.node_tree, output, follow)
     owner.animation_data_clear()
     node_trees.apply(found, job["trees"])
     for place, (node, image) in enumerate(list(node_trees.images(found))):

@@ -32,9 +32,10 @@ def main() -> None:
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     addon_utils.enable("cycles")
+    import baked_surface
     import baked_world
 
-    kinds = {"world": baked_world.bake}
+    kinds = {"world": baked_world.bake, "surface": baked_surface.bake}
     while True:
         job = json.loads(jobs.get())
         error = ""

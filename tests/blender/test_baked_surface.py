@@ -1,0 +1,300 @@
+"""Materials that Cycles bakes: what is on the mesh is what Cycles shows, kept by content, and nothing is silent."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+from scenes import mesh_object, part, read_exr
+from test_baked_world import folder, jobs  # noqa: F401 - fixtures
+
+pytestmark = pytest.mark.blender_api
+SQUARE = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
+
+
+@pytest.fixture
+def bake(scene):
+    """Function that exports the current scene as final pictures are; returns (frame, warnings)."""
+    export = part("addon.export").export_baked
+    scene.drgs.bake_texture_size = "512"
+
+    def run():
+        warnings: list[str] = []
+        frame = export(bpy.context.evaluated_depsgraph_get(), str, warnings.append, lambda text, part: None)
+        return frame, warnings
+
+    return run
+
+
+def material(name: str = "Odd"):
+    """A material with nodes; returns (material, tree, its Principled BSDF)."""
+    made = bpy.data.materials.new(name)
+    if made.node_tree is None:
+        made.use_nodes = True
+    return made, made.node_tree, next(n for n in made.node_tree.nodes if n.type == "BSDF_PRINCIPLED")
+
+
+def square(uvs=((0, 0), (1, 0), (1, 1), (0, 1))):
+    """A square of two metres, seen from above by the camera, pixel by pixel."""
+    obj = mesh_object("Square", SQUARE, [(0, 1, 2, 3)])
+    if uvs is not None:
+        obj.data.uv_layers.new().data.foreach_set("uv", np.ravel(uvs))
+    scene = bpy.context.scene
+    scene.camera.location, scene.camera.rotation_euler = (0, 0, 5), (0, 0, 0)
+    scene.camera.data.type, scene.camera.data.ortho_scale = "ORTHO", 2
+    scene.render.resolution_x = scene.render.resolution_y = 64
+    return obj
+
+
+def noise(tree, target, coordinates: str | None = None, scale: float = 3.0):
+    """Colours of a Noise Texture as an input."""
+    node = tree.nodes.new("ShaderNodeTexNoise")
+    node.inputs["Scale"].default_value = scale
+    if coordinates is not None:
+        source = tree.nodes.new("ShaderNodeTexCoord")
+        tree.links.new(source.outputs[coordinates], node.inputs["Vector"])
+    tree.links.new(node.outputs["Color"], target)
+    return node
+
+
+def shining(obj, socket_of) -> np.ndarray:
+    """(h, w, 3): the input of a material as Cycles shows it, by an Emission instead of its shader."""
+    scene, made = bpy.context.scene, obj.data.materials[0]
+    tree, output = made.node_tree, made.node_tree.get_output_node("ALL")
+    emission, before = tree.nodes.new("ShaderNodeEmission"), output.inputs["Surface"].links[0].from_socket
+    socket = socket_of
+    target = emission.inputs["Strength" if socket.type == "VALUE" else "Color"]
+    tree.links.new(socket.links[0].from_socket, target)
+    tree.links.new(emission.outputs[0], output.inputs["Surface"])
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 16, False
+    scene.cycles.use_adaptive_sampling = False
+    scene.cycles.pixel_filter_type, scene.cycles.filter_width = "BOX", 1.0
+    bpy.ops.render.render(write_still=True)
+    tree.links.new(before, output.inputs["Surface"])
+    tree.nodes.remove(emission)
+    scene.render.engine = "DRGS"
+    return read_exr(scene.render.filepath, 64, 64)[..., :3]
+
+
+def texture_of(frame, state, name: str):
+    """(image, uvs (m, 3, 2)) of a channel of the first material of a mesh."""
+    texture = getattr(state.materials[0], f"{name}_texture")
+    image = next(i for i in frame.images if i.name == texture.image)
+    layer = {layer.name: layer.values for layer in state.layers}
+    return image, layer[texture.layer] if texture.layer else state.uvs
+
+
+def seen(frame, name: str = "base_colour") -> np.ndarray:
+    """(64, 64, 3): a channel of the square as the camera sees it, by bilinear lookups."""
+    (state,) = frame.meshes
+    image, uvs = texture_of(frame, state, name)
+    pixels = image.pixels.astype(np.float64)[..., :3]
+    if image.pixels.dtype == np.uint8:
+        pixels /= 255
+    if image.encoding == "srgb":
+        pixels = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
+    points = state.vertices[state.faces][..., :2].astype(np.float64)
+    x = (np.arange(64) + 0.5) / 32 - 1
+    places = np.stack(np.meshgrid(x, -x), axis=-1).reshape(-1, 2)
+    found = np.zeros((len(places), 2))
+    for corners, uv in zip(points, uvs):
+        inverse = np.linalg.inv((corners[1:] - corners[0]).T)
+        weights = (places - corners[0]) @ inverse.T
+        inside = (weights >= -1e-9).all(axis=1) & (weights.sum(axis=1) <= 1 + 1e-9)
+        found[inside] = uv[0] + weights[inside] @ (uv[1:] - uv[0])
+    height, width = pixels.shape[:2]
+    column, row = found[:, 0] * width - 0.5, (1 - found[:, 1]) * height - 0.5
+    i, j = np.floor(row).astype(int), np.floor(column).astype(int)
+    a, b = (row - i)[:, None], (column - j)[:, None]
+
+    def at(r, c):
+        return pixels[np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)]
+
+    value = (1 - a) * ((1 - b) * at(i, j) + b * at(i, j + 1)) + a * ((1 - b) * at(i + 1, j) + b * at(i + 1, j + 1))
+    return value.reshape(64, 64, 3) * np.array(getattr(state.materials[0], name))
+
+
+def psnr(ours: np.ndarray, theirs: np.ndarray) -> float:
+    return 10 * np.log10(theirs.max() ** 2 / np.mean((ours - theirs) ** 2))
+
+
+UVS = {
+    "own": ((0, 0), (1, 0), (1, 1), (0, 1)),
+    "none": None,
+    "tiled": ((0, 0), (3, 0), (3, 3), (0, 3)),
+    "one place": ((0, 0), (0, 0), (0, 0), (0, 0)),
+}
+
+
+@pytest.mark.parametrize("kind", UVS)
+@pytest.mark.parametrize("coordinates", [None, "Object"])
+def test_a_procedural_colour_is_what_cycles_shows(scene, bake, kind, coordinates):
+    obj = square(UVS[kind])
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    noise(tree, shader.inputs["Base Color"], coordinates)
+    frame, warnings = bake()
+    assert not warnings and psnr(seen(frame), shining(obj, shader.inputs["Base Color"])) > 40
+    assert (frame.meshes[0].uvs is None) == (kind != "own"), "another map is made where the own one is of no use"
+
+
+def test_faces_that_overlap_get_places_of_their_own(scene, bake):
+    """Two halves of a square, mirrored onto each other in the UV map."""
+    obj = mesh_object("Halves", [*SQUARE, (0, -1, 0), (0, 1, 0)], [(0, 4, 5, 3), (4, 1, 2, 5)])
+    uvs = [(0, 0), (1, 0), (1, 1), (0, 1), (1, 0), (0, 0), (0, 1), (1, 1)]
+    obj.data.uv_layers.new().data.foreach_set("uv", np.ravel(uvs))
+    bpy.data.objects.remove(square())
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    noise(tree, shader.inputs["Base Color"])
+    frame, warnings = bake()
+    assert not warnings and frame.meshes[0].layers
+    assert psnr(seen(frame), shining(obj, shader.inputs["Base Color"])) > 40
+
+
+def test_numbers_and_what_shines_are_baked_and_the_rest_is_read(scene, bake, jobs):  # noqa: F811
+    obj = square()
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    shader.inputs["Base Color"].default_value = (0.1, 0.2, 0.3, 1)
+    noise(tree, shader.inputs["Roughness"])
+    noise(tree, shader.inputs["Emission Color"], scale=2)
+    shader.inputs["Emission Strength"].default_value = 5
+    frame, warnings = bake()
+    found = frame.meshes[0].materials[0]
+    assert not warnings and sorted(job["channel"] for job in jobs) == ["emission", "roughness"]
+    np.testing.assert_allclose(found.base_colour, (0.1, 0.2, 0.3), rtol=1e-6)
+    assert found.base_colour_texture is None and found.metallic_texture is None
+    assert psnr(seen(frame, "roughness"), shining(obj, shader.inputs["Roughness"])) > 40
+    assert psnr(seen(frame, "emission"), 5 * shining(obj, shader.inputs["Emission Color"])) > 40
+
+
+def test_mixed_shaders_within_groups_are_baked(scene, bake):
+    """A noise between a red and a blue surface, the mix in a group; half of the light of a glowing part is its own."""
+    obj = square()
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    group = bpy.data.node_groups.new("Mixed", "ShaderNodeTree")
+    group.interface.new_socket("Shader", in_out="OUTPUT", socket_type="NodeSocketShader")
+    mix, red, blue, end = (
+        group.nodes.new(n)
+        for n in ("ShaderNodeMixShader", "ShaderNodeBsdfDiffuse", "ShaderNodeBsdfDiffuse", "NodeGroupOutput")
+    )
+    red.inputs["Color"].default_value, blue.inputs["Color"].default_value = (0.8, 0.1, 0.1, 1), (0.1, 0.1, 0.9, 1)
+    texture = noise(group, mix.inputs[0])
+    group.links.new(texture.outputs[0], mix.inputs[0])
+    group.links.new(red.outputs[0], mix.inputs[1])
+    group.links.new(blue.outputs[0], mix.inputs[2])
+    group.links.new(mix.outputs[0], end.inputs[0])
+    node = tree.nodes.new("ShaderNodeGroup")
+    node.node_tree = group
+    tree.links.new(node.outputs[0], tree.get_output_node("ALL").inputs["Surface"])
+    frame, warnings = bake()
+    assert not warnings
+    found = seen(frame)
+    scalar = tree.nodes.new("ShaderNodeTexNoise")
+    scalar.inputs["Scale"].default_value = 3
+    tree.links.new(scalar.outputs[0], shader.inputs["Roughness"])
+    share = shining(obj, shader.inputs["Roughness"])
+    assert psnr(found, (1 - share) * (0.8, 0.1, 0.1) + share * (0.1, 0.1, 0.9)) > 40
+
+
+@pytest.mark.slow
+def test_results_are_kept_by_content(scene, bake, jobs):  # noqa: F811
+    obj = square()
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    texture = noise(tree, shader.inputs["Base Color"])
+    image = bake()[0].images[0]
+    texture.location, shader.inputs["Roughness"].default_value = (90, 10), 0.1
+    obj.location.x, obj.data.vertices[0].co.z = 3, 0.0
+    again = bake()[0]
+    assert len(jobs) == 1 and again.images[0].pixels is image.pixels, "neither place nor another channel matters"
+    obj.location.x = 0
+    texture.inputs["Scale"].default_value = 5
+    bake()
+    assert len(jobs) == 2
+    tree.links.new(tree.nodes.new("ShaderNodeNewGeometry").outputs["Position"], texture.inputs["Vector"])
+    bake()
+    obj.location.x = 1
+    bake()
+    assert len(jobs) == 4, "a place that matters does"
+
+
+def test_each_material_of_a_mesh_has_its_faces(scene, bake):
+    obj = mesh_object("Two", [*SQUARE, (0, -1, 0), (0, 1, 0)], [(0, 4, 5, 3), (4, 1, 2, 5)])
+    bpy.data.objects.remove(square())
+    for i, value in enumerate((0.2, 0.6)):
+        made, tree, shader = material(f"Part {i}")
+        obj.data.materials.append(made)
+        checker = tree.nodes.new("ShaderNodeTexChecker")
+        for socket in ("Color1", "Color2"):
+            checker.inputs[socket].default_value = (value, value, value, 1)
+        checker.inputs["Color2"].default_value = (value / 2, 0, 0, 1)
+        checker.inputs["Scale"].default_value = 0.0
+        tree.links.new(checker.outputs["Color"], shader.inputs["Base Color"])
+    obj.data.polygons[1].material_index = 1
+    frame, warnings = bake()
+    (state,) = frame.meshes
+    assert not warnings and len(state.layers) == 2
+    for i, found in enumerate(state.materials):
+        image = next(p for p in frame.images if p.name == found.base_colour_texture.image)
+        layer = next(k for k in state.layers if k.name == found.base_colour_texture.layer).values
+        places = layer[state.material_index == i].reshape(-1, 2).mean(axis=0) * 511
+        assert image.pixels[511 - int(places[1]), int(places[0]), 0] in (124, 204, 89, 149), "no empty part of it"
+
+
+def test_what_is_another_for_each_ray_is_named_and_not_baked(scene, bake, export, jobs):  # noqa: F811
+    obj = square()
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    weight, ramp = tree.nodes.new("ShaderNodeLayerWeight"), tree.nodes.new("ShaderNodeValToRGB")
+    tree.links.new(weight.outputs["Facing"], ramp.inputs[0])
+    tree.links.new(ramp.outputs[0], shader.inputs["Base Color"])
+    _, warnings = bake()
+    assert not jobs and warnings == export()[1] and 'node "Layer Weight"' in warnings[0]
+
+
+def test_a_failed_bake_is_named_and_the_rest_is_rendered(scene, bake, export, monkeypatch):
+    obj = square()
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    noise(tree, shader.inputs["Base Color"])
+    _, before = export()
+    monkeypatch.setattr(part("addon.bakes.blender_process"), "command", lambda: ["/nowhere/blender"])
+    frame, warnings = bake()
+    assert warnings[0].startswith('Material "Odd" on "Square": its base colour cannot be baked (')
+    assert (
+        warnings[1:] == before and len(frame.meshes) == 1 and frame.meshes[0].materials[0].base_colour_texture is None
+    )
+
+
+@pytest.mark.slow
+def test_instances_of_what_depends_on_its_place_are_named(scene, bake):
+    obj = square()
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    texture = noise(tree, shader.inputs["Base Color"])
+    other = bpy.data.objects.new("Other", obj.data)
+    other.location.x = 3
+    scene.collection.objects.link(other)
+    assert not bake()[1]
+    tree.links.new(tree.nodes.new("ShaderNodeNewGeometry").outputs["Position"], texture.inputs["Vector"])
+    (warning,) = bake()[1]
+    assert '"Square"' in warning and "2 instances" in warning
+
+
+@pytest.mark.slow
+def test_deformed_meshes_keep_their_generated_coordinates(scene, bake, jobs):  # noqa: F811
+    """What sticks to the surface is baked once for all poses."""
+    obj = square()
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    noise(tree, shader.inputs["Base Color"])
+    first = seen(bake()[0])
+    modifier = obj.modifiers.new("Bend", "SIMPLE_DEFORM")
+    modifier.deform_method, modifier.angle = "TWIST", 1.0
+    frame, warnings = bake()
+    assert not warnings and len(jobs) == 1
+    frame.meshes[0].vertices = np.float32(SQUARE)
+    np.testing.assert_allclose(seen(frame), first, atol=1e-6)
