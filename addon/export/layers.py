@@ -70,10 +70,10 @@ class LayerRef:
                 return None
             values = np.asarray(found if self.change is None else self.change(found), np.float32)
             return values[_elements(mesh.attributes[self.name].domain, corners, polygons, corner_vertices)]
-        found = self._coordinates(mesh)
-        if found is None:
+        there = self._coordinates(mesh)
+        if there is None:
             return None
-        coordinates, domain = found
+        coordinates, domain = there
         matrix = np.array(self.matrix)
         placed = (coordinates @ matrix[:2, :3].T + matrix[:2, 3]).astype(np.float32)
         return placed[_elements(domain, corners, polygons, corner_vertices)]

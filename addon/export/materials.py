@@ -118,13 +118,14 @@ class Materials:
 
     def _detail(self, tree: SurfaceWalker, detail: DetailRef, label: Callable[[LayerRef], str]) -> SurfaceDetail:
         texture, numbers = detail.value.texture, (*detail.value.colour, detail.strength, detail.distance)
+        x, y, z = map(float, detail.value.colour)
         if not np.isfinite(numbers).all():
             tree.report("its normal or bump map has a number that is not finite; it is left out. Check its drivers")
             return SurfaceDetail("bump")
         return SurfaceDetail(
             detail.kind,
             None if texture is None else self._texture(texture, label(texture.layer)),
-            tuple(map(float, detail.value.colour)),
+            (x, y, z),
             max(detail.strength, 0.0),
             detail.distance,
             label(detail.tangents),

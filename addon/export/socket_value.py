@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import wraps
 from typing import Any
@@ -25,11 +25,12 @@ class SocketValue:
 
     Attributes
     ----------
+    texture : hashable: a texture, attribute or bake of `texture_refs`, `layers` or `surface_bake`, or None
     approximations : what of it is not exact, as messages
     """
 
     colour: Array
-    texture: Hashable | None = None
+    texture: Any = None
     approximations: tuple[str, ...] = ()
 
     def times(self, factor: Array | float) -> SocketValue:

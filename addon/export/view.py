@@ -78,8 +78,8 @@ def _panorama(
     left, top, right, bottom = final.window
     edges = (x0 + sx * left, y0 + sy * top, x0 + sx * right, y0 + sy * bottom)
     ends = (width, height, width, height)
-    window = tuple(min(max(round(edge), 0), end) for edge, end in zip(edges, ends))
-    if window[2] <= window[0] or window[3] <= window[1]:
+    left, top, right, bottom = (min(max(round(edge), 0), end) for edge, end in zip(edges, ends))
+    if right <= left or bottom <= top:
         return None
     return replace(
         final,
@@ -89,7 +89,7 @@ def _panorama(
         fy=final.fy * sy,
         cx=x0 + final.cx * sx,
         cy=y0 + final.cy * sy,
-        region=window,
+        region=(left, top, right, bottom),
     )
 
 

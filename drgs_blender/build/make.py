@@ -164,10 +164,15 @@ def _cut_out(net: Net, alpha: Array, which: Array, name: str, report: dict[str, 
 
     Parameters
     ----------
+    net : Net
     alpha : (n,) array
         Of the vertices.
     which : (materials + 1,) bool array
         Materials that are cut out.
+    name : str
+        Of the file, in errors.
+    report : dict
+        Its notes get how many faces that were.
     """
     keep = (alpha[net.faces].mean(axis=1) >= CUT_OUT) | ~which[net.tags[:, 0]]
     if not keep.any():

@@ -85,6 +85,8 @@ class CornerFrames:
 
         Parameters
         ----------
+        face : (n,) int array
+        weights : (n, 3) array
         bumps : (n, 3) array, optional
             Normals of a map in tangent space.
         """
@@ -177,6 +179,9 @@ class SurfaceDetail:
 
         Parameters
         ----------
+        mesh : Mesh
+        surfels : Surfels
+        binding : Binding
         pieces : (n, 3, 3) array
             Of `hidden_by`, one for each surfel.
         """

@@ -192,6 +192,9 @@ def cut_for_detail(patches: _Patches, faces: Faces, detail: Detail, most: int, f
 
     Parameters
     ----------
+    patches : _Patches
+    faces : Faces
+    detail : Detail
     most : int
         Patches in the end, at most.
     finest : float

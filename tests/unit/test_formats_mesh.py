@@ -184,7 +184,36 @@ def test_materials_textures_and_colours(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.corner_uvs[0], [[0, 1], [1, 1], [0, 0]])
     np.testing.assert_allclose(mesh.vertex_colours[0], [1, 0, 0.2], atol=1e-7)  # linear by definition
     notes = " ".join(mesh.notes)
-    assert "emission ignored" in notes and "alpha ignored" in notes
+    assert "emission ignored" in notes
+    assert material.alpha == 1.0 and material.alpha_image is None
+
+
+@pytest.mark.parametrize(("mode", "cut"), [("MASK", True), ("BLEND", False), ("OPAQUE", False)])
+def test_alpha_and_normal_maps_of_gltf(tmp_path: Path, mode: str, cut: bool) -> None:
+    """Alpha times its factor, cut where the material says so; a normal map on other coordinates is left out."""
+    pixels = np.full((4, 4, 4), 200, np.uint8)
+    pixels[..., 3] = np.linspace(0, 255, 16).reshape(4, 4)
+    Pillow.fromarray(pixels).save(tmp_path / "t.png")
+    b = quad(material=0)
+    b.json["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = b.accessor(np.zeros((4, 2), np.float32), "VEC2")
+    pbr = {"baseColorFactor": [1, 1, 1, 0.5], "baseColorTexture": {"index": 0}}
+    bumps = {"index": 0, "scale": 0.7}
+    b.json |= {
+        "materials": [{"pbrMetallicRoughness": pbr, "alphaMode": mode, "alphaCutoff": 0.3, "normalTexture": bumps}],
+        "textures": [{"source": 0}],
+        "images": [{"uri": "t.png"}],
+    }
+    material = read_mesh(b.write(tmp_path / "a.gltf")).materials[0]
+    assert material.cut_out is cut and (material.alpha_image is None) is (mode == "OPAQUE")
+    if mode == "MASK":
+        np.testing.assert_array_equal(material.alpha_image.pixels, pixels[..., 3] / 255 * 0.5 >= 0.3)
+    elif mode == "BLEND":
+        np.testing.assert_allclose(material.alpha * material.alpha_image.pixels, pixels[..., 3] / 255 * 0.5, atol=1e-6)
+    assert material.normal_image is not None and not material.normal_image.srgb
+    assert material.normal_strength == 0.7
+    bumps["texCoord"] = 1
+    other = read_mesh(b.write(tmp_path / "b.gltf"))
+    assert other.materials[0].normal_image is None and "normal map ignored" in " ".join(other.notes)
 
 
 def test_uv_transform_is_khr_texture_transform_with_v_up() -> None:
