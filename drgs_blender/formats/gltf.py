@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +9,13 @@ import numpy as np
 
 from ..core.errors import AssetError
 from .axes import vectors_to_z_up
-from .files import Image, MaterialFile, MeshFile
+from .files import MaterialFile, MeshFile
 from .gltf_document import Document
+from .gltf_materials import GltfMaterials
 from .gltf_nodes import INSTANCES, NodeTree, Pose
-from .images import decode_image
 
 Array = np.ndarray
 
-_WRAP = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
 #: Required extensions that change nothing of what is read here, or that are read.
 _UNDERSTOOD = {
     INSTANCES,
@@ -46,7 +44,7 @@ def read_gltf(path: Path, pose: Pose = "rest") -> MeshFile:
     notes: list[str] = []
     _check_extensions(document, notes)
     tree = NodeTree(document, pose)
-    materials = _Materials(document, notes)
+    materials = GltfMaterials(document, notes)
     pieces = []
     for node_index in tree.order:
         node = document.items("nodes")[node_index]
@@ -96,7 +94,7 @@ def _primitive(
     tree: NodeTree,
     node: dict[str, Any],
     node_index: int,
-    materials: _Materials,
+    materials: GltfMaterials,
     notes: list[str],
 ) -> _Piece | None:
     """One primitive of a mesh node, placed in the scene; None where it has no triangles."""
@@ -217,154 +215,6 @@ def _blend_matrices(document: Document, attributes: dict[str, Any], joints: Arra
     loose = ~(total > 0)  # vertices without weights follow the first joint, as in Blender
     blend[loose], total[loose] = joints[0, :3], 1.0
     return blend / total[:, None, None]
-
-
-class _Materials:
-    """The materials of a document, converted when a primitive uses them; images are decoded once."""
-
-    def __init__(self, document: Document, notes: list[str]) -> None:
-        self.document, self.notes = document, notes
-        self.used: list[MaterialFile] = []
-        self._known: dict[int | None, tuple[int, int]] = {}
-        self._pixels: dict[int, Array | None] = {}
-        self._normal_set = 0  # UV set of the normal map that was read last
-
-    def use(self, index: int | None) -> tuple[int, int]:
-        """(number in `used`, UV set) of the glTF material `index`; None is glTF's default material."""
-        if index not in self._known:
-            self.used.append(MaterialFile("default", (1.0, 1.0, 1.0), 1.0, 1.0))
-            self._known[index] = len(self.used) - 1, 0
-            if index is not None:
-                self._known[index] = len(self.used) - 1, self._convert(index)
-        return self._known[index]
-
-    def _convert(self, index: int) -> int:
-        """Fill the newest material from the glTF material `index`; return the UV set of its textures."""
-        document, get = self.document, self.document.get
-        entry = document.item("materials", index)
-        material = self.used[-1]
-        material.name = str(entry.get("name") or f"material {index}")
-        extensions = get(entry, "extensions", dict, {})
-        if "KHR_materials_pbrSpecularGlossiness" in extensions and "pbrMetallicRoughness" not in entry:
-            return self._specular_glossiness(material, get(extensions, "KHR_materials_pbrSpecularGlossiness", dict))
-        pbr = get(entry, "pbrMetallicRoughness", dict, {})
-        colour = document.numbers(pbr, "baseColorFactor", (1.0, 1.0, 1.0, 1.0))
-        material.base_colour = _rgb(colour)
-        material.metallic = float(document.numbers(pbr, "metallicFactor", (1.0,))[0])
-        material.roughness = float(document.numbers(pbr, "roughnessFactor", (1.0,))[0])
-        material.base_colour_image, colour_set = self._texture(pbr, "baseColorTexture", srgb=True)
-        material.metallic_roughness_image, other_set = self._texture(pbr, "metallicRoughnessTexture", srgb=False)
-        if material.base_colour_image and material.metallic_roughness_image and colour_set != other_set:
-            self.notes.append(f"{material.name}: textures on two UV maps; the one of the base colour is used for both")
-        if get(entry, "emissiveTexture", dict) or document.numbers(entry, "emissiveFactor", (0.0, 0.0, 0.0)).any():
-            self.notes.append(f"{material.name}: emission ignored")
-        self._alpha(entry, material, float(colour[3]))
-        self._normal_map(entry, material, (colour_set if material.base_colour_image else other_set))
-        for name in extensions:
-            if name.startswith("KHR_materials_"):
-                self.notes.append(f"{material.name}: {name} ignored")
-        if material.base_colour_image or material.metallic_roughness_image or material.normal_image is None:
-            return colour_set if material.base_colour_image else other_set
-        return self._normal_set
-
-    def _alpha(self, entry: dict[str, Any], material: MaterialFile, factor: float) -> None:
-        """Read the alpha of the base colour, cut at the cutoff where the material says so."""
-        mode = self.document.get(entry, "alphaMode", str, "OPAQUE")
-        if mode not in ("MASK", "BLEND"):
-            return
-        alpha = None if material.base_colour_image is None else material.base_colour_image.alpha
-        factor = float(np.clip(factor, 0, 1)) if np.isfinite(factor) else 1.0
-        material.cut_out = mode == "MASK"
-        if material.cut_out:
-            cutoff = float(self.document.numbers(entry, "alphaCutoff", (0.5,))[0])
-            if alpha is not None:
-                alpha = replace(alpha, pixels=(alpha.pixels * factor >= cutoff).astype(np.float32))
-            factor = float(factor >= cutoff) if alpha is None else 1.0
-        material.alpha, material.alpha_image = factor, alpha
-
-    def _normal_map(self, entry: dict[str, Any], material: MaterialFile, uv_set: int) -> None:
-        """Read the normal map; it is left out, with a note, where it has another UV set than other textures."""
-        info = self.document.get(entry, "normalTexture", dict)
-        if info is None:
-            return
-        image, self._normal_set = self._texture(entry, "normalTexture", srgb=False)
-        others = material.base_colour_image or material.metallic_roughness_image
-        if image is not None and others and self._normal_set != uv_set:
-            self.notes.append(f"{material.name}: normal map ignored: its UV map is not that of the other textures")
-        elif image is not None:
-            material.normal_image = image
-            material.normal_strength = float(self.document.numbers(info, "scale", (1.0,))[0])
-
-    def _specular_glossiness(self, material: MaterialFile, pbr: dict[str, Any]) -> int:
-        """Approximate a specular-glossiness material: what is specular beyond a dielectric's 4 % is metal."""
-        diffuse = self.document.numbers(pbr, "diffuseFactor", (1.0, 1.0, 1.0, 1.0))[:3]
-        specular = self.document.numbers(pbr, "specularFactor", (1.0, 1.0, 1.0))
-        material.roughness = 1.0 - float(self.document.numbers(pbr, "glossinessFactor", (1.0,))[0])
-        material.base_colour_image, uv_set = self._texture(pbr, "diffuseTexture", srgb=True)
-        textured = material.base_colour_image is not None or "specularGlossinessTexture" in pbr
-        brightest = float(specular.max())
-        excess = max(brightest - 0.04, 0.0)
-        metallic = 0.0 if textured else excess / max(excess + float(diffuse.max()), 1e-6)
-        material.metallic = metallic
-        material.base_colour = _rgb(np.clip((1 - metallic) * diffuse + metallic * specular, 0, 1))
-        self.notes.append(f"{material.name}: specular-glossiness converted approximately to metallic-roughness")
-        return uv_set
-
-    def _texture(self, entry: dict[str, Any], key: str, srgb: bool) -> tuple[Image | None, int]:
-        """(image, UV set) of a texture reference; (None, 0) without one."""
-        document = self.document
-        info = document.get(entry, key, dict)
-        if info is None:
-            return None, 0
-        texture = document.item("textures", document.index(info, "index"))
-        extensions = document.get(texture, "extensions", dict, {})
-        source = document.index(document.get(extensions, "EXT_texture_webp", dict, texture), "source")
-        uv_set = document.index(info, "texCoord") or 0
-        if source is None:
-            self.notes.append(f"texture of {key} in a format that is not read (KTX2?) ignored")
-            return None, uv_set
-        pixels = self._image(source)
-        if pixels is None:
-            return None, uv_set
-        sampler_index = document.index(texture, "sampler")
-        sampler = {} if sampler_index is None else document.item("samplers", sampler_index)
-        wrap = [_WRAP.get(document.index(sampler, k) or 10497, "repeat") for k in ("wrapS", "wrapT")]
-        moved = document.get(document.get(info, "extensions", dict, {}), "KHR_texture_transform", dict)
-        transform = np.eye(2, 3)
-        if moved is not None:
-            replaced = document.index(moved, "texCoord")
-            uv_set = uv_set if replaced is None else replaced
-            transform = uv_transform(
-                document.numbers(moved, "offset", (0.0, 0.0)),
-                float(document.numbers(moved, "rotation", (0.0,))[0]),
-                document.numbers(moved, "scale", (1.0, 1.0)),
-            )
-        return Image(pixels, srgb, transform, (wrap[0], wrap[1])), uv_set
-
-    def _image(self, index: int) -> Array | None:
-        """Pixels of an image; None, with a note, where it cannot be had: a mesh without it is still a mesh."""
-        if index not in self._pixels:
-            try:
-                self._pixels[index] = decode_image(*self.document.image(index))
-            except AssetError as error:
-                self._pixels[index] = None
-                self.notes.append(f"texture left out: {error}")
-        return self._pixels[index]
-
-
-def uv_transform(offset: Array, rotation: float, scale: Array) -> Array:
-    """KHR_texture_transform as (2, 3) matrix on coordinates whose v points **up** (glTF's own points down)."""
-    c, s = np.cos(rotation), np.sin(rotation)
-    return np.array(
-        [
-            [c * scale[0], -s * scale[1], offset[0] + s * scale[1]],
-            [s * scale[0], c * scale[1], 1.0 - offset[1] - c * scale[1]],
-        ]
-    )
-
-
-def _rgb(colour: Array) -> tuple[float, float, float]:
-    return float(colour[0]), float(colour[1]), float(colour[2])
 
 
 def _join(pieces: list[tuple[str, _Piece]], materials: list[MaterialFile], notes: list[str]) -> MeshFile:

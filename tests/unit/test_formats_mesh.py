@@ -18,7 +18,8 @@ from scipy.spatial import cKDTree
 from drgs_blender.core.color import srgb_to_linear
 from drgs_blender.core.errors import AssetError
 from drgs_blender.formats.axes import vectors_to_z_up
-from drgs_blender.formats.gltf import read_gltf, uv_transform
+from drgs_blender.formats.gltf import read_gltf
+from drgs_blender.formats.gltf_materials import uv_transform
 from drgs_blender.formats.registry import read_mesh
 
 ROOT = Path(__file__).resolve().parents[2]
