@@ -76,7 +76,8 @@ def nearest(points: Array, sources: list[Source]) -> Match:
 def by_numbers(points: Array, rest: Mesh, sources: list[Source]) -> Match | None:
     """The vertices of the sources from which those of an asset were made, by their numbers.
 
-    Exact also where surfaces touch or lie in each other, where the nearest place may be another's.
+    Exact also where surfaces touch or lie in each other, where the nearest place may be another's. A vertex between
+    those of several sources, which were one surface in the asset's making, takes the nearest place.
 
     Parameters
     ----------
@@ -105,11 +106,17 @@ def by_numbers(points: Array, rest: Mesh, sources: list[Source]) -> Match | None
         distance = np.linalg.norm(found - points, axis=1)
         if distance.max(initial=0) > AT_PLACE * float(np.linalg.norm(np.ptp(vertices, axis=0))):
             continue
-        source = np.searchsorted(starts, index[:, 0], side="right") - 1
-        corners, shares = np.repeat(index[:, :1], 3, axis=1), np.zeros((n, 3))
         used = weights != 0
+        corners, shares = np.repeat(index[np.arange(n), used.argmax(axis=1)][:, None], 3, axis=1), np.zeros((n, 3))
         corners[:, : index.shape[1]][used], shares[:, : index.shape[1]] = index[used], weights
-        return Match(source, corners - starts[source][:, None], shares, distance)
+        of = np.searchsorted(starts, corners, side="right") - 1
+        match = Match(of[:, 0], corners - starts[of], shares, distance)
+        across = np.flatnonzero((of != of[:, :1]).any(axis=1))  # in faces with a vertex that another source has, too
+        if len(across):
+            near = nearest(points[across], sources)
+            match.source[across], match.corners[across] = near.source, near.corners
+            match.barycentric[across], match.distance[across] = near.barycentric, near.distance
+        return match
     return None
 
 

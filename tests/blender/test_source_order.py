@@ -73,6 +73,33 @@ def test_a_source_that_lies_elsewhere_is_matched_by_place(shells):
     assert np.isfinite(world_vertices(obj)).all() and not np.allclose(world_vertices(obj), before)
 
 
+def test_sources_that_became_one_surface_keep_their_own_bones(scene, tmp_path):
+    """Two boards that touch: the asset has one vertex for both at the seam, and one between the seam and a corner."""
+    vertices = np.float32([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0, 0), (2, 1, 0), (1.5, 0, 0)])
+    faces = np.int32([(0, 1, 2), (0, 2, 3), (1, 6, 2), (6, 5, 2), (6, 4, 5)])
+    asset = asset_of(vertices, faces)
+    # The second board's vertices 4 and 7 were merged with 1 and 2 of the first.
+    index, weights = np.array([0, 1, 2, 3, 5, 6, 1])[:, None].repeat(2, 1), np.tile((1.0, 0.0), (7, 1))
+    index[6], weights[6] = (1, 5), (0.5, 0.5)
+    asset.mesh.source = part("drgs_blender.core.asset.model").SourceVertices(index, weights, np.array([8]))
+    part("drgs_blender.core.asset.container").write_asset(tmp_path / "boards.drgs", asset)
+    bpy.ops.import_scene.drgs(filepath=str(tmp_path / "boards.drgs"))
+    obj = bpy.context.object
+    rig = armature_object({"Low": ((0, 0, -1), (0, 0, 0)), "High": ((0, 0, 0), (0, 0, 1))})
+    board = np.float32([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)])
+    sources = []
+    for name, x in (("Low", 0), ("High", 1)):
+        sources.append(skinned(name, rig, board + np.float32((x, 0, 0)), [(0, 1, 2), (0, 2, 3)]))
+        for group in sources[-1].vertex_groups:
+            group.remove(range(4))
+        sources[-1].vertex_groups[name].add(range(4), 1.0, "REPLACE")
+    select(*sources, obj)
+    assert bpy.ops.drgs.bind_to_rig() == {"FINISHED"}
+    names = [group.name for group in obj.vertex_groups]
+    found = [{names[g.group]: g.weight for g in vertex.groups} for vertex in obj.data.vertices]
+    assert found == [{"Low": 1.0}] * 4 + [{"High": 1.0}] * 3
+
+
 def write_pc2(path, frames: np.ndarray, first: float = 1) -> None:
     count, points, _ = frames.shape
     head = struct.pack("<12s2i2fi", b"POINTCACHE2\0", 1, points, first, 1.0, count)
