@@ -204,12 +204,16 @@ def _read_normal_map(material: MaterialFile, line: str, path: Path, notes: list[
         notes.append(f"{material.name}: heights of {line.split()[0]} ignored: only normal maps are read")
         return
     words = line.split()
-    material.normal_image = Image(image.pixels, srgb=False)
-    material.normal_strength = float(words[words.index("-bm") + 1]) if "-bm" in words[:-1] else 1.0
+    strength = float(words[words.index("-bm") + 1]) if "-bm" in words[:-1] else 1.0
+    if not np.isfinite(strength):
+        raise ValueError
+    material.normal_image, material.normal_strength = Image(image.pixels, srgb=False), strength
 
 
 def _image(line: str, path: Path, notes: list[str]) -> Image | None:
-    """The image a map statement names (its options come first, the file last)."""
+    """The image a map statement names (its options come first, the file last); ValueError where it names none."""
+    if len(line.split()) < 2:
+        raise ValueError
     name = _text(line.split()[-1])
     file = beside(path, name)
     if file is None or not file.is_file():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 
 import numpy as np
@@ -118,6 +119,13 @@ def test_surfels_show_textures_that_the_mesh_has_no_vertices_for() -> None:
     assert len(coarse.surfels) == 300 and 2000 < len(fine.surfels) <= 20_000
     assert error_of(fine) < 0.35 * error_of(coarse)
     assert coarse.provenance["report"]["surfels"]["hidden_pieces"] > 100
+    (note,) = coarse.provenance["report"]["surfels"]["notes"]
+    assert "the budget is 300 surfels" in note
+    dense = make_asset(file, max_triangles=8, density=10, max_surfels=1)
+    (note,) = dense.provenance["report"]["surfels"]["notes"]
+    assert len(dense.surfels) == 256 and "256 surfels, which the density asks for" in note
+    enough = make_asset(plane(2, checker(8, 2)), max_triangles=8, density=10, max_surfels=20_000)
+    assert len(enough.surfels) < 20_000 and "notes" not in enough.provenance["report"]["surfels"]
     plain = make_asset(plane(2), max_triangles=8, density=10, max_surfels=20_000)
     assert len(plain.surfels) == 256 and "hidden_pieces" not in plain.provenance["report"]["surfels"]
 
@@ -222,3 +230,24 @@ def test_obj_knows_alpha_and_normal_maps(tmp_path) -> None:
     assert material.normal_strength == 0.5 and material.normal_image.pixels.shape == (8, 8, 3)
     assert glass.alpha == 0.25 and glass.normal_image is None
     assert any("heights" in note and "ignored" in note for note in file.notes)
+
+
+@pytest.mark.parametrize("statement", ["norm", "map_Kd", "bump -bm", "bump -bm nan n.png", "bump -bm x n.png"])
+def test_map_statements_without_sense_are_named(tmp_path, statement: str) -> None:
+    """Of an MTL file; all others count."""
+    file = plane(1)
+    (tmp_path / "n.png").write_bytes(png_of(flat_map((0.5, 0.2, 0.8))))
+    lines = [f"v {x} {y} {z}" for x, y, z in file.vertices] + [f"vt {x} {y}" for x, y in file.vertices[:, :2]]
+    lines += ["f " + " ".join(f"{k + 1}/{k + 1}" for k in face) for face in file.faces]
+    (tmp_path / "a.obj").write_text("\n".join(["mtllib a.mtl", "usemtl m", *lines]))
+    (tmp_path / "a.mtl").write_text(f"newmtl m\n{statement}\nPr 0.25\n")
+    asset = make_asset(tmp_path / "a.obj")
+    notes = asset.provenance["report"]["notes"]
+    assert len(notes) == 1 and ("not understood" in notes[0] or "not found" in notes[0])
+    assert (asset.surfels.roughness == 0.25).all() and (asset.binding.normal == (0, 0, 1)).all()
+
+
+def png_of(image: Image) -> bytes:
+    buffer = io.BytesIO()
+    Pillow.fromarray((image.pixels * 255 + 0.5).astype(np.uint8)).save(buffer, "PNG")
+    return buffer.getvalue()
