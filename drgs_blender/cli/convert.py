@@ -6,6 +6,7 @@ The format read is found from the content, the format written from the name of t
 from __future__ import annotations
 
 import argparse
+import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,8 @@ from .pose_file import add_vertex_order, check_vertex_order, in_asset_order, is_
 from .progress import clock
 from .relight import finite, positive
 from .sampling import int_range
+
+logger = logging.getLogger(__name__)
 
 EXAMPLES = """examples:
   drgs convert capture.ply capture.spz
@@ -111,6 +114,8 @@ def convert_poses(args: argparse.Namespace) -> int:
         if getattr(args, option):
             name = {"kind": "as"}.get(option, option).replace("_", "-")
             raise UsageError(f"--{name}", "does not go with a point cache", "Leave it out")
+    if "#" in args.output.name:
+        raise UsageError(str(args.output), "has all frames, so its name has no number", "Leave out the #")
     check_writable(args.output, (args.input, args.vertices))
     with clock(args, "reading"):
         mesh = read_asset(args.input).mesh
@@ -119,10 +124,27 @@ def convert_poses(args: argparse.Namespace) -> int:
     if numbers != list(range(numbers[0], numbers[0] + len(numbers))):
         raise UsageError(f"--frames {args.frames}", "skips frames, which a point cache cannot", "Write it as 1-24")
     scale = np.float32(args.scale)
-    moving = (in_asset_order(args, mesh, pose()) * scale for _, pose in poses)
+    faulty: list[int] = []
+
+    def moved(number: int, vertices: np.ndarray) -> np.ndarray:
+        vertices = in_asset_order(args, mesh, vertices)
+        with np.errstate(over="ignore"):
+            vertices = vertices * scale
+        if not np.isfinite(vertices).all():
+            faulty.append(number)
+        return vertices
+
+    moving = (moved(number, pose()) for number, pose in poses)
     fps = read_point_cache(args.vertices).fps
     write_point_cache(args.output, moving, len(poses), len(mesh.vertices), numbers[0], fps)
-    print(f"{args.output}: {len(poses)} frames from {numbers[0]} on, {len(mesh.vertices)} vertices each")
+    # An MDD has times from its first frame on, and no numbers.
+    first = 1 if args.output.suffix.lower() == ".mdd" else numbers[0]
+    print(f"{args.output}: {len(poses)} frames from {first} on, {len(mesh.vertices)} vertices each")
+    if first != numbers[0]:
+        logger.warning("%s: MDD keeps no frame numbers; frame %d of %s is 1", args.output, numbers[0], args.vertices)
+    if faulty:
+        problem = "frames, the first %d, have vertices that are NaN or infinite; export them again"
+        logger.warning(f"%s: %d {problem}", args.vertices, len(faulty), faulty[0])
     return 0
 
 

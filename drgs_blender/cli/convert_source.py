@@ -97,6 +97,9 @@ class AssetSource:
         self._posed = args.vertices is not None
         if self._posed:
             self._vertices = in_asset_order(args, asset.mesh, read_vertices(args.vertices, args.frame))
+            if bad := int((~np.isfinite(self._vertices)).any(axis=1).sum()):
+                note = f"--vertices {args.vertices}: {bad} vertices are NaN or infinite; what hangs on them is left out"
+                self.notes = [*self.notes, note]
         held: dict[Held, bool] = {
             "mesh": len(asset.mesh.faces) > 0,
             "splats": len(asset.surfels) > 0,

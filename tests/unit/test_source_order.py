@@ -136,6 +136,10 @@ def test_the_file_keeps_where_vertices_come_from(tmp_path) -> None:
         ({"index": lambda a: a + 1000}, "refers to number"),
         ({"index": lambda a: a - 1000}, "refers to number"),
         ({"weights": lambda a: 2 * a}, "do not sum to 1"),
+        ({"weights": lambda a: np.tile(np.float32((-4, 5, 0)), (len(a), 1))}, "negative value -4"),
+        ({"transform": lambda a: 0 * a}, "flattens"),
+        ({"transform": lambda a: a @ np.diag([1, 1, 0])}, "flattens"),
+        ({"transform": lambda a: a + np.float32(np.inf)}, "NaN"),
         ({"weights": lambda a: a * np.float32(np.nan)}, "NaN"),
         ({"count": lambda a: a - 10}, "refers to number"),
         ({"count": lambda a: a - 1000}, "have the count"),
@@ -144,7 +148,7 @@ def test_the_file_keeps_where_vertices_come_from(tmp_path) -> None:
 def test_a_source_that_fits_no_mesh_is_refused(tmp_path, change, problem: str) -> None:
     asset = made(checkered())
     source = asset.mesh.source
-    values = {name: getattr(source, name) for name in ("index", "weights", "count")}
+    values = {name: getattr(source, name) for name in ("index", "weights", "count", "transform")}
     values |= {name: alter(values[name]) for name, alter in change.items()}
     with pytest.raises(AssetError, match=problem):
         asset.mesh.source = SourceVertices(**values)
@@ -287,9 +291,42 @@ def test_point_caches_of_the_source_are_written_in_the_order_of_the_asset(tmp_pa
         ([*meshes[:2], str(tmp_path / "one.glb"), *meshes[3:]], "Say which"),
         ([*command[:3], "--vertices", str(tmp_path / "pose.npy")], "is written of a point cache"),
         ([*command[:4], str(tmp_path / "none.pc2")], "does not exist"),
+        ([*command[:2], str(tmp_path / "own_##.pc2"), *command[3:]], "has no number"),
     ):
         assert main(bad) == EXIT_USAGE
         assert problem in capsys.readouterr().err
+
+
+def test_frame_numbers_that_an_mdd_cannot_keep_are_told(tmp_path, board, capsys) -> None:
+    _, walk = board
+    write_point_cache(tmp_path / "walk.pc2", iter(walk), 3, 16, 5, 25.0)
+    command = ["convert", str(tmp_path / "board.drgs"), str(tmp_path / "own.mdd")]
+    command += ["--vertices", str(tmp_path / "walk.pc2")]
+    assert main(command) == 0
+    assert read_point_cache(tmp_path / "own.mdd").first == 1
+    printed = capsys.readouterr()
+    assert "3 frames from 1 on" in printed.out and "MDD keeps no frame numbers; frame 5 of" in printed.err
+    assert main([*command[:2], str(tmp_path / "own.pc2"), *command[3:]]) == 0
+    assert "no frame numbers" not in capsys.readouterr().err
+
+
+def test_poses_that_are_not_finite_are_told(tmp_path, board, capsys) -> None:
+    """The rest of them is written: in a sequence one bad frame does not cost the others."""
+    asset, walk = board
+    walk[1, 3] = np.nan
+    write_point_cache(tmp_path / "walk.pc2", iter(walk), 3, 16, 1, 25.0)
+    command = ["convert", str(tmp_path / "board.drgs"), str(tmp_path / "own.pc2")]
+    command += ["--vertices", str(tmp_path / "walk.pc2")]
+    assert main(command) == 0
+    assert "walk.pc2: 1 frames, the first 2, have vertices that are NaN" in capsys.readouterr().err
+    np.testing.assert_array_equal(read_point_cache(tmp_path / "own.pc2").frames[2], asset.mesh.in_own_order(walk[2]))
+    told = []
+    for frame in ("1", "2"):
+        splats = [*command[:2], str(tmp_path / "own.ply"), *command[3:], "--frames", frame]
+        assert main(splats) == 0
+        printed = capsys.readouterr()
+        told.append("NaN or infinite; what hangs on them is left out" in printed.out + printed.err)
+    assert told == [False, True]
 
 
 @pytest.mark.parametrize(

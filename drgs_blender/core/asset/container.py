@@ -198,7 +198,7 @@ def check_asset(asset: Asset, subject: str, values: bool = True) -> None:
     """Raise AssetError where counts disagree or indices are out of range; with `values`, where numbers are not valid.
 
     Valid numbers are finite; materials and opacity are in [0, 1], scales and radiance not negative, quaternions and
-    binding normals of unit length, barycentric coordinates of sum 1.
+    binding normals of unit length, barycentric coordinates and source weights of sum 1, the latter not negative.
     """
     surfels, mesh, binding = asset.surfels, asset.mesh, asset.binding
     for name, extra in surfels.extras.items():
@@ -360,6 +360,10 @@ def _check_values(array: Array, name: str, where: str) -> None:
             wrong = "has rows that are not of unit length"
     elif name in ("barycentric", "weights") and np.abs(array.sum(axis=1) - 1).max() > TOLERANCE:
         wrong = "has rows that do not sum to 1"
+    elif name == "weights" and low < -TOLERANCE:
+        wrong = f"has the negative value {low:g}"
+    elif name == "transform" and np.linalg.matrix_rank(array / max(abs(low), abs(high), 1e-30)) < 3:
+        wrong = "flattens the vertices"
     if wrong:
         raise AssetError(where, wrong, "Import the source files again")
 
