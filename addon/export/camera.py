@@ -159,7 +159,8 @@ def _panorama(name: str, data: bpy.types.Camera, flat: Camera, shift_x: float) -
     if panorama == "equirectangular":
         across, along = lens.longitude_max - lens.longitude_min, lens.latitude_max - lens.latitude_min
         if not (across > 0 and along > 0):
-            raise UsageError(f'Camera "{name}"', "has longitudes or latitudes that end before they begin", "Swap them")
+            problem = "has longitudes or latitudes that end before they begin"
+            raise UsageError(f'Camera "{name}"', problem, "Make the maxima larger than the minima")
         fx, fy = flat.width / across, flat.height / along
         return fields | {"fx": fx, "fy": fy, "cx": -lens.longitude_min * fx - left, "cy": lens.latitude_max * fy + down}
     fields |= {"fov": lens.fisheye_fov, "cx": flat.width / 2 - left, "cy": flat.height / 2 + down}
