@@ -170,6 +170,9 @@ def _panorama(name: str, data: bpy.types.Camera, flat: Camera, shift_x: float) -
     per_mm, aspect = flat.fx / data.lens, flat.fx / flat.fy
     if panorama == "fisheye":
         angle = tuple(-getattr(lens, f"fisheye_polynomial_k{i}") for i in range(5))
+        if not (np.isfinite(angle).all() and any(angle[1:])):
+            problem = "has a Lens Polynomial that is no number, or the same everywhere"
+            raise UsageError(f'Camera "{name}"', problem, "Check its coefficients, K1 to K4 are not all 0")
         return fields | {"fx": per_mm, "fy": per_mm / aspect, "lens": angle}
     fx = per_mm * lens.fisheye_lens
     return fields | {"fx": fx, "fy": fx / aspect, "fov": min(lens.fisheye_fov, 2 * math.pi)}

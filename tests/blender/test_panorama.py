@@ -190,6 +190,14 @@ def test_limits_that_end_before_they_begin_are_refused(scene):
         part("addon.export.camera").export_camera(scene.camera, scene.render)
 
 
+@pytest.mark.parametrize("values", [(0.1, 0, 0, 0, 0), (0, math.nan, 0, 0, 0), (0, 1, math.inf, 0, 0)])
+def test_lens_polynomials_without_a_picture_are_refused(scene, values):
+    case = {f"fisheye_polynomial_k{i}": value for i, value in enumerate(values)}
+    aim(scene, {"panorama_type": "FISHEYE_LENS_POLYNOMIAL", **case})
+    with pytest.raises(part("drgs_blender.core.errors").UsageError, match=r'"Camera".*Lens Polynomial.*K1 to K4'):
+        part("addon.export.camera").export_camera(scene.camera, scene.render)
+
+
 def test_depth_of_field_of_a_panorama_is_told(scene, captured):
     aim(scene, {"panorama_type": "EQUIRECTANGULAR"})
     scene.camera.data.dof.use_dof = True
