@@ -127,6 +127,7 @@ class SceneCache:
         self._background: World | None = None
         self.lights = Lights([])
         self.captured: tuple[CapturedObject, ...] = ()
+        self._captured_faults: list[str] = []
         self._emitters = Emitters()
         self._deformer: Deformer | None = None
 
@@ -182,7 +183,8 @@ class SceneCache:
     def pose(self, frame: Frame, backend: RenderBackend = CPU) -> PosedSurfels:
         """Bring the trace scene up to date; return the surfels of all objects, posed where they will be needed."""
         seen, met = frame.settings.camera_sees == "surfels", frame.settings.rays_see == "surfels"
-        objects = []
+        objects: list[CachedObject] = []
+        faults: list[str] = []
         for index, state in enumerate(frame.objects):
             loaded = self._assets.get(state.asset)
             if loaded is None:
@@ -201,13 +203,13 @@ class SceneCache:
                 item = known
             else:
                 item = _begun(kept, loaded, mode)
-                item.faults += captured_faults(kept, loaded.asset, frame)
             if (seen or met) and item.posed is None:
                 given = item.state, index, loaded.surfels_of(item.state), item.traced
                 item.posed, item.hidden_count = posed_surfels(*given, self._poser(backend))
             if shown and item.captured is None and item.posed is not None:
                 item.captured = captured_object(item.state, loaded.asset, item.posed)
             objects.append(item)
+            faults += captured_faults(kept, loaded.asset, frame)
         meshes, images = reuse_equal(frame.meshes, self.meshes), reuse_equal(frame.images, self.images)
         same = len(objects) == len(self.objects) and all(a is b for a, b in zip(objects, self.objects))
         if not (self._current and same and meshes is self.meshes and images is self.images):
@@ -217,7 +219,7 @@ class SceneCache:
             others = [*meshes, *(item.glowing for item in glowing if item.glowing is not None)]
             self.scene.update([item.traced for item in objects], others, [*images, *glows.values()])
             self._current = True
-        self.objects, self.meshes, self.images = objects, meshes, images
+        self.objects, self.meshes, self.images, self._captured_faults = objects, meshes, images, faults
         used = {state.asset for state in frame.objects}
         for key, loaded in self._assets.items():
             if key not in used:
@@ -316,6 +318,7 @@ class SceneCache:
             )
         for item in self.objects:
             found += item.faults
+        found += self._captured_faults
         found += self.scene.mesh_materials.warnings
         found += self.lights.warnings
         bad = sum(light.bad_texels for light in (self.environment, self.background) if light is not None)

@@ -89,18 +89,24 @@ def test_it_is_seen_in_its_own_colour_under_any_light(captured_path, frame_of):
 
 
 def test_passes_add_up_beside_a_lit_object(captured_path, asset_path, frame_of):
-    passes = ("Combined", "DiffDir", "DiffInd", "GlossDir", "GlossInd", "Env", "Emit", "IndexOB", "CryptoObject00")
+    passes = ("Combined", "DiffDir", "DiffInd", "DiffCol", "GlossDir", "GlossInd", "GlossCol", "Env", "Emit")
+    passes += ("IndexOB", "CryptoObject00")
     frame = frame_of(captured_path, passes, size=(64, 48), samples=8)
     beside(frame, asset_path).pass_index = 3
     frame.objects[0].pass_index = 5
     picture = session_of(captured_path, asset_path).render(frame)
-    assert np.array_equal(picture["Combined"][..., :3], sum(picture[name] for name in passes[1:7]))
+    total = picture["Env"] + picture["Emit"]
+    for lobe in ("Diff", "Gloss"):
+        total = total + (picture[f"{lobe}Dir"] + picture[f"{lobe}Ind"]) * picture[f"{lobe}Col"]
+    np.testing.assert_allclose(picture["Combined"][..., :3], total, rtol=1e-5, atol=1e-6)
     index, light = picture["IndexOB"][..., 0], (picture["DiffDir"] + picture["GlossDir"]).sum(axis=2)
     assert set(np.unique(index)) == {0, 3, 5}
     matte, share = (picture["CryptoObject00"][..., k] for k in (0, 1))
     ball, lit = np.array([name_hash("Ball"), name_hash("Lit")], np.uint32).view(np.float32)
     whole = share > 0.999
     assert (matte[whole & (index == 5)] == ball).all() and (matte[whole & (index == 3)] == lit).all()
+    colour = (picture["DiffCol"] + picture["GlossCol"]).sum(axis=2)  # of what emits alone it is black
+    assert not colour[whole & (matte == ball)].any() and (colour[whole & (matte == lit)] > 0).all()
     assert not light[whole & (matte == ball)].any() and (light[whole & (matte == lit)] > 0).all()
 
 
@@ -270,6 +276,12 @@ def test_what_cannot_be_shown_is_named_and_no_longer(captured_path, frame_of):
     (warning,) = session.render(frame_of(captured_path, camera_sees="mesh")).warnings
     assert warning.startswith("Ball: ") and "Camera Sees is Mesh" in warning
     assert not session.render(frame_of(captured_path)).warnings
+    curved = frame_of(captured_path)
+    curved.camera.panorama, curved.camera.fx, curved.camera.fy = "fisheye", 20.0, 20.0
+    (warning,) = session.render(curved).warnings
+    assert "panoramic" in warning
+    (warning,) = session.render(frame_of(captured_path, camera_sees="mesh")).warnings  # of the same state
+    assert "Camera Sees is Mesh" in warning
     caught = frame_of(captured_path)
     caught.objects[0].visibility.shadow_catcher = True
     assert "shadow catcher" in session.render(caught).warnings[0]

@@ -4,7 +4,7 @@ They are those of Cycles. All but the material index, which is that of the neare
 samples premultiplied by coverage: in a pixel half covered, UV is half of what the surface has, with a third channel
 that says so, and Mist is 1 where nothing is. Diffuse and glossy colour are the directional albedos of the lobes,
 for a viewer as flat to the surface as the camera: colour passes, by which light passes are divided
-(`core.passes.COLOURS`).
+(`core.passes.COLOURS`); those of objects that are shown as captured, which emit alone, are 0.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..gbuffer.gbuffer import GBuffer
 from ..integrator import brdf
 from ..sampling import ONE, ZERO, F
 from ..scene.trace_scene import TraceScene
-from ..shading_points import CATCHER
+from ..shading_points import CATCHER, UNLIT
 
 Array = np.ndarray
 
@@ -81,6 +81,9 @@ class SurfaceFilm:
         model = brdf.SHADING_DATABLOCKS[self._frame.settings.shading_model]
         tables = brdf.layer_table(), brdf.schlick_table()
         over_range(_lobe_colours, len(points), points.arrays, model, tables, diffuse, glossy, fewest=ELEMENTS)
+        unlit = points.flags & UNLIT != 0  # they emit alone
+        if unlit.any():
+            diffuse[unlit] = glossy[unlit] = 0.0
         return diffuse, glossy
 
     def _places(self, buffer: GBuffer, uvs: Array) -> Array:
