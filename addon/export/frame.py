@@ -18,6 +18,7 @@ from .camera import export_camera, picture_of
 from .export_cache import ExportCache, uid
 from .images import end_export
 from .instances import UNRENDERED, Unrendered, Visible, uncancelled, visible
+from .light_links import LightLinks
 from .lights import export_light
 from .materials import Materials
 from .meshes import Meshes
@@ -79,17 +80,19 @@ def export_frame(
     materials, unrendered, lights = Materials(warn, layer.material_override), Unrendered(), []
     cache = ExportCache() if cache is None else cache
     passes = passes or tuple(p.name for p in enabled(scene, depsgraph.view_layer))
-    objects = DrgsObjects(depsgraph, key_of, warn, cache)
-    meshes = Meshes(depsgraph, materials, warn, cache, wanted, with_uv_map="UV" in passes)
+    objects, links = DrgsObjects(depsgraph, key_of, warn, cache), LightLinks(depsgraph, warn)
+    meshes = Meshes(depsgraph, materials, warn, cache, links, wanted, with_uv_map="UV" in passes)
     others = Limited(depsgraph.view_layer.drgs, f'View layer "{depsgraph.view_layer.name}"', warn).others
     for item in uncancelled(visible(depsgraph), cancelled):
         if is_visible is not None and not is_visible(item.object):
             continue
+        item = links.marked(item)
         if others != "SEEN" and not assets.is_drgs(item.object):
             item = _unseen(item, others)
         if item.object.type == "LIGHT":
             light = export_light(item, warn)
             if light is not None:
+                light = replace(light, **links.numbers_of(item))
                 lights.append(light if others == "SEEN" else replace(light, camera=False))
         elif item.object.type in UNRENDERED:
             unrendered.add(item.object)

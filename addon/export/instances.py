@@ -25,12 +25,18 @@ Key = tuple[int, int, tuple[int, ...]]
 
 @dataclass(frozen=True, slots=True)
 class Visible:
-    """One visible instance: an evaluated object, where it stands and which rays meet it."""
+    """One visible instance: an evaluated object, where it stands and which rays meet it.
+
+    Attributes
+    ----------
+    parent : the original object that makes the instance; None for an object itself
+    """
 
     key: Key
     object: bpy.types.Object
     matrix_world: np.ndarray
     visibility: Visibility
+    parent: bpy.types.Object | None = None
 
 
 def visible(depsgraph: bpy.types.Depsgraph) -> Iterator[Visible]:
@@ -52,7 +58,8 @@ def visible(depsgraph: bpy.types.Depsgraph) -> Iterator[Visible]:
         visibility = known[key]
         if visibility is not None:
             number = tuple(instance.persistent_id) if parent else ()
-            yield Visible((*key, number), obj, np.array(instance.matrix_world, np.float64, order="C"), visibility)
+            matrix = np.array(instance.matrix_world, np.float64, order="C")
+            yield Visible((*key, number), obj, matrix, visibility, parent.original if parent else None)
 
 
 def uncancelled(items: Iterable[T], cancelled: Callable[[], bool] | None) -> Iterator[T]:

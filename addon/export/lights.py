@@ -24,9 +24,6 @@ def export_light(item: Visible, warn: Warn) -> Light | None:
     if light.type == "AREA" and getattr(getattr(light, "cycles", None), "is_portal", False):
         return None
     name = f'Light "{obj.name}"'
-    linking = obj.light_linking
-    if linking.receiver_collection or linking.blocker_collection:
-        warn(f"{name}: light linking is not rendered; it lights everything")
     if light.use_custom_distance:
         warn(f"{name}: a custom distance is not rendered; its light goes on")
     colour = np.array(light.color, np.float64)

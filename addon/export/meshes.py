@@ -14,6 +14,7 @@ from .. import mesh_arrays
 from ..bakes.requests import Wanted
 from .export_cache import ExportCache, uid
 from .instances import Key, Visible
+from .light_links import LightLinks
 from .materials import DEFAULT_MATERIAL, ExportedMaterial, Materials
 from .surface_bake import SurfaceBakes
 
@@ -64,10 +65,11 @@ class Meshes:
         materials: Materials,
         warn: Warn,
         cache: ExportCache,
+        links: LightLinks,
         wanted: Wanted | None = None,
         with_uv_map: bool = False,
     ) -> None:
-        self._with_uv_map = with_uv_map
+        self._links, self._with_uv_map = links, with_uv_map
         self._depsgraph, self._materials, self._warn, self._cache = depsgraph, materials, warn, cache
         self._wanted = wanted
         self._shapes: dict[tuple[object, ...], _Shape] = {}
@@ -75,12 +77,13 @@ class Meshes:
     def add(self, item: Visible) -> None:
         """Take in a visible instance of a mesh."""
         obj, rays = item.object, item.visibility
-        slots = self._materials.slots(obj)
+        slots, sent = self._materials.slots(obj), self._links.numbers_of(item)
         key = (
             obj.data.as_pointer(),
             *(m.as_pointer() if m else 0 for m in slots),
             *(getattr(rays, name) for name in rays.__slots__),
             self._with_uv_map,
+            *sent.values(),
         )
         shape = self._shapes.get(key)
         if shape is None:
@@ -168,6 +171,7 @@ class Meshes:
             materials=[material.material or DEFAULT_MATERIAL for material in exported],
             visibility=item.visibility,
             layers=self._layers(item.object.name, mesh, (corners, polygons, arrays.corner_vertices), exported),
+            **self._links.numbers_of(item),
         )
 
     def _layers(

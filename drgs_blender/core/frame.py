@@ -77,6 +77,10 @@ class Visibility:
 
     ``diffuse`` and ``glossy`` are indirect rays from a diffuse or glossy scattering, ``shadow`` rays towards lights. A
     ``holdout`` cuts a hole into the picture; of a ``shadow_catcher`` only the shadows on it are seen.
+
+    Light linking: bit i of ``lit_by`` says that a light whose ``receivers`` are i shines on the object, bit i of
+    ``blocks`` that the object throws the shadow of a light whose ``blockers`` are i. A light whose numbers are -1
+    shines on everything, and everything throws its shadow.
     """
 
     camera: bool = True
@@ -85,6 +89,8 @@ class Visibility:
     shadow: bool = True
     holdout: bool = False
     shadow_catcher: bool = False
+    lit_by: int = 0
+    blocks: int = 0
 
 
 @dataclass(slots=True)
@@ -328,6 +334,8 @@ class MeshState:
         Of all its instances.
     uv_map : (m, 3, 2) float32 array, optional
         What the pass UV shows, one per face corner; None: 0.
+    receivers, blockers : int
+        Light linking of what it emits, see `Visibility`.
     """
 
     name: str
@@ -342,6 +350,8 @@ class MeshState:
     visibility: Visibility = field(default_factory=Visibility)
     layers: list[Layer] = field(default_factory=list)
     uv_map: Array | None = None
+    receivers: int = -1
+    blockers: int = -1
 
 
 @dataclass(slots=True)
@@ -380,6 +390,8 @@ class Light:
         Whether such rays see the light.
     cast_shadow : bool
         Whether objects between light and surface block it.
+    receivers, blockers : int
+        Light linking: on what it shines, and what throws its shadow, see `Visibility`.
     """
 
     name: str
@@ -401,6 +413,8 @@ class Light:
     diffuse: bool = True
     glossy: bool = True
     cast_shadow: bool = True
+    receivers: int = -1
+    blockers: int = -1
 
 
 @dataclass(slots=True)

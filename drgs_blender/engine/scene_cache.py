@@ -22,6 +22,7 @@ from ..render.backend import CPU, RenderBackend
 from ..render.camera import camera_parameters
 from ..render.film.motion_vectors import SceneState
 from ..render.lights.environment import EnvironmentLight
+from ..render.lights.light_links import link
 from ..render.lights.light_sampler import Lights
 from ..render.lights.mesh_lights import Emitters
 from ..render.scene.ray_masks import group_mask
@@ -356,7 +357,9 @@ class SceneCache:
         boxes = [self.scene.bvh.bounds()] if len(self.scene.faces) or self.tree is None else []
         boxes += [self.tree.bounds()] if self.tree is not None else []
         low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
-        self.lights = Lights(lights, 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)), self._emitters)
+        sphere = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+        self.lights = Lights(lights, *sphere, self._emitters)
+        link(self.lights, lights, [*(item.state for item in self.objects), *self.meshes], self.scene, sphere)
         return self.lights
 
 

@@ -285,7 +285,8 @@ class Session:
 
     def _warnings(self, settings: RenderSettings) -> list[str]:
         trouble = cache_folder().trouble
-        return self._scene_cache.warnings() + self._backends.warnings(settings) + ([trouble] if trouble else [])
+        linked = self._scene_cache.lights.linked is not None
+        return self._scene_cache.warnings() + self._backends.warnings(settings, linked) + ([trouble] if trouble else [])
 
     def _statistics(self, frame: Frame, prepared: PreparedScene, timer: _StageTimer) -> dict[str, float]:
         return timer.seconds | {

@@ -32,7 +32,7 @@ from .gbuffer.visible_lights import visible_lights
 from .integrator.adaptive import part_count, sample_adaptively
 from .integrator.variance import variances
 from .prepared_scene import PreparedScene
-from .shading_points import UNLIT, Radiance, ShadingPoints
+from .shading_points import RECEIVER, UNLIT, Radiance, ShadingPoints
 from .surfels import captured
 from .surfels.raster import SurfelSamples
 from .surfels.splats import Splats
@@ -180,6 +180,8 @@ class VisibleSurfaces:
 
     def __init__(self, prepared: PreparedScene, frame: Frame, parameters: Array, backend: RenderBackend = CPU) -> None:
         self._scene, self._camera, self._parameters = prepared.scene, frame.camera, parameters
+        linked = None if prepared.lights is None else prepared.lights.linked
+        self._receiver: Array | None = None if linked is None else linked.receiver
         self._tree, self._objects, self._backend = prepared.surfel_bvh, len(frame.objects), backend
         self._splats: Splats | SurfelRays | None = None
         self._captured: captured.CapturedSplats | None = None
@@ -198,6 +200,13 @@ class VisibleSurfaces:
 
     def rows(self, y0: int, y1: int) -> GBuffer:
         """The samples of the rows ``y0 .. y1`` of the full picture."""
+        buffer = self._rows(y0, y1)
+        if self._receiver is not None:
+            sets = self._receiver[self._scene.source[buffer.object_index]]
+            buffer.points.flags |= (sets << RECEIVER).astype(np.uint8)
+        return buffer
+
+    def _rows(self, y0: int, y1: int) -> GBuffer:
         backend = self._backend
         if self._splats is None:
             buffer = primary_mesh(self._scene, self._camera, self._parameters, y0, y1, backend.trace, backend.shade)

@@ -17,6 +17,7 @@ from drgs_blender.core.frame import (
     Light,
     Material,
     MeshState,
+    ObjectState,
     RenderSettings,
     SurfaceDetail,
     Texture,
@@ -28,6 +29,7 @@ from drgs_blender.render.gpu.select_backend import Backends
 from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
+from drgs_blender.render.lights.light_links import link
 from drgs_blender.render.lights.light_sampler import Lights
 from drgs_blender.render.lights.mesh_lights import Emitters
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
@@ -311,6 +313,24 @@ def test_surfels_as_tracer_are_left_to_the_processor(device: WarpRenderBackend) 
     devices._known["cuda"] = device
     (warning,) = devices.warnings(replace(SETTINGS, device="cuda", rays_see="surfels"))
     assert "Rays See: Surfels" in warning
+
+
+def test_linked_lights_are_left_to_the_processor(device: WarpRenderBackend) -> None:
+    scene, light, _, points = under_lights()
+    place = np.eye(4)
+    place[2, 3] = 3.0
+    lamp = Light("lamp", "point", place, power=100.0, radius=0.3, receivers=0)
+    sphere, shapes = (np.zeros(3), 1.0), [ObjectState(str(i), "key") for i in range(len(scene.faults))]
+    shining = Lights([lamp], *sphere)
+    link(shining, [lamp], shapes, scene, sphere)
+    expected = integrate(scene, light, points, SETTINGS, 3, shining)
+    assert np.array_equal(device.integrate(scene, light, points, SETTINGS, 3, shining).components, expected.components)
+    everywhere = integrate(scene, light, points, SETTINGS, 3, Lights([lamp]))
+    assert not np.array_equal(expected.components, everywhere.components)
+    devices = Backends()
+    devices._known["cuda"] = device
+    (warning,) = devices.warnings(replace(SETTINGS, device="cuda"), linked=True)
+    assert "Light linking" in warning
 
 
 def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,8 +35,8 @@ class Backends:
                 self._missing[device] = str(error)
         return self._known.get(device, CPU)
 
-    def warnings(self, settings: RenderSettings) -> list[str]:
-        """Warnings: which requested device was not used, and why."""
+    def warnings(self, settings: RenderSettings, linked: bool = False) -> list[str]:
+        """Warnings: which requested device was not used, and why; whether lights are `linked` (`light_links`)."""
         device = settings.device
         backend = self._found(device)
         why = self._missing.get(device) or backend.failed
@@ -44,6 +44,8 @@ class Backends:
             return [f"{why} Rendered on the CPU"]
         if backend is not CPU and settings.rays_see == "surfels":
             return ["Rays See: Surfels is not supported on a graphics card; rendered on the CPU"]
+        if backend is not CPU and linked:
+            return ["Light linking is not supported on a graphics card; light is traced on the CPU"]
         return []
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...compute.jit import njit
 from ..lights.environment import envmap_radiance
+from ..lights.light_links import emits_to, lights_of
 from ..lights.light_sampler import emission_along, lights_along
 from ..lights.light_shapes import DIFFUSE, GLOSSY
 from ..sampling import ONE, ZERO, F, luminance
@@ -98,9 +99,9 @@ def _see_lights(rays, slot, reach, hit, taking_part, scene, sums):  # type: igno
     `taking_part` says (1 or 0) whether cosine and GGX sampling do, as in `mis.balance_heuristic`.
     """
     s = rays.floats
-    lights = scene.lights
     cosine, ggx = taking_part
     i, _ = w.at(slot)
+    lights = lights_of(scene.lights, s[i + w.POINT_SET])
     position, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
     others, share = cosine * s[i + w.WC] * s[i + w.PC] + ggx * s[i + w.WG] * s[i + w.PG], s[i + w.WL]
     if not others > ZERO:
@@ -109,7 +110,7 @@ def _see_lights(rays, slot, reach, hit, taking_part, scene, sums):  # type: igno
     gr, gg, gb = dr, dg, db
     if scene.traits.lights_differ:
         gr, gg, gb = lights_along(position, direction, reach, others, share, GLOSSY, lights)
-    if scene.traits.emissive:
+    if scene.traits.emissive and emits_to(scene.lights, s[i + w.POINT_SET], hit, scene.geometry):
         r, g, b, density, glossy = emission_along(position, direction, hit, scene.geometry, lights)
         weight, glossy = ONE / (others + share * density), ONE / (others + share * glossy)
         dr, dg, db = dr + weight * r, dg + weight * g, db + weight * b
@@ -122,7 +123,7 @@ def _see_lights(rays, slot, reach, hit, taking_part, scene, sums):  # type: igno
 def _trace_lights(rays, count, scene, settings, sums):  # type: ignore[no-untyped-def]
     """Light samples: draw, trace, add."""
     s = rays.floats
-    w.light_directions(rays, count, scene.lights)
+    w.light_directions(rays, count, scene.lights, w.POINT_SET)
     w.evaluate(rays, count, settings.shading_model)
     if scene.traits.detailed:
         w.soften(rays, count)
@@ -132,7 +133,8 @@ def _trace_lights(rays, count, scene, settings, sums):  # type: ignore[no-untype
         others, glossy_others = s[i + w.WC] * s[i + w.PC], s[i + w.WG] * s[i + w.PG]
         if not scene.traits.lobes_apart:
             others = glossy_others = others + glossy_others
-        dr, dg, db, gr, gg, gb = light_radiance(rays, slot, others, glossy_others, s[i + w.WL], scene, mask)
+        receiver = s[i + w.POINT_SET]
+        dr, dg, db, gr, gg, gb = light_radiance(rays, slot, others, glossy_others, s[i + w.WL], receiver, scene, mask)
         if dr + dg + db + gr + gg + gb > ZERO:
             _reflect(sums, rays, slot, 0, (dr, dg, db), (gr, gg, gb))
 

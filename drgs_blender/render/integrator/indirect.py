@@ -13,6 +13,7 @@ import numpy as np
 
 from ...compute.jit import njit
 from ..lights.environment import envmap_pdf, envmap_radiance, map_at
+from ..lights.light_links import emits_to, lights_of, set_of
 from ..lights.light_sampler import emission_along, lights_along
 from ..lights.light_shapes import DIFFUSE, GLOSSY
 from ..lights.product_sampling import product_row
@@ -76,6 +77,7 @@ def _surfaces(rays, count, scene, settings):  # type: ignore[no-untyped-def]
         ints[c + w.ROW] = U(product_row(nx, ny, nz, envmap))
         s[a + w.OX], s[a + w.OY], s[a + w.OZ] = lifted(s[a + w.OX], s[a + w.OY], s[a + w.OZ], gx, gy, gz, extent)
         s[a + w.AR], s[a + w.AG], s[a + w.AB] = r, g, b
+        s[a + w.PATH_SET] = set_of(scene.lights, np.int32(ints[c + w.N0]), np.int32(ints[c + w.OWN]), geometry)
         s[a + w.METALLIC], s[a + w.A2] = metallic, brdf.alpha_squared(roughness)
         s[a + w.KD] = brdf.diffuse_weight(roughness, metallic, mx * vx + my * vy + mz * vz, shading_model, layers)
 
@@ -115,7 +117,7 @@ def _towards_lights(rays, count, scene, shift, found):  # type: ignore[no-untype
         i, c = w.at(slot)
         others = s[i + w.SHARE] * s[i + w.PC] + (ONE - s[i + w.SHARE]) * s[i + w.PG]
         dr, dg, db, gr, gg, gb = light_radiance(
-            rays, slot, others, others, ONE, scene, np.int32(ray_masks.SHADOW << shift)
+            rays, slot, others, others, ONE, s[i + w.PATH_SET], scene, np.int32(ray_masks.SHADOW << shift)
         )
         if dr + dg + db + gr + gg + gb > ZERO:
             owner = np.int64(ints[c + w.OWNER])
@@ -128,7 +130,7 @@ def _towards_lights(rays, count, scene, shift, found):  # type: ignore[no-untype
 def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no-untyped-def]
     """The BRDF samples; return how many paths go on, in slots 0, 1, ..."""
     s, ints = rays
-    tracer, envmap, lights = scene.tracer, scene.envmap, scene.lights
+    tracer, envmap = scene.tracer, scene.envmap
     any_lights, emissive = scene.traits.lights, scene.traits.emissive
     going = 0
     for slot in range(count):
@@ -146,13 +148,14 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
             through, reach, hit = meet(scene, rays, slot, mask)
         owner = np.int64(ints[c + w.OWNER])
         fr, fg, fb = s[i + w.QR], s[i + w.QG], s[i + w.QB]
+        lights = lights_of(scene.lights, s[i + w.PATH_SET])
         if any_lights:
             seen_by = DIFFUSE if diffuse else GLOSSY
             red, green, blue = lights_along(position, direction, reach, s[i + w.PG], ONE, seen_by, lights)
             found[owner, INDIRECT] += fr * red
             found[owner, INDIRECT + 1] += fg * green
             found[owner, INDIRECT + 2] += fb * blue
-        if emissive:
+        if emissive and emits_to(scene.lights, s[i + w.PATH_SET], hit, scene.geometry):
             red, green, blue, own, glossy = emission_along(position, direction, hit, scene.geometry, lights)
             weight = ONE / (s[i + w.PG] + (own if diffuse else glossy))
             found[owner, INDIRECT] += fr * red * weight
@@ -215,7 +218,7 @@ def trace_paths(rays, count, scene, settings, found):  # type: ignore[no-untyped
             _towards_envmap(rays, count, scene, shift, found)
         if scene.traits.lights:
             w.fresh_numbers(rays, count, U(0x2C1B3C6D))
-            w.light_directions(rays, count, lights)
+            w.light_directions(rays, count, lights, w.PATH_SET)
             _evaluate(rays, count, scene, shading_model)
             _towards_lights(rays, count, scene, shift, found)
         w.fresh_numbers(rays, count, U(0x7FEB352D))

@@ -22,7 +22,7 @@ from ..lights.light_sampler import Lights
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
 from ..scene.trace_scene import TraceScene
-from ..shading_points import CATCHER, SECOND, PointArrays, Radiance, ShadingPoints
+from ..shading_points import CATCHER, RECEIVER, SECOND, PointArrays, Radiance, ShadingPoints
 from ..surfels.surfel_bvh import SurfelBVH
 from ..surfels.surfel_tracer import tracer_of
 from . import brdf
@@ -50,7 +50,7 @@ class ShadingKernel:
 
     def tables(self, scene: TraceScene, environment: EnvironmentLight, lights: Lights) -> tuple[Any, Any, Any, Any]:
         """(tracer, geometry, environment, lights) as `shade` takes them; until the scene's next update."""
-        return meshes_alone(scene.tracer), scene.geometry, environment.envmap, lights.tables
+        return meshes_alone(scene.tracer), scene.geometry, environment.envmap, lights.linked or lights.tables
 
     def shade(
         self, points: PointArrays, scene: Scene, settings: Settings, sampler: Sampler, out: tuple[Array, Array]
@@ -258,7 +258,8 @@ def shade_points(thread, stride, scratch, points, scene, settings, sampler, out)
                         count = np.int64(0)
                     total[h] += 1
                     put_sample(scene, rays, count, points, i, state, h, rate)
-                    _, c = w.at(count)
+                    a, c = w.at(count)
+                    rays.floats[a + w.POINT_SET] = F(points.flags[i] >> RECEIVER)
                     ints[c + w.KEY] = mix(U(key ^ U(U(j + 1) * U(0x85EBCA6B))))
                     ints[c + w.CELL], ints[c + w.ROW] = key, scratch.row[h]
                     sequence = sampler.sequence

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compute.jit import njit
+from ..lights.light_links import blockers_of, lights_of
 from ..lights.light_sampler import light_flags
 from ..lights.light_shapes import DIFFUSE, GLOSSY
 from ..lights.light_shapes import SHADOW as SHADOWED
@@ -407,7 +408,7 @@ def put_start(tracer, rays, slot, points, point):  # type: ignore[no-untyped-def
 
 
 @njit
-def light_radiance(rays, slot, others, glossy_others, share, scene, mask):  # type: ignore[no-untyped-def]
+def light_radiance(rays, slot, others, glossy_others, share, receiver, scene, mask):  # type: ignore[no-untyped-def]
     """Radiance of a light sample times visibility and MIS weight over pdf, for the diffuse and the glossy lobe.
 
     Parameters
@@ -419,6 +420,8 @@ def light_radiance(rays, slot, others, glossy_others, share, scene, mask):  # ty
         Sum over the other strategies of count times pdf (sr^-1), for the diffuse and the glossy lobe.
     share : float32
         Number of light samples.
+    receiver : float32
+        Set of the surface, see `light_links`.
     scene : Scene
     mask : int32
         Of the shadow ray, see `ray_masks`.
@@ -434,15 +437,18 @@ def light_radiance(rays, slot, others, glossy_others, share, scene, mask):  # ty
     r, g, b = s[i + w.ER], s[i + w.EG], s[i + w.EB]
     if not (s[i + w.LIVE] > ZERO and r + g + b > ZERO and density != ZERO):
         return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    flags = light_flags(np.int64(ints[c + w.CELL]), scene.lights)
+    light = np.int64(ints[c + w.CELL])
+    flags = light_flags(light, lights_of(scene.lights, receiver))
     if flags & ABSENT and mask >> ray_masks.WITHOUT:
         return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    bright = ONE
-    if flags & SHADOWED:
+    bright, own = ONE, blockers_of(scene.lights, receiver, light)
+    if mask >> ray_masks.WITHOUT == 0 and own != 0:
+        mask = own
+    if flags & SHADOWED or own != 0:
         bright = passed(scene, rays, slot, s[i + w.MU] * F(0.9999), mask)
         if not bright > ZERO:
             return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    if density < ZERO:
+    if density < ZERO or own != 0:
         others = glossy_others = ZERO
     density = share * abs(density)
     diffuse = bright / (others + density) if flags & DIFFUSE else ZERO

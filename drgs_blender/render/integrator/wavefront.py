@@ -16,6 +16,7 @@ import numpy as np
 from ...compute.jit import inlined, njit
 from .. import sampling
 from ..lights.environment import cell_at, cell_end, direction_in_cell, envmap_pdf, envmap_touch, first_cell, map_at
+from ..lights.light_links import lights_of
 from ..lights.light_sampler import sample_light
 from ..lights.product_sampling import block_of, in_cells_order
 from ..sampling import INVERSE_PI, ONE, TWO, ZERO, F, U, luminance, mix, scrambled, unit
@@ -41,6 +42,9 @@ WC, WG, WE, WL, SIZE = (LANES * i for i in range(43, 48))
 # where there are normal or bump maps: the shading normal without them, 0 where it is N
 UX, UY, UZ = (LANES * i for i in range(48, 51))
 PACKET_FLOATS = 51 * LANES
+PACKET_FLOATS = 48 * LANES
+#: Where lights are linked, the set of the surface: of a point's samples, which have no throughput, and of paths.
+POINT_SET, PATH_SET = TR, WL
 # uint32 fields: three random numbers, the key of more, the owner (a point, or a path), a place in a table, the row of
 # the normal in the light's tables, the object of the surfels that the ray starts on (or -1)
 N0, N1, N2, KEY, OWNER, CELL, ROW, OWN = (LANES * i for i in range(8))
@@ -52,7 +56,7 @@ IN_LANES = (
     "AR", "AG", "AB", "METALLIC", "A2", "KD",
     "LX", "LY", "LZ", "LIVE", "QR", "QG", "QB", "SR", "SG", "SB", "PC", "PG",
     "MU", "MV", "PE", "TR", "TG", "TB", "SHARE", "ER", "EG", "EB", "WC", "WG", "WE", "WL", "SIZE",
-    "UX", "UY", "UZ",
+    "UX", "UY", "UZ", "POINT_SET", "PATH_SET",
     "N0", "N1", "N2", "KEY", "OWNER", "CELL", "ROW", "OWN",
 )  # fmt: skip
 
@@ -282,7 +286,7 @@ def environment_directions(rays, count, envmap):  # type: ignore[no-untyped-def]
 
 
 @njit
-def light_directions(rays, count, lights):  # type: ignore[no-untyped-def]
+def light_directions(rays, count, lights, receiver):  # type: ignore[no-untyped-def]
     """Light sampling: directions towards lights and emitting triangles, see ``sample_light``.
 
     Parameters
@@ -293,13 +297,16 @@ def light_directions(rays, count, lights):  # type: ignore[no-untyped-def]
         light), CELL (the light, for `light_flags`).
     count : int64
         Slots.
-    lights : LightTables
+    lights : LightTables or LinkedTables
+    receiver : int64
+        Field that has the set of the surface, see `light_links`.
     """
     s, ints = rays
     for slot in range(count):
         i, c = at(slot)
+        own = lights_of(lights, s[i + receiver])
         lx, ly, lz, distance, r, g, b, density, light = sample_light(
-            ints[c + N2], ints[c + N0], ints[c + N1], s[i + OX], s[i + OY], s[i + OZ], lights
+            ints[c + N2], ints[c + N0], ints[c + N1], s[i + OX], s[i + OY], s[i + OZ], own
         )
         s[i + LX], s[i + LY], s[i + LZ], s[i + MU], s[i + MV] = lx, ly, lz, distance, density
         s[i + ER], s[i + EG], s[i + EB] = r, g, b

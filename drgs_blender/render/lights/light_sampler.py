@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -103,6 +103,10 @@ class Lights:
         Whether the camera sees a light.
     warnings : list of str
         Lights that are left out, and why.
+    linked : LinkedTables, optional
+        What each set of objects gets, where lights are linked (`light_links`); then kernels take it for ``tables``.
+    parts : list of Lights
+        Those of the sets, which keep its memory.
     """
 
     def __init__(
@@ -113,6 +117,8 @@ class Lights:
         emitters: Emitters | None = None,
     ) -> None:
         self.emitters = emitters or _NO_EMITTERS
+        self.linked: Any = None
+        self.parts: list[Lights] = []
         rows: list[Array] = []
         kept: list[int] = []
         self.warnings: list[str] = []

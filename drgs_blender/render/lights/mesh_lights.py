@@ -81,6 +81,8 @@ class Emitters:
         None: there are none.
     previous : Emitters, optional
         Of the frame before; what has not changed is taken over.
+    receivers : int, optional
+        Only meshes that shine on objects with these bits of ``Visibility.lit_by``; None: all.
 
     Attributes
     ----------
@@ -91,9 +93,13 @@ class Emitters:
     warnings : list of str
     """
 
-    def __init__(self, scene: TraceScene | None = None, previous: Emitters | None = None) -> None:
+    def __init__(
+        self, scene: TraceScene | None = None, previous: Emitters | None = None, receivers: int | None = None
+    ) -> None:
         self._scene = scene
         meshes = scene.emissive_meshes if scene is not None else []
+        if receivers is not None:
+            meshes = [m for m in meshes if m.mesh.receivers < 0 or receivers >> m.mesh.receivers & 1]
         self._known: list[Any] = [scene and scene.mesh_materials.table]
         for emitter in meshes:
             self._known += [
@@ -385,6 +391,25 @@ def emitter_bits(i, emitters):  # type: ignore[no-untyped-def]
     int64
     """
     return np.int64(load_float(_tables(emitters).tree.rows, WIDTH * i + BITS))
+
+
+@njit
+def emitter_source(i, emitters):  # type: ignore[no-untyped-def]
+    """Source of an emitting triangle: DR-GS objects and meshes are numbered in the order of the frame.
+
+    Parameters
+    ----------
+    i : int64
+        Row.
+    emitters : int64
+        Address, see `LightTables`.
+
+    Returns
+    -------
+    int32
+    """
+    tables = _tables(emitters)
+    return load_int32(tables.geometry.face_object, np.int64(load_int32(tables.faces, i)))
 
 
 @njit

@@ -15,6 +15,9 @@ WITHOUT = 8
 
 #: ``mask << CLEAR``: meshes that light may pass, in place of the bits of others.
 CLEAR = 16
+#: Bits of shadow linkings: rays towards their lights meet what throws their shadows. Neither the others nor ``CLEAR`` use
+#: them, or the same bits beyond it.
+LINKED = (6, 7, 8, 12, 13, 14)
 
 #: Bits of ``TraceScene.object_flags``.
 HOLDOUT, CATCHER = 1, 2
@@ -28,12 +31,19 @@ def group_mask(visibility: Visibility, surfels: bool, seen_only: bool = False, c
     v = visibility
     kinds = DIFFUSE * v.diffuse | GLOSSY * v.glossy | SHADOW * v.shadow
     mask = CAMERA * v.camera | kinds
+    if v.shadow:
+        mask |= sum((v.blocks >> number & 1) << bit for number, bit in enumerate(LINKED))
     if v.shadow_catcher:
         mask |= kinds << WITHOUT
     if surfels:
         return (mask & CAMERA if seen_only else mask) | SURFELS
     mask |= ORDINARY * v.camera
     return mask << CLEAR if clear else mask
+
+
+def blocker_mask(blockers: int) -> int:
+    """Mask of the shadow rays of a light with this shadow linking; 0 without."""
+    return 1 << LINKED[blockers] if 0 <= blockers < len(LINKED) else 0
 
 
 def object_flags(visibility: Visibility) -> int:
