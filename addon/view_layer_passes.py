@@ -37,7 +37,9 @@ _NOT_RENDERED = {
 def not_rendered(view_layer: bpy.types.ViewLayer) -> list[str]:
     """Names of passes that are switched on in a view layer, for other engines, and that DR-GS does not make."""
     owners = [view_layer, *filter(None, (getattr(view_layer, name, None) for name in ("cycles", "eevee")))]
-    return [text for name, text in _NOT_RENDERED.items() if any(getattr(owner, name, False) for owner in owners)]
+    found = [text for name, text in _NOT_RENDERED.items() if any(getattr(owner, name, False) for owner in owners)]
+    found += [f'Shader AOV "{aov.name}"' for aov in view_layer.aovs]
+    return found + [f'Light Group "{group.name}"' for group in view_layer.lightgroups]
 
 
 def label(render_pass: Pass) -> str:

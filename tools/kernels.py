@@ -51,6 +51,9 @@ def commands(folder: Path) -> Iterator[tuple[str, list[object]]]:
     yield "motion", [*own, "motion", folder]
     yield "viewport", [*own, "viewport", folder]
     yield "captured", [*drgs, "relight", folder / "playbot.drgs", "--captured", *relight[relight.index("--camera") :]]
+    yield "surface passes", [*own, "surface passes", folder]
+    yield "panorama", [*own, "panorama", folder]
+    yield "linked lights", [*own, "linked lights", folder]
     yield "surfel rays", [*relight, "--rays-see", "surfels"]
     for solver in ("mpm", "xpbd", "rigid"):
         yield "simulate", [*drgs, "simulate", asset, "--solver", solver, "--resolution", "12", "--frames", "3",
@@ -139,6 +142,15 @@ def engine(folder: Path, what: str) -> None:
         elif what == "motion":
             step = MotionStep(camera, [Pose("cow", matrix[None].copy(), body.vertices)])
             client.render(replace(frame, previous=step, next=step, passes=("Combined", "Vector")))
+        elif what == "surface passes":
+            names = ("DiffDir", "GlossDir", "Mist", "UV", "IndexMA")
+            client.render(replace(frame, passes=names))
+        elif what == "panorama":
+            around = replace(camera, panorama="fisheye", fov=3.0)
+            client.render(replace(frame, camera=around, settings=replace(settings, film_transparent=True)))
+        elif what == "linked lights":
+            lit = [Light("lamp", "point", matrix, receivers=0, blockers=0)]
+            client.render(replace(frame, lights=lit))
         elif what == "viewport":
             for denoise in ("none", "svgf"):
                 seen = replace(frame, settings=replace(settings, denoise=denoise))

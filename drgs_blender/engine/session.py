@@ -18,10 +18,12 @@ from ..compute.prepare import prepare_kernels
 from ..compute.threads import use_threads
 from ..core.asset.model import Asset, PosedSurfels
 from ..core.errors import Cancelled, UsageError
-from ..core.frame import Frame, Light, ObjectState, RenderSettings
+from ..core.frame import Frame, Light, MeshState, ObjectState, RenderSettings
+from ..core.passes import COLOURS
 from ..ipc.change_detection import reuse_equal
 from ..ipc.protocol import Passes
 from ..render.backend import CPU, RenderBackend
+from ..render.film.surface_film import CHANNELS
 from ..render.gpu.select_backend import Backends
 from ..render.integrator.adaptive import part_count
 from ..render.pipeline import Progress, render
@@ -314,6 +316,13 @@ def jobs_of(frame: Frame) -> list[str]:
         jobs.append("motion")
     if any(name.startswith("Crypto") for name in frame.passes):
         jobs.append("mattes")
+    if {*CHANNELS, *COLOURS}.intersection(frame.passes):
+        jobs.append("surface passes")
+    if frame.camera.panorama:
+        jobs.append("panorama")
+    sources: list[Light | MeshState] = [*frame.lights, *frame.meshes]
+    if any(source.receivers >= 0 or source.blockers >= 0 for source in sources):
+        jobs.append("linked lights")
     return jobs
 
 

@@ -94,6 +94,10 @@ def test_passes_that_are_not_made_are_told(scene, ball, export):
     layer.use_pass_shadow = layer.use_pass_ambient_occlusion = layer.use_pass_uv = False
     _, warnings = export()
     assert not any("no pass" in text or "UV" in text for text in warnings)
+    layer.aovs.add().name = "wetness"
+    layer.lightgroups.add(name="lamps")
+    _, warnings = export()
+    assert any('Shader AOV "wetness", Light Group "lamps"' in text for text in warnings)
 
 
 def test_frame_has_mist_material_indices_and_the_map_that_renders(passes, room, ball, export):  # noqa: F811
