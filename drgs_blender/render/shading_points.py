@@ -17,8 +17,8 @@ DIFFUSE_DIRECT, DIFFUSE_INDIRECT, GLOSSY_DIRECT, GLOSSY_INDIRECT = range(4)
 
 #: Bits of ``ShadingPoints.flags``. SECOND: an ordinary mesh seen next to surfels; a first point may have the same pixel
 #: and sample, so random numbers must differ. CATCHER: of a shadow catcher, see ``Radiance.unshadowed``. UNLIT: of an
-#: object shown as captured, which emits what is seen of it and reflects nothing. The bits from RECEIVER on are the set of
-#: objects to which it belongs where lights are linked (`lights.light_links`).
+#: object shown as captured, which emits what is seen of it and reflects nothing. The bits from RECEIVER on are the set
+#: of objects to which it belongs where lights are linked (`lights.light_links`).
 SECOND, CATCHER, UNLIT, RECEIVER = 1, 2, 4, 3
 
 _WIDTHS = {
