@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import bpy
 
@@ -56,7 +57,7 @@ class LightLinks:
     def __bool__(self) -> bool:
         return any(self._numbers.values())
 
-    def numbers_of(self, item: Visible) -> dict[str, int]:
+    def numbers_of(self, item: Visible) -> dict[str, Any]:
         """Fields of `frame.Light` and `frame.MeshState` for what an instance sends out."""
         links = _linked(item).light_linking
         found = {}

@@ -15,8 +15,8 @@ WITHOUT = 8
 
 #: ``mask << CLEAR``: meshes that light may pass, in place of the bits of others.
 CLEAR = 16
-#: Bits of shadow linkings: rays towards their lights meet what throws their shadows. Neither the others nor ``CLEAR`` use
-#: them, or the same bits beyond it.
+#: Bits of shadow linkings: rays towards their lights meet what throws their shadows. No kind of rays has them, and so
+#: they are free beyond ``CLEAR`` as well.
 LINKED = (6, 7, 8, 12, 13, 14)
 
 #: Bits of ``TraceScene.object_flags``.
