@@ -84,7 +84,8 @@ def _linked(item: Visible) -> bpy.types.Object:
 
 
 def _members(collection: bpy.types.Collection) -> _Members:
-    included, excluded = set(), set()
+    included: set[int] = set()
+    excluded: set[int] = set()
     for address, state in _states(collection):
         (included if state == "INCLUDE" else excluded).add(address)
     return _Members(frozenset(included), frozenset(excluded))

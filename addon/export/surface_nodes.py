@@ -166,7 +166,7 @@ class SurfaceWalker(NormalWalker):
         if any(value.texture is not None for value in (a, b, share)):
             self.warn(node, "both shaders let light pass, one more than the other; what is there is mixed as if alike")
         else:
-            share = uniform(b.colour * share.colour / np.maximum(alpha.colour, 1e-9))
+            share = replace(share, colour=b.colour * share.colour / np.maximum(alpha.colour, 1e-9))
         return replace(self.mixed(node, first, second, share), alpha=alpha)
 
     def shader_add_shader(self, output: SocketRef) -> Surface:
@@ -228,7 +228,9 @@ class SurfaceWalker(NormalWalker):
 
 def _unit(value: SocketValue) -> SocketValue:
     """Within [0, 1]; what a texture says is so where it is looked up."""
-    return value if value.texture is not None else uniform(np.clip(np.nan_to_num(value.colour, nan=1.0), 0, 1))
+    if value.texture is not None:
+        return value
+    return replace(value, colour=np.clip(np.nan_to_num(value.colour, nan=1.0), 0, 1))
 
 
 def _used(ref: SocketRef) -> bool:
