@@ -14,7 +14,7 @@ import bpy
 T = TypeVar("T")
 
 #: Types of datablocks on which the shading of surfaces and of the world depends.
-SHADING_DATABLOCKS = (bpy.types.Material, bpy.types.NodeTree, bpy.types.Image, bpy.types.Texture, bpy.types.World)
+SHADING_MODELS = (bpy.types.Material, bpy.types.NodeTree, bpy.types.Image, bpy.types.Texture, bpy.types.World)
 #: First items of the keys of entries that depend on such datablocks.
 SHADED = ("mesh", "world")
 
@@ -48,7 +48,7 @@ class ExportCache:
         """Drop entries that the depsgraph's updates invalidate."""
         looks, shapes = False, set()
         for update in depsgraph.updates:
-            if isinstance(update.id, SHADING_DATABLOCKS):
+            if isinstance(update.id, SHADING_MODELS):
                 looks = True
             elif update.is_updated_geometry:
                 shapes.add(uid(update.id))

@@ -76,12 +76,12 @@ def kernel_values(situation: tuple[torch.Tensor, ...], shading_model: str, table
     cosines.append((torch.linalg.cross(normal, half) ** 2).sum(-1))
     single = [x.numpy().astype(np.float32) for x in (torch.stack(cosines, -1), albedo, roughness, metallic)]
     out = np.empty((len(normal), 7), np.float32)
-    _evaluate_many(*single, kernel.SHADING_DATABLOCKS[shading_model], table.astype(np.float32), out)
+    _evaluate_many(*single, kernel.SHADING_MODELS[shading_model], table.astype(np.float32), out)
     out[:, :6] *= single[0][:, :1]
     return torch.from_numpy(out).double()
 
 
-@pytest.mark.parametrize("shading_model", brdf.SHADING_DATABLOCKS)
+@pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
 def test_brdf_values_and_the_density_of_visible_normals(shading_model: str):
     situation = situations()
     normal, view, light, *_, roughness, _ = situation

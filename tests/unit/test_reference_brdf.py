@@ -82,7 +82,7 @@ def test_a_narrow_lobe_keeps_its_energy():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shading_model", brdf.SHADING_DATABLOCKS)
+@pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
 @pytest.mark.parametrize("cosine", [1.0, 0.5, 0.2])
 def test_white_furnace(shading_model: str, cosine: float):
     view, white = view_at(cosine), torch.ones(3, dtype=F64)
@@ -137,7 +137,7 @@ def test_the_paper_brdf_is_reciprocal():
         torch.testing.assert_close(there, back, rtol=1e-9, atol=0)
 
 
-@pytest.mark.parametrize("shading_model", brdf.SHADING_DATABLOCKS)
+@pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
 def test_below_the_surface_is_black_and_without_nan(shading_model: str):
     view, light = random_unit((200,), 4).requires_grad_(), random_unit((200,), 5).requires_grad_()
     roughness = torch.full((200,), 0.3, dtype=F64, requires_grad=True)
@@ -152,7 +152,7 @@ def test_below_the_surface_is_black_and_without_nan(shading_model: str):
     assert all(torch.isfinite(x.grad).all() for x in (view, light, roughness))
 
 
-@pytest.mark.parametrize("shading_model", brdf.SHADING_DATABLOCKS)
+@pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
 def test_gradients(shading_model: str):
     def unit_parts(normal, view, light, albedo, roughness, metallic):
         normal, view, light = (brdf.normalise(x) for x in (normal, view, light))

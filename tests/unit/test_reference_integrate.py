@@ -67,7 +67,7 @@ def z_scores(samples: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shading_model", brdf.SHADING_DATABLOCKS)
+@pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
 @pytest.mark.parametrize("counts", [(30000, 0, 0), (0, 30000, 0), (0, 0, 30000), (10000, 5000, 5000)])
 def test_each_strategy_and_all_together_find_the_truth(counts: tuple[int, int, int], shading_model: str):
     light, points = random_light(), points_up()
@@ -127,7 +127,7 @@ def test_white_surfaces_in_white_light_vanish():
     assert 0.97 < brightness[2][0] < 1.06
 
 
-@pytest.mark.parametrize("shading_model", brdf.SHADING_DATABLOCKS)
+@pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
 def test_indirect_light_agrees_with_quadrature(shading_model: str):
     light, points = random_light(3, 4), points_up(metallic=(0.0, 0.6, 0.3))
     points.origin = torch.tensor([[0.1, 0.3, 1e-4], [0.5, 0.6, 1e-4], [0.3, 0.2, 1e-4]], dtype=F64)

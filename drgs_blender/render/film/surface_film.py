@@ -78,7 +78,7 @@ class SurfaceFilm:
         """(n, 3) float32 colour of the diffuse and of the glossy lobe at each point."""
         points = buffer.points
         diffuse, glossy = (np.empty((len(points), 3), np.float32) for _ in range(2))
-        model = brdf.SHADING_DATABLOCKS[self._frame.settings.shading_model]
+        model = brdf.SHADING_MODELS[self._frame.settings.shading_model]
         tables = brdf.layer_table(), brdf.schlick_table()
         over_range(_lobe_colours, len(points), points.arrays, model, tables, diffuse, glossy, fewest=ELEMENTS)
         unlit = points.flags & UNLIT != 0  # they emit alone

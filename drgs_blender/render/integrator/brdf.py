@@ -20,7 +20,7 @@ from ..sampling import HALF, INVERSE_PI, ONE, PI, TWO, ZERO, F, sincos_turns
 Array = np.ndarray
 
 PAPER, PRINCIPLED = 0, 1
-SHADING_DATABLOCKS = {"paper": PAPER, "principled": PRINCIPLED}
+SHADING_MODELS = {"paper": PAPER, "principled": PRINCIPLED}
 
 _IOR = 1.5
 _F0 = F(0.04)

@@ -112,7 +112,7 @@ def integrate(
         raise UsageError("render settings", problem, "Use counts of zero or more")
     if not (0.0 <= settings.clamp_indirect < np.inf and 0.0 <= settings.noise_threshold < np.inf):
         raise UsageError("render settings", "the clamp or the threshold is no number of at least 0", "Use 0 for none")
-    if settings.shading_model not in brdf.SHADING_DATABLOCKS:
+    if settings.shading_model not in brdf.SHADING_MODELS:
         problem = f"shading model {settings.shading_model!r} is unknown"
         raise UsageError("render settings", problem, "Use principled or paper")
     n = len(points)
@@ -135,7 +135,7 @@ def integrate(
     traits = Traits(extent, *shines, lights.rays_differ, apart, table.detailed, table.clear)
     given = Scene(tracer, geometry, envmap, light_tables, traits)
     clamp = F(settings.clamp_indirect * settings.subpixel_count * part[1] / sum(counts))
-    how = Settings(settings.bounces, brdf.SHADING_DATABLOCKS[settings.shading_model], brdf.layer_table(), clamp, 0)
+    how = Settings(settings.bounces, brdf.SHADING_MODELS[settings.shading_model], brdf.layer_table(), clamp, 0)
     seed, sequence = U(hash_seed(settings.seed, noise_index)), sampling.point_set(sum(counts) + 1)
     shares = F(environment_part), F(lights_part), _MAX_LIGHT_SHARE if scene.rays_differ else ONE
     sampler = Sampler._make([seed, sequence, settings.subpixel_count, *part, auto, *map(F, counts), *shares])

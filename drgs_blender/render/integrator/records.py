@@ -74,7 +74,7 @@ class Settings(NamedTuple):
     bounces : int
         Vertices of a path behind the shading point.
     shading_model : int
-        One of ``brdf.SHADING_DATABLOCKS``.
+        One of ``brdf.SHADING_MODELS``.
     layers : (16, 16) float32 array
         ``brdf.layer_table()``.
     clamp : np.float32

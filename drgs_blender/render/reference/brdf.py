@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-SHADING_DATABLOCKS = ("principled", "paper")
+SHADING_MODELS = ("principled", "paper")
 MIN_GGX_ALPHA = 1e-3
 IOR = 1.5
 #: Reflectance of the dielectric at normal incidence.
@@ -154,8 +154,8 @@ def evaluate(
         Zero where the light is below the surface, glossy also where the view is (an interpolated normal may turn away
         from the viewer at a silhouette; diffuse light does not ask for the view).
     """
-    if shading_model not in SHADING_DATABLOCKS:
-        raise ValueError(f"shading model {shading_model!r} is not one of {SHADING_DATABLOCKS}")
+    if shading_model not in SHADING_MODELS:
+        raise ValueError(f"shading model {shading_model!r} is not one of {SHADING_MODELS}")
     normal, view, light = torch.broadcast_tensors(normal, view, light)
     lit = (dot(normal, light) > 0).unsqueeze(-1)
     seen = lit & (dot(normal, view) > 0).unsqueeze(-1)

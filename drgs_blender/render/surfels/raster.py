@@ -231,8 +231,8 @@ def _meet(screen, i, opacity, near, far, state, first, last):  # type: ignore[no
 
 
 @njit
-def _room_for(n):  # type: ignore[no-untyped-def]
-    """Room for n splats of a tile."""
+def _tile_splats(n):  # type: ignore[no-untyped-def]
+    """Memory for n splats of a tile."""
     screen, surface = np.empty((n, RECORD), np.float32), np.empty((n, SPLAT), np.float32)
     return TileSplats(screen, surface, np.empty((n, 4), np.int32), np.empty(n, np.int32))
 
@@ -380,7 +380,7 @@ def _blend(first_part, last_part, parts, splats, y0, y1, samples):  # type: igno
     state, count = np.empty(_BLOCK, np.float32), np.empty(LANES, np.int32)
     lists, scratch = contributions(ROOM), scratch_for(ROOM)
     start, binned = np.empty(TILE * blocks_row + 2, np.int64), np.empty(0, np.int32)
-    own = _room_for(0)
+    own = _tile_splats(0)
     for task in range(tiles_x * (last_row - first_row + 1)):
         if not first_part <= task % parts < last_part:
             continue
@@ -392,7 +392,7 @@ def _blend(first_part, last_part, parts, splats, y0, y1, samples):  # type: igno
         left, right = max(tx * TILE, x0), min(tx * TILE + TILE, x1)
         tile = Tile(tx * TILE, ty * TILE, left, max(ty * TILE, y0), right, min(ty * TILE + TILE, y1))
         if n > len(own.screen):
-            own = _room_for(2 * n)
+            own = _tile_splats(2 * n)
         _collect(splats, listed, listed + n, tile, view.subpixels, own)
         _count(own.span, n, blocks_row, start)
         if start[-1] > len(binned):
