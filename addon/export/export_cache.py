@@ -30,6 +30,14 @@ class ExportCache:
     def __init__(self) -> None:
         self._known: dict[tuple[Hashable, ...], tuple[frozenset[int], Any]] = {}
         self._used: set[tuple[Hashable, ...]] = set()
+        self._frame, self._moving = 0, False
+
+    def begin(self, frame: int) -> None:
+        """An export at a frame of the scene begins; pictures that move are other ones in each."""
+        if self._moving and frame != self._frame:
+            self.forget_shading()
+            self._moving = False
+        self._frame = frame
 
     def get(self, key: tuple[Hashable, ...], owners: Iterable[int], make: Callable[[], T]) -> T:
         """The result known under `key`, else that of `make`.
@@ -67,7 +75,8 @@ class ExportCache:
         """Forget everything."""
         self._known = {}
 
-    def end(self) -> None:
-        """An export is over: drop what it did not use."""
+    def end(self, moving: bool = False) -> None:
+        """An export is over, which read images that move or did not: drop what it did not use."""
+        self._moving |= moving
         self._known = {key: entry for key, entry in self._known.items() if key in self._used}
         self._used = set()

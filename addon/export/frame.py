@@ -16,7 +16,7 @@ from ..property_limits import Limited
 from ..view_layer_passes import enabled, not_rendered
 from .camera import export_camera, picture_of
 from .export_cache import ExportCache, uid
-from .images import end_export
+from .images import begin_export, end_export
 from .instances import UNRENDERED, Unrendered, Visible, uncancelled, visible
 from .light_links import LightLinks
 from .lights import export_light
@@ -79,6 +79,8 @@ def export_frame(
     world = getattr(layer, "world_override", None) or scene.world
     materials, unrendered, lights = Materials(warn, layer.material_override), Unrendered(), []
     cache = ExportCache() if cache is None else cache
+    cache.begin(scene.frame_current)
+    begin_export(scene.frame_current)
     passes = passes or tuple(p.name for p in enabled(scene, depsgraph.view_layer))
     objects, links = DrgsObjects(depsgraph, key_of, warn, cache), LightLinks(depsgraph, warn)
     meshes = Meshes(depsgraph, materials, warn, cache, links, wanted, with_uv_map="UV" in passes)
@@ -125,8 +127,7 @@ def export_frame(
     )
     if "UV" in passes and objects.states:
         warn("The pass UV is 0 on DR-GS objects: surfels have no texture coordinates")
-    cache.end()
-    end_export()
+    cache.end(end_export())
     if wanted is not None:
         wanted.end()
     if frame_set is not None and own_camera:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import bpy
@@ -12,6 +13,7 @@ import numpy as np
 
 from ...drgs_blender.core.color import linear_to_srgb, srgb_to_linear
 from ...drgs_blender.core.frame import Image
+from . import image_cubic, image_grid, image_parts
 
 Array = np.ndarray
 Warn = Callable[[str], None]
@@ -28,6 +30,42 @@ KEPT_EXPORTS = 4
 #: What was made of an image -> (the number of the export that used it last, result).
 _known: dict[tuple[object, ...], tuple[int, Any]] = {}
 _export = 0
+_MAGENTA_TEXEL = np.array([[[255, 0, 255, 255]]], np.uint8)
+#: Frame of the scene that is exported.
+_now = 0
+#: Whether the export read a sequence or a movie.
+_moving = False
+
+
+@dataclass(frozen=True, slots=True)
+class Lookup:
+    """What of an image a node shows, and how; as Blender's Image Texture node says it.
+
+    Attributes
+    ----------
+    frame : of a sequence or movie, 0 for others
+    interpolation, extension : as the node's
+    """
+
+    frame: int = 0
+    interpolation: str = "Linear"
+    extension: str = "REPEAT"
+
+    @classmethod
+    def of(cls, node: bpy.types.Node) -> Lookup:
+        """That of an Image or Environment Texture node at the frame that is exported."""
+        frame = 0
+        if node.image is not None and node.image.source in image_parts.MOVING:
+            frame = image_parts.frame_of(node.image_user, _now)
+        return cls(frame, node.interpolation, getattr(node, "extension", "REPEAT"))
+
+    @property
+    def is_cubic(self) -> bool:
+        """Whether Cycles shows a spline."""
+        return self.interpolation in ("Cubic", "Smart")
+
+
+PLAIN = Lookup()
 
 
 def linear_pixels(image: bpy.types.Image, warn: Warn) -> Array | None:
@@ -36,11 +74,32 @@ def linear_pixels(image: bpy.types.Image, warn: Warn) -> Array | None:
     Blender keeps float images in scene-linear already; 8-bit ones are as in the file and decoded here. Values that are
     no light (NaN, infinite, negative) stay as they are: the engine takes such texels as black and warns with a count.
     """
+    if image.source in image_parts.MOVING:
+        warn(f'Image "{image.name}": of a {image.source.lower()} only the current picture is used')
+    if image.source == "TILED" and len(image.tiles) > 1:
+        warn(f'Image "{image.name}": of its {len(image.tiles)} UDIM tiles only the first is used')
     _check(image, warn)
     return _remembered(image, "light", _linear)
 
 
-def export_image(image: bpy.types.Image, straight: bool, warn: Warn) -> Image | None:
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """A picture, and where it lies.
+
+    Attributes
+    ----------
+    place : (4, 4), from the coordinates at which Blender looks the image up to those of the picture
+    extension : of the picture, as the node's
+    is_spline : as Cubic and Smart want it; else the picture is looked up as with Linear
+    """
+
+    picture: Image
+    place: Array
+    extension: str
+    is_spline: bool = False
+
+
+def export_image(image: bpy.types.Image, straight: bool, warn: Warn, lookup: Lookup = PLAIN) -> Image | None:
     """Pixels of a texture; None when the image has none.
 
     Parameters
@@ -48,8 +107,92 @@ def export_image(image: bpy.types.Image, straight: bool, warn: Warn) -> Image | 
     straight : keep the colours as they are where alpha is small. Cycles does so only for nodes whose Alpha is used;
         else the colours are multiplied with alpha (not those of data and of channel-packed images)
     """
+    found = show(image, straight, warn, lookup)
+    return None if found is None else found.picture
+
+
+def show(image: bpy.types.Image, straight: bool, warn: Warn, lookup: Lookup) -> Shown | None:
+    """What a node shows of an image; None when it has no pixels. Parameters as of `export_image`."""
+    global _moving
     _check(image, warn)
-    return _remembered(image, "straight" if straight else "associated", _straight if straight else _associated)
+    make, name = (_straight, f"{image.name_full} (straight)") if straight else (_associated, image.name_full)
+    kind = "straight" if straight else "associated"
+    if image.source == "TILED":
+        picture = _tiled(image, kind, make, name, lookup, warn)
+        if picture is None:
+            return None
+        return Shown(picture, image_grid.placement([tile.number for tile in image.tiles], picture), "EXTEND")
+    if image.source in image_parts.MOVING:
+        _moving = True
+        picture = _still(image, kind, make, f"{name} (frame {lookup.frame})", lookup, warn)
+    else:
+        picture = _remembered(image, kind, lambda i: _named(make(i), name))
+    if picture is None:
+        return None
+    shown = Shown(picture, np.eye(4), lookup.extension)
+    if not lookup.is_cubic:
+        return shown
+
+    def spline(_: bpy.types.Image) -> Shown:
+        finer = image_cubic.finer(picture, lookup.extension)
+        if finer is None:
+            return shown
+        named = replace(finer, name=f"{picture.name} (cubic {lookup.extension})")
+        size = picture.pixels.shape[1], picture.pixels.shape[0]
+        return Shown(named, image_cubic.placement(size, lookup.extension), lookup.extension, True)
+
+    return _remembered(image, f"{kind} {lookup.extension} {lookup.frame} cubic", spline, lookup.frame)
+
+
+def _tiled(
+    image: bpy.types.Image, kind: str, make: Callable[..., Image | None], name: str, lookup: Lookup, warn: Warn
+) -> Image | None:
+    """All tiles in one picture; None where none can be read."""
+    closest = lookup.interpolation == "Closest"
+
+    def stitch(image: bpy.types.Image) -> tuple[Image | None, list[str]]:
+        with image_parts.tiles(image) as shown:
+            found = {number: make(tile) for number, tile in shown}
+        lost = [str(number) for number, picture in found.items() if picture is None]
+        whole = {number: picture for number, picture in found.items() if picture is not None}
+        problems = []
+        if not whole:
+            return None, problems
+        if lost:
+            problems.append(f"tile {', '.join(lost)} cannot be read; as in Cycles it is magenta. Find or fill it")
+        if image.is_dirty and len(found) > 1:
+            problems.append("what is painted on its tiles is not saved; but for the first they are as saved. Save it")
+        # The grid is that of all tiles, so that it lies where `placement` says.
+        ends = {n: whole.get(n) or Image("", _MAGENTA_TEXEL, "linear") for n in found}
+        picture, reduced = image_grid.grid(ends, lookup.extension, closest)
+        if reduced > 1:
+            problems.append(f"its {len(found)} tiles are too large together and are reduced {reduced:.3g} times")
+        return _named(picture, f"{name} ({lookup.extension} {'closest' if closest else 'linear'} tiles)"), problems
+
+    picture, problems = _remembered(image, f"{kind} {lookup.extension} {closest}", stitch)
+    for problem in problems:
+        warn(f'Image "{image.name}": {problem}')
+    return picture
+
+
+def _still(
+    image: bpy.types.Image, kind: str, make: Callable[..., Image | None], name: str, lookup: Lookup, warn: Warn
+) -> Image | None:
+    """The picture of a frame; None where it cannot be read."""
+
+    def read(image: bpy.types.Image) -> Image | None:
+        with image_parts.still(image, lookup.frame) as shown:
+            return _named(make(shown), name)
+
+    picture = _remembered(image, f"{kind} {lookup.frame}", read, lookup.frame)
+    if picture is None:
+        path = image_parts.frame_file(image, lookup.frame)
+        warn(f'Image "{image.name}": frame {lookup.frame}, {path}, cannot be read. See that the file is there')
+    return picture
+
+
+def _named(picture: Image | None, name: str) -> Image | None:
+    return None if picture is None else replace(picture, name=name)
 
 
 def mean_colour(picture: Image) -> Array:
@@ -70,7 +213,13 @@ def _some(picture: Image) -> Array:
 
 
 def export_curved(
-    image: bpy.types.Image, straight: bool, source: str, curve: bytes, warn: Warn, data: bool = False
+    image: bpy.types.Image,
+    straight: bool,
+    source: str,
+    curve: bytes,
+    warn: Warn,
+    data: bool = False,
+    lookup: Lookup = PLAIN,
 ) -> Image:
     """Pixels of an 8-bit texture whose bytes stand for other values.
 
@@ -80,7 +229,7 @@ def export_curved(
     curve : (256, 3) float32 in [0, 1], linear, as bytes
     data : keep the values as they are; else colours are encoded as sRGB
     """
-    plain = export_image(image, straight, warn)
+    plain = export_image(image, straight, warn, lookup)
     assert plain is not None, "a curve is made of pixels"
     values = np.frombuffer(curve, np.float32).reshape(256, 3)
     number = data or (bool((np.ptp(values, axis=1) < 1e-6).all()) and source != "rgb")
@@ -94,7 +243,8 @@ def export_curved(
         mark = hashlib.blake2b(source.encode() + b"data" * data + curve, digest_size=6).hexdigest()
         return Image(f"{plain.name} ({mark})", pixels, "linear" if number else "srgb")
 
-    return _remembered(image, f"{straight} {source} {data} {hashlib.blake2b(curve).hexdigest()}", make)
+    kind = f"{plain.name} {source} {data} {hashlib.blake2b(curve).hexdigest()}"
+    return _remembered(image, kind, make, lookup.frame)
 
 
 def is_grey(picture: Image) -> bool:
@@ -103,12 +253,19 @@ def is_grey(picture: Image) -> bool:
     return bool((some[:, 0] == some[:, 1]).all() and (some[:, 0] == some[:, 2]).all())
 
 
-def end_export() -> None:
-    """Drop what the last exports did not use."""
+def begin_export(frame: int) -> None:
+    """An export of the scene at a frame begins."""
+    global _now, _moving
+    _now, _moving = frame, False
+
+
+def end_export() -> bool:
+    """Drop what the last exports did not use; whether this one read a sequence or a movie."""
     global _export
     _export += 1
     for key in [k for k, (used, _) in _known.items() if used < _export - KEPT_EXPORTS]:
         del _known[key]
+    return _moving
 
 
 def forget() -> None:
@@ -118,12 +275,8 @@ def forget() -> None:
 
 def _check(image: bpy.types.Image, warn: Warn) -> None:
     """Say what is not as in Cycles."""
-    if image.source in ("MOVIE", "SEQUENCE"):
-        warn(f'Image "{image.name}": of a {image.source.lower()} only the current picture is used')
-    if image.source == "TILED" and len(image.tiles) > 1:
-        warn(f'Image "{image.name}": of its {len(image.tiles)} UDIM tiles only the first is used')
     space = image.colorspace_settings.name
-    if not image.is_float and space not in LINEAR and space != "sRGB":
+    if not image.is_float and space not in (*LINEAR, "sRGB", ""):  # "": of a movie that was not read yet
         warn(f'Image "{image.name}": colour space {space} of an 8-bit image is read as sRGB')
 
 
@@ -160,7 +313,7 @@ def _straight(image: bpy.types.Image) -> Image | None:
     alpha = pixels[..., 3:]
     if image.is_float and _has_alpha(image):
         np.divide(pixels[..., :3], alpha, out=pixels[..., :3], where=alpha > 0)
-    return _picture(image, f"{image.name_full} (straight)", pixels)
+    return _picture(image, pixels)
 
 
 def _associated(image: bpy.types.Image) -> Image | None:
@@ -170,7 +323,7 @@ def _associated(image: bpy.types.Image) -> Image | None:
     if not image.is_float and _has_alpha(image) and (pixels[..., 3] != 255).any():
         # Of the encoded values and rounded down, as Cycles does.
         pixels[..., :3] = pixels[..., :3].astype(np.uint16) * pixels[..., 3:] // 255
-    return _picture(image, image.name_full, pixels)
+    return _picture(image, pixels)
 
 
 def _has_alpha(image: bpy.types.Image) -> bool:
@@ -191,14 +344,14 @@ def _rgba(image: bpy.types.Image) -> Array | None:
     return rgba if image.is_float else np.rint(rgba * 255).astype(np.uint8)
 
 
-def _picture(image: bpy.types.Image, name: str, pixels: Array) -> Image:
+def _picture(image: bpy.types.Image, pixels: Array) -> Image:
     pixels.flags.writeable = False  # so that its identity says whether it changed
-    return Image(name, pixels, "srgb" if _is_srgb(image) else "linear")
+    return Image("", pixels, "srgb" if _is_srgb(image) else "linear")
 
 
-def _remembered(image: bpy.types.Image, kind: str, make: Callable[[bpy.types.Image], Any]) -> Any:
+def _remembered(image: bpy.types.Image, kind: str, make: Callable[[bpy.types.Image], Any], frame: int = 0) -> Any:
     """What `make` makes of the image, from memory where the image did not change."""
-    key = _key(image)
+    key = _key(image, frame)
     if key is None:
         return make(image)
     key = (kind, *key)
@@ -209,15 +362,30 @@ def _remembered(image: bpy.types.Image, kind: str, make: Callable[[bpy.types.Ima
     return result
 
 
-def _key(image: bpy.types.Image) -> tuple[object, ...] | None:
-    """What the pixels depend on, or None where that is not known: painted, generated and moving images."""
-    if image.source != "FILE" or image.is_dirty:
+def _key(image: bpy.types.Image, frame: int) -> tuple[object, ...] | None:
+    """What the pixels depend on, or None where that is not known: painted and generated images."""
+    if image.source in ("GENERATED", "VIEWER") or image.is_dirty:
         return None
-    path = bpy.path.abspath(image.filepath, library=image.library)
+    settings = image.session_uid, image.name_full, image.source, image.colorspace_settings.name, image.alpha_mode
+    if image.source == "TILED":
+        files = [(*_generated(tile), *_stamp(image_parts.tile_file(image, tile.number))) for tile in image.tiles]
+        return *settings, *files, *(_digest(p.packed_file) for p in image.packed_files)
+    stamp = _stamp(image_parts.frame_file(image, frame))
+    packed = _digest(image.packed_file) if image.packed_file else b""
+    return *settings, *stamp, packed, *(tuple(image.size) if image.source == "FILE" else (frame,))
+
+
+def _generated(tile: bpy.types.UDIMTile) -> tuple[object, ...]:
+    """What a generated tile is filled with."""
+    return tile.number, *tile.size, tile.generated_type, *tile.generated_color
+
+
+def _stamp(path: str) -> tuple[str, int]:
     try:
-        changed = os.stat(path).st_mtime_ns
+        return path, os.stat(path).st_mtime_ns
     except OSError:  # packed, or missing (then there are no pixels)
-        changed = 0
-    packed = hashlib.blake2b(image.packed_file.data).digest() if image.packed_file else b""
-    settings = image.colorspace_settings.name, image.alpha_mode
-    return image.session_uid, image.name_full, path, changed, packed, *settings, tuple(image.size)
+        return path, 0
+
+
+def _digest(packed: bpy.types.PackedFile) -> bytes:
+    return hashlib.blake2b(packed.data).digest()

@@ -52,14 +52,17 @@ class TextureWalker(Walker):
     def node_tex_image(self, output: SocketRef) -> SocketValue:
         node, image = output.node, output.node.image
         straight = node.outputs["Alpha"].is_linked
-        if image is None or images.export_image(image, straight, self._warn) is None:
+        lookup = images.Lookup.of(node)
+        shown = None if image is None else images.show(image, straight, self._warn, lookup)
+        if shown is None:
             name = "has no image" if image is None else f'image "{image.name}" cannot be read'
             self.warn(node, f"{name}; as in Cycles it is magenta. Choose another, or find its file")
             return uniform(1) if output.socket.name == "Alpha" else SocketValue(np.array(images.MISSING))
         if node.projection != "FLAT":
             self.warn(node, f"the {node.projection.title()} projection is not supported; the UV map is used")
-        if node.interpolation not in ("Linear", "Closest"):
-            self.warn(node, f"{node.interpolation} interpolation is read as Linear")
+        if lookup.is_cubic and not shown.is_spline:
+            why = "of tiled images" if image.source == "TILED" else "of an image this large"
+            self.warn(node, f"{node.interpolation} interpolation {why} is read as Linear")
         matrix, layer = self.coordinates(output.input("Vector"))
         if layer.source != "uv":
             layer, matrix = replace(layer, matrix=tuple(map(tuple, matrix.tolist()))), np.eye(4)
@@ -70,15 +73,24 @@ class TextureWalker(Walker):
                 straight,
                 "a" if output.socket.name == "Alpha" else "rgb",
                 layer,
-                tuple(map(tuple, matrix.tolist())),
+                tuple(map(tuple, (shown.place @ matrix).tolist())),
                 "closest" if node.interpolation == "Closest" else "linear",
-                node.extension.lower(),
+                shown.extension.lower(),
+                lookup=lookup,
             ),
         )
 
     def node_tex_environment(self, output: SocketRef) -> SocketValue:
         node = output.node
-        if node.image is not None and (picture := images.export_image(node.image, False, self._warn)) is not None:
+        if (
+            node.image is not None
+            and (
+                picture := images.export_image(
+                    node.image, False, self._warn, images.Lookup(images.Lookup.of(node).frame)
+                )
+            )
+            is not None
+        ):
             self.warn(node, "an Environment Texture is not supported on surfaces; its mean colour is used")
             return SocketValue(images.mean_colour(picture)[:3])
         return self.nearest(output, output)

@@ -38,8 +38,10 @@ class TextureRef:
     channel : of the picture, after the curve
     curve : (256, 3) float32 as bytes, the value that each byte stands for; empty where it stands for itself
     layer : coordinates that place it, before `matrix`
+    matrix, interpolation, extension : of the picture that is exported
     source : channel of the image whose bytes the curve is of; "rgb" is each of its own
     data : values that are no colours, such as normals: a curve of them is not encoded as sRGB
+    lookup : as of images.export_image
     """
 
     image: bpy.types.Image
@@ -52,16 +54,17 @@ class TextureRef:
     curve: bytes = b""
     source: str = "rgb"
     data: bool = False
+    lookup: images.Lookup = images.PLAIN
 
     def export(self, warn: Warn) -> Image:
         """The pixels."""
         if not self.curve:
             return self._plain(warn)
-        return images.export_curved(self.image, self.straight, self.source, self.curve, warn, self.data)
+        return images.export_curved(self.image, self.straight, self.source, self.curve, warn, self.data, self.lookup)
 
     def _plain(self, warn: Warn) -> Image:
         """The pixels before the curve. What has none is no texture: whoever makes a `TextureRef` has looked."""
-        exported = images.export_image(self.image, self.straight, warn)
+        exported = images.export_image(self.image, self.straight, warn, self.lookup)
         assert exported is not None, self.image
         return exported
 
