@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ...drgs_blender.core.frame import Image
@@ -48,7 +50,7 @@ def placement(size: tuple[int, int], extension: str) -> Array:
     return matrix
 
 
-def _axis(pixels: Array, axis: int, factor: int, border: int, beyond: str) -> Array:
+def _axis(pixels: Array, axis: int, factor: int, border: int, beyond: Any) -> Array:
     """The spline at `factor` places per texel along an axis."""
     count, pad = pixels.shape[axis], border + BORDER
     padding = [(0, 0)] * 3
@@ -59,4 +61,5 @@ def _axis(pixels: Array, axis: int, factor: int, border: int, beyond: str) -> Ar
     t = (place - low).reshape((-1, 1, 1) if axis == 0 else (1, -1, 1)).astype(np.float32)
     weights = ((1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3)
     start = low.astype(int) + pad - 1
-    return sum(wide.take(start + i, axis=axis) * (weight / 6) for i, weight in enumerate(weights))
+    parts = [wide.take(start + i, axis=axis) * (weight / 6) for i, weight in enumerate(weights)]
+    return parts[0] + parts[1] + parts[2] + parts[3]

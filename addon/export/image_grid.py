@@ -9,6 +9,7 @@ the grid they blend with each other.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 
@@ -40,7 +41,9 @@ def grid(pictures: Mapping[int, Image], extension: str, closest: bool) -> tuple[
     """
     first_column, first_row, columns, rows = cells(list(pictures))
     all_bytes = all(p.pixels.dtype == np.uint8 for p in pictures.values())
-    encoding = "srgb" if all_bytes and any(p.encoding == "srgb" for p in pictures.values()) else "linear"
+    encoding: Literal["linear", "srgb"] = (
+        "srgb" if all_bytes and any(p.encoding == "srgb" for p in pictures.values()) else "linear"
+    )
     kind: type[np.generic] = np.uint8 if all_bytes else np.float32
     height = max(p.pixels.shape[0] for p in pictures.values())
     width = max(p.pixels.shape[1] for p in pictures.values())

@@ -155,7 +155,7 @@ def _tiled(
             found = {number: make(tile) for number, tile in shown}
         lost = [str(number) for number, picture in found.items() if picture is None]
         whole = {number: picture for number, picture in found.items() if picture is not None}
-        problems = []
+        problems: list[str] = []
         if not whole:
             return None, problems
         if lost:

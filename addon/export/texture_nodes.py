@@ -75,7 +75,7 @@ class TextureWalker(Walker):
                 layer,
                 tuple(map(tuple, (shown.place @ matrix).tolist())),
                 "closest" if node.interpolation == "Closest" else "linear",
-                shown.extension.lower(),
+                cast(Any, shown.extension.lower()),
                 lookup=lookup,
             ),
         )
