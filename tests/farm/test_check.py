@@ -20,7 +20,7 @@ def test_files_and_settings_that_a_node_would_do_without_are_named(drgs, folder)
     assert [line for line in lines if line.startswith("missing")] == ["missing  //gone.png: does not exist"]
     notes = [line for line in lines if line.startswith("note")]
     assert any("there.png: is an absolute path" in line for line in notes)
-    assert any("Cryptomatte of assets" in line for line in notes)
+    assert any("Cryptomatte Asset" in line for line in notes)
 
 
 def test_scene_that_takes_everything_along_is_fine(drgs, folder, tmp_path):
