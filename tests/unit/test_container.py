@@ -287,7 +287,7 @@ def test_unknown_members_and_foreign_conventions_are_refused(file: Path) -> None
     with pytest.raises(AssetError, match="up_axis"):
         read_asset(file)
     file.write_bytes(clean)
-    rewrite(file, {}, manifest={"schema": 2, "producer": "drgs-blender 9"})
+    rewrite(file, {}, manifest={"schema": 3, "producer": "drgs-blender 9"})
     with pytest.raises(VersionError, match="drgs-blender 9"):
         read_asset(file)
 

@@ -143,9 +143,10 @@ def developed(buffer: GBuffer, scene: TraceScene, radiance: Radiance, transparen
     settings = replace(SETTINGS, film_transparent=transparent)
     film = Film(camera, settings, camera_parameters(camera, settings, 1))
     film.add(buffer, radiance, scene.pass_index, EnvironmentLight(World(colour=(1.0, 0.5, 0.25))))
-    return film.passes(
-        tuple(name for name in BY_NAME if not name.startswith("Crypto"))
-    )  # these have films of their own
+    white = np.ones((*buffer.alpha.shape[:2], 3), np.float32)
+    apart = {"DiffCol", "GlossCol", "Mist", "UV", "IndexMA"}  # these have films of their own, as mattes have
+    names = tuple(name for name in BY_NAME if name not in apart and not name.startswith("Crypto"))
+    return film.passes(names, {"DiffCol": white, "GlossCol": white})
 
 
 def uniform_light(buffer: GBuffer, value: float) -> Radiance:

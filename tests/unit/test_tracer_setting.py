@@ -31,6 +31,7 @@ from drgs_blender.deform.rigid import pose_by_matrix
 from drgs_blender.engine.session import Session
 from drgs_blender.render.integrator import intersect
 from drgs_blender.render.integrator import wavefront as w
+from drgs_blender.render.integrator.records import Scene, Traits
 from drgs_blender.render.sampling import F, U, mix
 from drgs_blender.render.scene.trace_scene import TraceScene
 from drgs_blender.render.surfels.surfel_bvh import SurfelBVH
@@ -140,7 +141,7 @@ def test_lights_among_surfels_look_the_same_to_both_strategies(tmp_path: Path) -
 
 
 @njit
-def _meet_all(tracer, origins, directions, count, out):  # type: ignore[no-untyped-def]
+def _meet_all(scene, origins, directions, count, out):  # type: ignore[no-untyped-def]
     rays = w.batch(16)
     s, ints = rays
     for n in range(len(origins)):
@@ -149,7 +150,7 @@ def _meet_all(tracer, origins, directions, count, out):  # type: ignore[no-untyp
             s[i + w.OX], s[i + w.OY], s[i + w.OZ] = origins[n, 0], origins[n, 1], origins[n, 2]
             s[i + w.LX], s[i + w.LY], s[i + w.LZ] = directions[n, 0], directions[n, 1], directions[n, 2]
             ints[c + w.KEY], ints[c + w.OWN] = mix(U(mix(U(n)) + U(k))), U(0xFFFFFFFF)
-            through, _, hit = intersect.meet(tracer, rays, 3, np.int32(-1))
+            through, _, hit = intersect.meet(scene, rays, 3, np.int32(-1))
             out[n, k, 0], out[n, k, 1], out[n, k, 2], out[n, k, 3] = through, hit[0], F(hit[1]), F(hit[17])
             values = hit[5:17]
             for j in range(12):
@@ -168,7 +169,9 @@ def test_a_ray_meets_the_blend_of_all_surfels_or_the_mesh_behind(backed: bool) -
     directions = rng.normal(size=(80, 3)) * 0.1 - [0, 0, 1]
     directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
     out = np.zeros((80, 400, 16), np.float32)
-    _meet_all(intersect.MixedTracer(*scene.tracer, *tracer_of(bvh)), origins, directions, out.shape[1], out)
+    tracer = intersect.MixedTracer(*scene.tracer, *tracer_of(bvh))
+    traits = Traits(F(10), False, False, False, False, False, False, False)
+    _meet_all(Scene(tracer, scene.geometry, 0, 0, traits), origins, directions, out.shape[1], out)
     stop = (0.2 - origins[:, 2]) / directions[:, 2] if backed else np.full(80, np.inf)
     share = []
     for n in range(80):

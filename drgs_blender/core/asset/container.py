@@ -282,7 +282,7 @@ def _tensors(
     for name, array in tensors.items():
         family = name.split("/", 1)[0] + "/" if "/" in name else name
         if schema.get(family) != dtype_name(array):
-            raise AssetError(f"{where}, {name}", f"with type {array.dtype} is not part of the schema", _RESTORE)
+            raise AssetError(f"{where}, {name}", f"with type {array.dtype} is not part of schema {SCHEMA}", _RESTORE)
     for name in schema:
         if name not in tensors and not name.endswith("/") and name not in _OPTIONAL_TENSORS:
             raise AssetError(f"{where}, {name}", "is missing", _RESTORE)
