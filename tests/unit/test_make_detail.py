@@ -85,7 +85,7 @@ def checker(size: int = 256, cells: int = 32) -> Image:
 
 def test_a_divided_ball_is_shaded_as_smoothly_as_its_file() -> None:
     """Divided faces stay flat; by their own normals the ball would show its 320 faces."""
-    asset = make_asset(ball(2, checker()))
+    asset = make_asset(ball(2, checker()), max_triangles=4000, max_surfels=10_000)
     assert len(asset.mesh.faces) > 2000
     radial = asset.surfels.centre / np.linalg.norm(asset.surfels.centre, axis=1, keepdims=True)
     error = np.degrees(np.arccos(np.clip((shading_normals(asset) * radial).sum(1), -1, 1)))
