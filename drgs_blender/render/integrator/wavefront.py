@@ -42,7 +42,6 @@ WC, WG, WE, WL, SIZE = (LANES * i for i in range(43, 48))
 # where there are normal or bump maps: the shading normal without them, 0 where it is N
 UX, UY, UZ = (LANES * i for i in range(48, 51))
 PACKET_FLOATS = 51 * LANES
-PACKET_FLOATS = 48 * LANES
 #: Where lights are linked, the set of the surface: of a point's samples, which have no throughput, and of paths.
 POINT_SET, PATH_SET = TR, WL
 # uint32 fields: three random numbers, the key of more, the owner (a point, or a path), a place in a table, the row of
