@@ -81,12 +81,12 @@ def make_asset(
 
 def scale_mesh(mesh: Mesh, scale: float, name: str) -> None:
     """Multiply all lengths of `mesh` by `scale`. Raises UsageError where no mesh can be as small or large."""
-    if scale == 1:
-        return
     with np.errstate(all="ignore"):
         mesh.vertices = mesh.vertices * np.float32(scale)
     check_extent(mesh.vertices, name, scale)
-    mesh.source = (mesh.source or SourceVertices.identity(len(mesh.vertices))).turned(np.eye(3) * np.float32(scale))
+    if scale != 1:
+        source = mesh.source or SourceVertices.identity(len(mesh.vertices))
+        mesh.source = source.turned(np.eye(3) * np.float32(scale))
 
 
 def read_mesh_file(source: str | Path | MeshFile, pose: Pose = "rest") -> MeshFile:

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from test_build_make import plane
 
-from drgs_blender.build.make import make_asset, mesh_with_materials
+from drgs_blender.build.make import make_asset, mesh_with_materials, scale_mesh
 from drgs_blender.cli.main import main
 from drgs_blender.core.asset.container import inspect_asset, read_asset, write_asset
 from drgs_blender.core.asset.model import Asset, Environment, Mesh, SourceVertices
@@ -365,3 +365,11 @@ def test_pictures_of_a_point_cache(tmp_path, board) -> None:
     assert main([*command, "--frames", "6-7", "--out", str(tmp_path / "f_##.png")]) == 0
     assert sorted(path.name for path in tmp_path.glob("*.png")) == ["f_06.png", "f_07.png"]
     assert main([*command, "--out", str(tmp_path / "one.png")]) == EXIT_USAGE
+
+
+@pytest.mark.parametrize("vertices", [np.full((3, 3), np.nan), 1e-9 * np.eye(3), 1e12 * np.eye(3)])
+def test_sizes_are_checked_also_where_no_length_is_changed(vertices: np.ndarray) -> None:
+    mesh = Mesh(vertices, [[0, 1, 2]], np.ones((3, 3)), np.ones(3), np.zeros(3))
+    with pytest.raises(AssetError, match="board"):
+        scale_mesh(mesh, 1.0, "board")
+    assert mesh.source is None
