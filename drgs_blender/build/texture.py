@@ -119,6 +119,11 @@ class Pyramid:
         coarse = self._corners(low[blended] + 1, x[blended], y[blended])
         return TrilinearTaps(self._corners(low, x, y), coarse, blended, share[blended])
 
+    def taps_at(self, uvs: Array, scale: Array) -> TrilinearTaps:
+        """Find the pixels around texture coordinates (n, 2), v up, to average over areas of width `scale` (n, 2)."""
+        footprint = np.abs(scale) * self.levels[0].shape[1::-1] * _zoom(self.image)
+        return self.taps(self.texels(uvs.astype(np.float64)), np.maximum(footprint[:, 0], footprint[:, 1]))
+
     def look_up(self, taps: TrilinearTaps, channels: slice = slice(0, 3)) -> Array:
         """Colours (channels, n) at `taps`, those of a pyramid of the same layout."""
         planes = self._planes[channels]
@@ -209,9 +214,7 @@ class Materials:
         for image, columns, channels in self._images(index):
             pyramid = self._pyramid(image)
             if pyramid.layout not in taps:
-                footprint = np.abs(scale) * pyramid.levels[0].shape[1::-1] * _zoom(image)
-                texels = pyramid.texels(uvs.astype(np.float64))
-                taps[pyramid.layout] = pyramid.taps(texels, np.maximum(footprint[:, 0], footprint[:, 1]))
+                taps[pyramid.layout] = pyramid.taps_at(uvs, scale)
             values[columns] *= pyramid.look_up(taps[pyramid.layout], channels)
         return values
 
@@ -220,19 +223,17 @@ class Materials:
 
         Parameters are those of `sample`.
         """
-        if not self.bumpy[np.unique(material)].any():
+        bumpy = [index for index in np.unique(material) if self.bumpy[index]]
+        if not bumpy:
             return None
         result = np.zeros((3, len(material)))
         result[2] = 1
-        for index in np.unique(material):
+        for index in bumpy:
             m = self._materials[index]
-            if m.normal_image is None:
-                continue
+            assert m.normal_image is not None
             rows = np.flatnonzero(material == index)
             pyramid = self._pyramid(m.normal_image)
-            footprint = np.abs(scale[rows]) * pyramid.levels[0].shape[1::-1] * _zoom(m.normal_image)
-            texels = pyramid.texels(uvs[rows].astype(np.float64))
-            found = 2.0 * pyramid.look_up(pyramid.taps(texels, footprint.max(axis=1))) - 1
+            found = 2.0 * pyramid.look_up(pyramid.taps_at(uvs[rows], scale[rows])) - 1
             found[:2] *= m.normal_strength
             found[2] = 1 + (found[2] - 1) * min(max(m.normal_strength, 0), 1)
             result[:, rows] = found

@@ -175,19 +175,18 @@ def cut(patches: _Patches, faces: Faces, longest: float) -> _Patches:
     done_weights: list[Array] = []
     face, weights, total = patches.face, patches.weights, 0
     while len(face):
-        corners = product(weights, faces.corners[face])
-        edges = lengths(corners[:, [1, 2, 0]] - corners)
-        split = edges.max(axis=1) > longest
+        length, start = _longest_edges(face, weights, faces)
+        split = length > longest
         done_face.append(face[~split])
         done_weights.append(weights[~split])
         total += int((~split).sum())
-        face, weights = face[split], weights[split]
+        face, weights, start = face[split], weights[split], start[split]
         if total + 2 * len(face) > MOST:
             log.warning("surfel density lowered: more than %d surfels would be needed", MOST)
             done_face.append(face)
             done_weights.append(weights)
             break
-        face, weights = _bisected(face, weights, faces)
+        face, weights = _bisected(face, weights, start)
     face, weights = np.concatenate(done_face), np.concatenate(done_weights)
     order = np.argsort(face, kind="stable")
     return _Patches(face[order], weights[order])
@@ -215,28 +214,32 @@ def cut_for_detail(patches: _Patches, faces: Faces, detail: Detail, most: int, f
     face, weights = patches.face, patches.weights
     if len(face) >= most:
         return patches, -1
-    hidden = detail.hidden_by(face, weights)
+    hidden, (length, start) = detail.hidden_by(face, weights), _longest_edges(face, weights, faces)
     while True:
-        longest = lengths(np.roll(corners := product(weights, faces.corners[face]), -1, axis=1) - corners).max(axis=1)
-        wanted = np.flatnonzero((hidden > 0) & (longest > finest))
+        wanted = np.flatnonzero((hidden > 0) & (length > finest))
         room = most - len(face)
         if not len(wanted) or room <= 0:
             return _Patches(face, weights), int((hidden > 0).sum())
         wanted = wanted[np.argsort(-hidden[wanted], kind="stable")[:room]]
         split = np.zeros(len(face), bool)
         split[wanted] = True
-        new_face, new_weights = _bisected(face[split], weights[split], faces)
-        found = detail.hidden_by(new_face, new_weights)
-        face, weights = np.concatenate([face[~split], new_face]), np.concatenate([weights[~split], new_weights])
-        hidden = np.concatenate([hidden[~split], found])
-        order = np.argsort(face, kind="stable")
-        face, weights, hidden = face[order], weights[order], hidden[order]
+        halves = _bisected(face[split], weights[split], start[split])
+        known = face, weights, hidden, length, start
+        new = *halves, detail.hidden_by(*halves), *_longest_edges(*halves, faces)
+        joined = [np.concatenate([old[~split], more]) for old, more in zip(known, new, strict=True)]
+        order = np.argsort(joined[0], kind="stable")
+        face, weights, hidden, length, start = (values[order] for values in joined)
 
 
-def _bisected(face: Array, weights: Array, faces: Faces) -> tuple[Array, Array]:
-    """Both halves of patches, the longest edge of each cut at its middle."""
+def _longest_edges(face: Array, weights: Array, faces: Faces) -> tuple[Array, Array]:
+    """Length (n,) of the longest edge of each patch, metres, and the corner from which it runs to the next one."""
     corners = product(weights, faces.corners[face])
-    start = lengths(np.roll(corners, -1, axis=1) - corners).argmax(axis=1)  # the edge from corner `start` to the next
+    edges = lengths(corners[:, [1, 2, 0]] - corners)
+    return edges.max(axis=1), edges.argmax(axis=1)
+
+
+def _bisected(face: Array, weights: Array, start: Array) -> tuple[Array, Array]:
+    """Both halves of patches, the edge of each from corner `start` to the next one cut at its middle."""
     row = np.arange(len(face))
     a, b, c = (weights[row, (start + k) % 3] for k in range(3))
     middle = 0.5 * (a + b)

@@ -25,7 +25,6 @@ class GltfMaterials:
         self.used: list[MaterialFile] = []
         self._known: dict[int | None, tuple[int, int]] = {}
         self._pixels: dict[int, Array | None] = {}
-        self._normal_set = 0  # UV set of the normal map that was read last
 
     def use(self, index: int | None) -> tuple[int, int]:
         """(number in `used`, UV set) of the glTF material `index`; None is glTF's default material."""
@@ -57,13 +56,11 @@ class GltfMaterials:
         if get(entry, "emissiveTexture", dict) or document.numbers(entry, "emissiveFactor", (0.0, 0.0, 0.0)).any():
             self.notes.append(f"{material.name}: emission ignored")
         self._alpha(entry, material, float(colour[3]))
-        self._normal_map(entry, material, (colour_set if material.base_colour_image else other_set))
+        uv_set = self._normal_map(entry, material, colour_set if material.base_colour_image else other_set)
         for name in extensions:
             if name.startswith("KHR_materials_"):
                 self.notes.append(f"{material.name}: {name} ignored")
-        if material.base_colour_image or material.metallic_roughness_image or material.normal_image is None:
-            return colour_set if material.base_colour_image else other_set
-        return self._normal_set
+        return uv_set
 
     def _alpha(self, entry: dict[str, Any], material: MaterialFile, factor: float) -> None:
         """Read the alpha of the base colour, cut at the cutoff where the material says so."""
@@ -80,18 +77,21 @@ class GltfMaterials:
             factor = float(factor >= cutoff) if alpha is None else 1.0
         material.alpha, material.alpha_image = factor, alpha
 
-    def _normal_map(self, entry: dict[str, Any], material: MaterialFile, uv_set: int) -> None:
-        """Read the normal map; it is left out, with a note, where it has another UV set than other textures."""
-        info = self.document.get(entry, "normalTexture", dict)
-        if info is None:
-            return
-        image, self._normal_set = self._texture(entry, "normalTexture", srgb=False)
-        others = material.base_colour_image or material.metallic_roughness_image
-        if image is not None and others and self._normal_set != uv_set:
+    def _normal_map(self, entry: dict[str, Any], material: MaterialFile, uv_set: int) -> int:
+        """Read the normal map; return the UV set of all textures, that of the others (`uv_set`) where there are any.
+
+        A map that has another UV set than those is left out, with a note.
+        """
+        image, own_set = self._texture(entry, "normalTexture", srgb=False)
+        if image is None:
+            return uv_set
+        if own_set != uv_set and (material.base_colour_image or material.metallic_roughness_image):
             self.notes.append(f"{material.name}: normal map ignored: its UV map is not that of the other textures")
-        elif image is not None:
-            material.normal_image = image
-            material.normal_strength = float(self.document.numbers(info, "scale", (1.0,))[0])
+            return uv_set
+        info = self.document.get(entry, "normalTexture", dict, {})
+        material.normal_image = image
+        material.normal_strength = float(self.document.numbers(info, "scale", (1.0,))[0])
+        return own_set
 
     def _specular_glossiness(self, material: MaterialFile, pbr: dict[str, Any]) -> int:
         """Approximate a specular-glossiness material: what is specular beyond a dielectric's 4 % is metal."""
