@@ -14,6 +14,7 @@ from ..drgs_blender.core.asset import Asset
 from ..drgs_blender.core.asset.container import read_asset
 from ..drgs_blender.core.errors import AssetError, UsageError
 from ..drgs_blender.core.frame_sequences import frame_path
+from .blend_paths import relative
 from .preferences import ROOT
 
 #: (path, mtime_ns, size) -> asset, arrays memory-mapped. A changed file gets a new key; `forget` empties it.
@@ -47,12 +48,7 @@ def anchor(path: Path) -> bpy.types.Volume:
         if not volume.library and volume.filepath and _key(bpy.path.abspath(volume.filepath)) == _key(path):
             return volume
     volume = bpy.data.volumes.new(path.name)
-    volume.filepath = str(path)
-    if bpy.data.filepath:
-        try:
-            volume.filepath = bpy.path.relpath(str(path))
-        except ValueError:  # another drive on Windows: there is no relative path
-            volume.filepath = str(path)
+    volume.filepath = relative(path)
     return volume
 
 

@@ -4,7 +4,7 @@ Blender itself plays it, by its own frame number: the same in viewports, F12, `b
 extension, in any order of frames, between them (motion vectors), after undo and after loading, and nothing is called at
 a frame change. What is in the file is in the cache as well; it can be thrown away at any time.
 
-Layout after Autodesk's PointCache 2, as Blender's MOD_meshcache_pc2.c reads it. The header's count of frames is changed
+Layout as of `point_caches`. The header's count of frames is changed
 after the frames are written, so a reader never sees a part of one.
 """
 
@@ -24,16 +24,16 @@ import numpy as np
 from ..drgs_blender.core.asset.archive import replace_file
 from ..drgs_blender.core.errors import AssetError, DrgsError, UsageError, WriteError
 from ..drgs_blender.core.particle_cache import HEADER, Header, ParticleCache
+from . import point_caches
+from .point_caches import MAGIC, PC2
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
 
 MODIFIER = "DR-GS Physics"
 FILE = "mesh.pc2"
-_HEAD = struct.Struct("<12s2i2fi")
 _COUNT = struct.Struct("<i")
-_COUNT_AT = _HEAD.size - _COUNT.size
-_MAGIC = b"POINTCACHE2\0"
+_COUNT_AT = PC2.size - _COUNT.size
 
 
 class Playback:
@@ -93,11 +93,11 @@ class Playback:
     def _append(self, header: Header) -> None:
         frame = self._vertices(header, self.count)
         if self.count == 0:
-            head = _HEAD.pack(_MAGIC, 1, len(frame), float(header.first), 1.0, 1)
+            head = PC2.pack(MAGIC, 1, len(frame), float(header.first), 1.0, 1)
             replace_file(self.path, [head, frame.tobytes()])
         else:
             with open(self.path, "r+b") as file:
-                file.seek(_HEAD.size + self.count * frame.nbytes)
+                file.seek(PC2.size + self.count * frame.nbytes)
                 file.write(frame.tobytes())
                 file.flush()
                 file.seek(_COUNT_AT)
@@ -119,11 +119,11 @@ class Playback:
             return 0  # the cache does not record whether these have changed
         try:
             with open(self.path, "rb") as file:
-                magic, _, points, _, _, count = _HEAD.unpack(file.read(_HEAD.size))
-                if magic != _MAGIC or points != header.vertices or count < 1 or header.first + count - 1 not in there:
+                magic, _, points, _, _, count = PC2.unpack(file.read(PC2.size))
+                if magic != MAGIC or points != header.vertices or count < 1 or header.first + count - 1 not in there:
                     return 0
                 for index in {0, count - 1}:
-                    file.seek(_HEAD.size + index * points * 12)
+                    file.seek(PC2.size + index * points * 12)
                     if file.read(points * 12) != self._vertices(header, index).tobytes():
                         return 0
                 return count
@@ -133,7 +133,7 @@ class Playback:
 
 def modifier_of(obj: bpy.types.Object) -> bpy.types.Modifier | None:
     """The modifier that plays the cache of an object."""
-    return next((m for m in obj.modifiers if m.type == "MESH_CACHE" and m.name.startswith(MODIFIER)), None)
+    return point_caches.find(obj, MODIFIER)
 
 
 def check(obj: bpy.types.Object, warn: Callable[[str], None], *, final: bool) -> None:
@@ -179,10 +179,7 @@ def fracture_state(obj: bpy.types.Object) -> dict[str, Any]:
 def attach(obj: bpy.types.Object, path: Path, first: int) -> None:
     """Let the object play the file; a new modifier is the last of all, and stays where it is moved."""
     modifier = modifier_of(obj) or obj.modifiers.new(MODIFIER, "MESH_CACHE")
-    modifier.cache_format, modifier.filepath = "PC2", _relative(path)
-    modifier.interpolation, modifier.time_mode, modifier.play_mode = "LINEAR", "FRAME", "SCENE"
-    modifier.deform_mode, modifier.forward_axis, modifier.up_axis = "OVERWRITE", "POS_Y", "POS_Z"
-    modifier.frame_start, modifier.frame_scale = first, 1.0
+    point_caches.play(modifier, path, first)
 
 
 def detach(obj: bpy.types.Object) -> None:
@@ -207,12 +204,3 @@ def hidden(obj: bpy.types.Object) -> Iterator[None]:
         for name, value in shown:
             if name in obj.modifiers:
                 obj.modifiers[name].show_viewport = value
-
-
-def _relative(path: Path) -> str:
-    if not bpy.data.filepath:
-        return str(path)
-    try:
-        return bpy.path.relpath(str(path))
-    except ValueError:  # another drive on Windows
-        return str(path)

@@ -1,4 +1,7 @@
-"""Point caches of other programs (PC2, MDD) that Blender's Mesh Cache modifier plays on a DR-GS object."""
+"""Point caches (PC2, MDD) and the Mesh Cache modifier by which Blender plays them on a DR-GS object.
+
+Layouts after Autodesk's PointCache 2 and NewTek's MDD, as Blender's MOD_meshcache_pc2.c and _mdd.c read them.
+"""
 
 from __future__ import annotations
 
@@ -9,38 +12,49 @@ from pathlib import Path
 import bpy
 
 from ..drgs_blender.core.asset import Mesh
+from .blend_paths import relative
 
 MODIFIER = "Point Cache"
-SUFFIXES = (".pc2", ".mdd")
-_MAGIC = b"POINTCACHE2\0"
+#: Head of a PC2: magic, version, vertices, first frame, frames per sample, samples; of an MDD: samples, vertices.
+PC2, _MDD = struct.Struct("<12s2i2fi"), struct.Struct(">2i")
+MAGIC = b"POINTCACHE2\0"
 
 
 def header_of(path: Path) -> tuple[int, int] | None:
     """(vertices, first frame) of a point cache; None where the file is none or cannot be read."""
     try:
         with open(path, "rb") as file:
-            head = file.read(32)
+            head = file.read(PC2.size)
     except OSError:
         return None
-    if head.startswith(_MAGIC) and len(head) == 32:
-        _, points, start, _, _ = struct.unpack("<2i2fi", head[12:])
+    if head.startswith(MAGIC) and len(head) == PC2.size:
+        _, _, points, start, _, _ = PC2.unpack(head)
         return points, round(start) if abs(start) < 1e6 else 1
-    if path.suffix.lower() == ".mdd" and len(head) >= 8:
-        return struct.unpack(">2i", head[:8])[1], 1
+    if path.suffix.lower() == ".mdd" and len(head) >= _MDD.size:
+        return _MDD.unpack(head[: _MDD.size])[1], 1
     return None
 
 
-def attach(obj: bpy.types.Object, path: Path, first: int) -> bpy.types.Modifier:
-    """Let `obj` play the file by a Mesh Cache modifier, before all modifiers that it has."""
-    modifier = next((m for m in obj.modifiers if m.type == "MESH_CACHE" and m.name.startswith(MODIFIER)), None)
-    if modifier is None:
-        modifier = obj.modifiers.new(MODIFIER, "MESH_CACHE")
-        obj.modifiers.move(len(obj.modifiers) - 1, 0)
-    modifier.cache_format, modifier.filepath = path.suffix[1:].upper(), str(path)
+def find(obj: bpy.types.Object, name: str) -> bpy.types.Modifier | None:
+    """The Mesh Cache modifier of `obj` with this name, or that and a number."""
+    return next((m for m in obj.modifiers if m.type == "MESH_CACHE" and m.name.startswith(name)), None)
+
+
+def play(modifier: bpy.types.Modifier, path: Path, first: int) -> None:
+    """Let a Mesh Cache modifier play the file from frame `first` on, in object space, Z up."""
+    modifier.cache_format, modifier.filepath = path.suffix[1:].upper(), relative(path)
     modifier.interpolation, modifier.time_mode, modifier.play_mode = "LINEAR", "FRAME", "SCENE"
     modifier.deform_mode, modifier.forward_axis, modifier.up_axis = "OVERWRITE", "POS_Y", "POS_Z"
     modifier.frame_start, modifier.frame_scale = first, 1.0
-    return modifier
+
+
+def attach(obj: bpy.types.Object, path: Path, first: int) -> None:
+    """Let `obj` play the file by a Mesh Cache modifier, before all modifiers that it has."""
+    modifier = find(obj, MODIFIER)
+    if modifier is None:
+        modifier = obj.modifiers.new(MODIFIER, "MESH_CACHE")
+        obj.modifiers.move(len(obj.modifiers) - 1, 0)
+    play(modifier, path, first)
 
 
 def check(obj: bpy.types.Object, rest: Mesh, warn: Callable[[str], None], *, final: bool) -> None:

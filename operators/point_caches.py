@@ -8,6 +8,7 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from ..addon import assets, point_caches
+from ..drgs_blender.core.asset import Mesh
 from ..drgs_blender.core.errors import UsageError
 from . import selection
 from .engine_command import CommandOperator
@@ -59,7 +60,7 @@ class DRGS_OT_play_point_cache(CommandOperator, selection.ObjectMode, bpy.types.
         rest = assets.load(asset).mesh
         points, first = found
         self._name, self._first = obj.name, first if self.use_file_start else context.scene.frame_start
-        order = self._order(points, len(rest.vertices), rest.source_count, rest.source is not None, subject, path)
+        order = self._order(rest, points, subject, path)
         if order == "ASSET":
             self._target = path
             return self.done(context)
@@ -72,20 +73,14 @@ class DRGS_OT_play_point_cache(CommandOperator, selection.ObjectMode, bpy.types.
         obj = bpy.data.objects.get(self._name)
         if obj is None:
             raise UsageError(f'Object "{self._name}"', "is gone", "Undo what removed it")
-        path = str(self._target)
-        if bpy.data.filepath:
-            try:
-                path = bpy.path.relpath(path)
-            except ValueError:  # another drive on Windows
-                path = str(self._target)
-        point_caches.attach(obj, self._target, self._first).filepath = path
+        point_caches.attach(obj, self._target, self._first)
         return {"FINISHED"}
 
-    def _order(self, points: int, own: int, source: int, mapped: bool, subject: str, path: Path) -> str:
-        """ASSET or SOURCE."""
-        fitting = [name for name, count in (("ASSET", own), ("SOURCE", source if mapped else -1)) if points == count]
+    def _order(self, rest: Mesh, points: int, subject: str, path: Path) -> str:
+        """ASSET or SOURCE: what a cache of so many vertices moves."""
+        own, fitting = len(rest.vertices), [order.upper() for order in rest.orders_of(points)]
         if not fitting or self.vertex_order not in ("AUTO", *fitting):
-            made_from = f", the mesh it was made from {source}" if mapped else ""
+            made_from = "" if rest.source is None else f", the mesh it was made from {rest.source_count}"
             problem = f"has {own} vertices{made_from}; {path.name} has {points}"
             raise UsageError(subject, problem, "Choose another cache")
         if self.vertex_order != "AUTO":

@@ -43,10 +43,9 @@ def in_asset_order(args: argparse.Namespace, mesh: Mesh, vertices: np.ndarray) -
         It fits both, and the order is not said.
     """
     subject, order = f"--vertices {args.vertices}", args.vertex_order
-    own, source, made_from = len(mesh.vertices), mesh.source, mesh.source_count
-    fitting = [name for name, count in (("asset", own), ("source", made_from)) if len(vertices) == count]
-    if not fitting or (order and order not in fitting):
-        there = f"the asset has {own}, the mesh it was made from {made_from}"
+    own, source, fitting = len(mesh.vertices), mesh.source, mesh.orders_of(len(vertices))
+    if not fitting or (order and source is not None and order not in fitting):
+        there = f"the asset has {own}, the mesh it was made from {mesh.source_count}"
         raise AssetError(subject, f"has {len(vertices)} vertices; {there}", "Pose this asset, or that mesh")
     if source is None:
         return vertices

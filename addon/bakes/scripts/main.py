@@ -15,8 +15,8 @@ import threading
 import traceback
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE), str(HERE.parent)]
+_FOLDER = Path(__file__).resolve().parent
+sys.path[:0] = [str(_FOLDER), str(_FOLDER.parent)]
 
 
 def main() -> None:

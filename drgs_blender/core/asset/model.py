@@ -191,15 +191,20 @@ class Mesh:
         """How many vertices the source has."""
         return len(self.vertices) if self.source is None else int(self.source.count[0])
 
+    def orders_of(self, count: int) -> tuple[str, ...]:
+        """Orders of a pose with `count` vertices: "asset", that of this mesh, and "source", where that differs."""
+        own, source = len(self.vertices) == count, self.source is not None and self.source_count == count
+        return ("asset",) * own + ("source",) * source
+
     def in_own_order(self, vertices: Array) -> Array:
         """A pose in the order of this mesh, if it has as many vertices as its source and not as many as itself.
 
         Any other is returned as it is.
         """
-        source = self.source
-        if source is None or len(vertices) == len(self.vertices) or np.shape(vertices) != (self.source_count, 3):
+        if np.shape(vertices)[1:] != (3,) or self.orders_of(len(vertices)) != ("source",):
             return vertices
-        return source.to_asset(vertices)
+        assert self.source is not None
+        return self.source.to_asset(vertices)
 
     @classmethod
     def empty(cls) -> Mesh:

@@ -5,8 +5,8 @@ that nothing is drawn for lights that shine elsewhere; kernels choose them by th
 rays of lights with shadow linking have masks of their own (`scene.ray_masks`); such lights are found by their own
 samples alone, since a ray by another strategy meets other objects.
 
-Kernels are compiled anew for `LinkedTables`. With `LightTables` the functions here do nothing, and are gone from the
-machine code.
+Kernels have a version of their own for `LinkedTables`. With `LightTables` the functions here do nothing, and are gone
+from the machine code.
 """
 
 from __future__ import annotations
