@@ -14,10 +14,11 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import numpy as np
-from judge import blender_python, decibels, environments, psnr, systematic_error, to_srgb
+from judge import blender_python, environments, psnr, systematic_error, to_srgb, without_noise
 from PIL import Image
 from report import OUT, ROOT, table, write_section
 from scipy.ndimage import binary_erosion
@@ -32,6 +33,8 @@ SCENES = {
     "catcher": "the same, floor a shadow catcher",
 }
 _PROGRAM = Path(__file__).with_name("composed_job.py")
+#: (scene, ours, theirs) -> its line of the table.
+Row = Callable[[str, np.ndarray, np.ndarray], tuple[str, ...]]
 
 
 def render(
@@ -74,27 +77,39 @@ def show(ours: np.ndarray, theirs: np.ndarray, path: Path) -> None:
     Image.fromarray((sheet * 255 + 0.5).astype(np.uint8)).save(path)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser()
+def options_of(text: str, scenes: Collection[str], seeds: int, spp: int, samples: int) -> argparse.Namespace:
+    """Options of the command line of a program that compares `scenes`; the numbers are defaults."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=192)
-    parser.add_argument("--seeds", type=int, default=3, help="independent pictures of either program, at least 2")
-    parser.add_argument("--spp", type=int, default=1024, help="of Cycles, a pixel and picture")
-    parser.add_argument("--samples", type=int, default=2048, help="of ours, a pixel and picture")
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
+    parser.add_argument("--seeds", type=int, default=seeds, help="independent pictures of either program, at least 2")
+    parser.add_argument("--spp", type=int, default=spp, help="of Cycles, per pixel and picture")
+    parser.add_argument("--samples", type=int, default=samples, help="of ours, per pixel and picture")
+    parser.add_argument("--scenes", nargs="+", default=list(scenes), choices=list(scenes))
     options = parser.parse_args()
     if options.seeds < 2:
         parser.error("--seeds: noise can be separated from the rest with two pictures or more")
+    return options
+
+
+def compare(options: argparse.Namespace, row: Row, name: str, module: str = "composed_job") -> list[tuple[str, ...]]:
+    """Lines of the table of all scenes that the options ask for; a picture of each is kept as ``name-SCENE.png``."""
     OUT.mkdir(parents=True, exist_ok=True)
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         command = [sys.executable, str(ROOT / "tools" / "extension.py"), "--out", str(folder / "extension.zip")]
         subprocess.run(command, check=True)
-        for name in options.scenes:
-            ours, theirs = render(name, options, folder)
-            rows.append(row(name, ours, theirs))
-            show(ours.mean(0), theirs.mean(0), OUT / f"composed-{name}.png")
+        for scene in options.scenes:
+            ours, theirs = render(scene, options, folder, module)
+            rows.append(row(scene, ours, theirs))
+            show(ours.mean(0), theirs.mean(0), OUT / f"{name}-{scene}.png")
             print(*rows[-1], flush=True)
+    return rows
+
+
+def main() -> None:
+    options = options_of(__doc__ or "", SCENES, seeds=3, spp=1024, samples=2048)
+    rows = compare(options, row, "composed")
     if options.scenes == list(SCENES):
         write_section("composed", "Whole scenes against Cycles", report(options, rows))
 
@@ -104,13 +119,10 @@ def row(name: str, ours: np.ndarray, theirs: np.ndarray) -> tuple[str, ...]:
     mask = binary_erosion((theirs[..., 3].min(0) > 0.999) & (ours[..., 3].min(0) > 0.999), iterations=2)
     error, deviation = systematic_error(ours, theirs, mask)
     a, b = ours.mean(0), theirs.mean(0)
-    systematic = (
-        f"{decibels(error):.1f}" if error > 2 * deviation else f"> {decibels(max(error, 0) + 2 * deviation):.1f}"
-    )
     alpha = a[..., 3] - b[..., 3]
     light = a[mask][:, :3].mean() / b[mask][:, :3].mean() - 1
     return (
-        name, SCENES[name], f"{psnr(a, b, mask):.2f}", systematic, f"{light:+.2%}",
+        name, SCENES[name], f"{psnr(a, b, mask):.2f}", without_noise(error, deviation), f"{light:+.2%}",
         f"{np.abs(alpha).mean():.4f} ({alpha.mean():+.4f})", f"{psnr(theirs[0], theirs[1], mask):.1f}",
     )  # fmt: skip
 

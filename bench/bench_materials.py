@@ -8,15 +8,11 @@ Both pictures come out of Blender, ours through the extension, from one file (`c
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
-import tempfile
-from pathlib import Path
 
 import numpy as np
-from bench_composed import BOUNCES, render, show
-from judge import decibels, psnr, systematic_error
-from report import OUT, ROOT, table, write_section
+from bench_composed import BOUNCES, compare, options_of
+from judge import psnr, systematic_error, without_noise
+from report import table, write_section
 from scipy.ndimage import binary_erosion
 
 SCENES = {
@@ -38,26 +34,8 @@ SCENES = {
 
 def main() -> None:
     """Measure and write the section."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--size", type=int, default=192)
-    parser.add_argument("--seeds", type=int, default=2, help="independent pictures of either program, at least 2")
-    parser.add_argument("--spp", type=int, default=512, help="of Cycles, per pixel and picture")
-    parser.add_argument("--samples", type=int, default=1024, help="of ours, per pixel and picture")
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
-    options = parser.parse_args()
-    if options.seeds < 2:
-        parser.error("--seeds: noise can be separated from the rest with two pictures or more")
-    OUT.mkdir(parents=True, exist_ok=True)
-    rows = []
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        command = [sys.executable, str(ROOT / "tools" / "extension.py"), "--out", str(folder / "extension.zip")]
-        subprocess.run(command, check=True)
-        for name in options.scenes:
-            ours, theirs = render(name, options, folder, "material_scenes")
-            rows.append(row(name, ours, theirs))
-            show(ours.mean(0), theirs.mean(0), OUT / f"materials-{name}.png")
-            print(*rows[-1], flush=True)
+    options = options_of(__doc__ or "", SCENES, seeds=2, spp=512, samples=1024)
+    rows = compare(options, row, "materials", "material_scenes")
     if options.scenes == list(SCENES):
         write_section("materials", "Materials and worlds against Cycles", report(options, rows))
 
@@ -66,13 +44,12 @@ def row(name: str, ours: np.ndarray, theirs: np.ndarray) -> tuple[str, ...]:
     """A scene's line of the table; of the pixels where Cycles shows something."""
     mask = binary_erosion(theirs[..., 3].min(0) > 0.999, iterations=2)
     error, deviation = systematic_error(ours, theirs, mask)
-    found = f"{decibels(error):.1f}" if error > 2 * deviation else f"> {decibels(max(error, 0) + 2 * deviation):.1f}"
     a, b = ours.mean(0), theirs.mean(0)
     light = a[mask][:, :3].mean() / b[mask][:, :3].mean() - 1
     return (
         name,
         SCENES[name],
-        found,
+        without_noise(error, deviation),
         f"{psnr(a, b, mask):.2f}",
         f"{light:+.2%}",
         f"{psnr(theirs[0], theirs[1], mask):.1f}",

@@ -15,7 +15,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from judge import cycles_pictures, decibels, environments, foreground, frame_camera, psnr, systematic_error
+from judge import (
+    cycles_pictures,
+    decibels,
+    environments,
+    foreground,
+    frame_camera,
+    psnr,
+    systematic_error,
+    without_noise,
+)
 from ours import relight
 from report import OUT, table, write_section
 from subjects import spread_asset
@@ -45,7 +54,7 @@ class Score:
 
     def __str__(self) -> str:
         """`error` in dB; where it cannot be distinguished from zero, what it is better than."""
-        return f"{decibels(self.error):.1f}" if self.error > 2 * self.deviation else f"> {decibels(self.bound):.1f}"
+        return without_noise(self.error, self.deviation)
 
 
 def score(ours: np.ndarray, theirs: np.ndarray) -> Score:

@@ -20,6 +20,9 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
+sys.path.append(str(Path(__file__).resolve().parent))
+from cycles_job import plain_shading
+
 UP = (0, 0, 1)
 
 
@@ -217,15 +220,8 @@ def build(job: dict) -> bpy.types.Scene:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
     bpy.ops.wm.save_as_mainfile(filepath=job["blend"])
-    sys.path.append(str(Path(__file__).parent))
     importlib.import_module(job["module"]).SCENES[job["scene"]](job)
-    for made in bpy.data.materials:
-        for node in made.node_tree.nodes if made.node_tree else ():
-            if node.type == "BSDF_PRINCIPLED":
-                node.distribution = "GGX"
-    for obj in bpy.data.objects:
-        # Not physics: it lights what the mesh itself shadows.
-        obj.shadow_terminator_geometry_offset = obj.shadow_terminator_shading_offset = 0.0
+    plain_shading()
     render = scene.render
     render.resolution_x = render.resolution_y = job["size"]
     render.film_transparent = True

@@ -30,6 +30,19 @@ def reset() -> bpy.types.Scene:
     return bpy.context.scene
 
 
+def plain_shading() -> None:
+    """Let all materials and objects of the file be what both programs solve alike.
+
+    GGX without multiple scattering; Cycles' shadow terminator offsets, which are no physics, off.
+    """
+    for material in bpy.data.materials:
+        for node in material.node_tree.nodes if material.node_tree else ():
+            if node.type == "BSDF_PRINCIPLED":
+                node.distribution = "GGX"
+    for obj in bpy.data.objects:
+        obj.shadow_terminator_geometry_offset = obj.shadow_terminator_shading_offset = 0.0
+
+
 def add_world(scene: bpy.types.Scene, path: str, rotation_z: float, strength: float) -> None:
     world = bpy.data.worlds.new("world")
     scene.world = world

@@ -15,19 +15,14 @@ import bpy
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from cycles_job import add_camera, add_world, render, reset
+from cycles_job import add_camera, add_world, plain_shading, render, reset
 
 
 def main(path: str) -> None:
     for job in json.loads(Path(path).read_text()):
         scene = reset()
         bpy.ops.import_scene.gltf(filepath=job["file"])
-        for material in bpy.data.materials:
-            for node in material.node_tree.nodes if material.node_tree else ():
-                if node.type == "BSDF_PRINCIPLED":
-                    node.distribution = "GGX"
-        for obj in bpy.data.objects:
-            obj.shadow_terminator_geometry_offset = obj.shadow_terminator_shading_offset = 0.0
+        plain_shading()
         add_world(scene, job["environment"], 0.0, job["strength"])
         add_camera(scene, job["camera"])
         pixels, _ = render(scene, job)

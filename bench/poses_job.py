@@ -16,7 +16,7 @@ import bpy
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from cycles_job import add_camera, add_world, render, reset
+from cycles_job import add_camera, add_world, plain_shading, render, reset
 
 
 def imported(path: Path) -> list[bpy.types.Object]:
@@ -64,7 +64,6 @@ def main(path: str) -> None:
         grey.use_nodes = True
         inputs = grey.node_tree.nodes["Principled BSDF"].inputs
         inputs["Base Color"].default_value, inputs["Roughness"].default_value = (0.6, 0.6, 0.6, 1), 0.5
-        grey.node_tree.nodes["Principled BSDF"].distribution = "GGX"
         for obj, matrix, start, stop in zip(objects, places, starts, starts[1:]):
             obj.animation_data_clear()
             for modifier in list(obj.modifiers):
@@ -82,7 +81,7 @@ def main(path: str) -> None:
             mesh.materials.append(grey)
             mesh.polygons.foreach_set("material_index", [0] * len(mesh.polygons))
             mesh.update()
-            obj.shadow_terminator_geometry_offset = obj.shadow_terminator_shading_offset = 0.0
+        plain_shading()
         if job["renders"]:
             add_world(scene, job["environment"], 0.0, job["strength"])
             add_camera(scene, job["camera"])

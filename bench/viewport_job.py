@@ -114,7 +114,7 @@ class Run:
         self.turn(0)
 
     def begin_redraws(self) -> None:
-        """Count redraws anew."""
+        """Forget the redraws so far."""
         self.views.redraws.clear()
         self.bringing.clear()
 

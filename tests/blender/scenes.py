@@ -132,6 +132,22 @@ def armature_object(bones: dict[str, tuple]) -> bpy.types.Object:
     return obj
 
 
+def shine_as_position(wall: bpy.types.Object, offset: float) -> None:
+    """Give a wall a material that shines as its position; `offset` is added, because light is not negative."""
+    material = bpy.data.materials.new("Position")
+    if material.node_tree is None:
+        material.use_nodes = True
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    place, moved = nodes.new("ShaderNodeNewGeometry"), nodes.new("ShaderNodeVectorMath")
+    shine, output = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
+    moved.inputs[1].default_value = (offset,) * 3
+    links.new(place.outputs["Position"], moved.inputs[0])
+    links.new(moved.outputs[0], shine.inputs["Color"])
+    links.new(shine.outputs[0], output.inputs["Surface"])
+    wall.data.materials.append(material)
+
+
 def select(*objects: bpy.types.Object) -> None:
     """Select exactly these; the last one is active."""
     for obj in bpy.context.scene.objects:

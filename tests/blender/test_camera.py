@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Matrix, Vector
-from scenes import mesh_object, part, read_exr
+from scenes import mesh_object, part, read_exr, shine_as_position
 
 pytestmark = pytest.mark.blender_api
 
@@ -102,18 +102,7 @@ def test_every_pixel_of_a_cycles_picture_of_positions_projects_to_itself(scene, 
         render.border_min_x, render.border_min_y, render.border_max_x, render.border_max_y = case["border"]
     # A tilted wall that fills the picture and shines as its position (offset, because light is not negative).
     wall = mesh_object("Wall", [(-30, -2, -30), (30, 4, -30), (30, 9, 30), (-30, 3, 30)], [(0, 1, 2, 3)])
-    material = bpy.data.materials.new("Position")
-    if material.node_tree is None:
-        material.use_nodes = True
-    nodes, links = material.node_tree.nodes, material.node_tree.links
-    nodes.clear()
-    place, offset = nodes.new("ShaderNodeNewGeometry"), nodes.new("ShaderNodeVectorMath")
-    shine, output = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
-    offset.inputs[1].default_value = (50, 50, 50)
-    links.new(place.outputs["Position"], offset.inputs[0])
-    links.new(offset.outputs[0], shine.inputs["Color"])
-    links.new(shine.outputs[0], output.inputs["Surface"])
-    wall.data.materials.append(material)
+    shine_as_position(wall, 50)
     render.engine = "CYCLES"
     scene.cycles.samples, scene.cycles.use_denoising = 1, False
     scene.cycles.pixel_filter_type, scene.cycles.filter_width = "BOX", 0.01

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 import pytest
 from mathutils import Matrix
-from scenes import mesh_object, new_world, part, read_exr, sphere
+from scenes import mesh_object, new_world, part, read_exr, shine_as_position, sphere
 
 CASES = {
     "equirectangular": {"panorama_type": "EQUIRECTANGULAR"},
@@ -69,18 +69,7 @@ def test_every_pixel_of_cycles_looks_where_ours_does(scene, name):
     )
     vertices, faces = sphere(200, 300)
     wall = mesh_object("Wall", 100 * vertices + (3, 1, 2), faces)
-    material = bpy.data.materials.new("Position")
-    if material.node_tree is None:
-        material.use_nodes = True
-    nodes, links = material.node_tree.nodes, material.node_tree.links
-    nodes.clear()
-    place, offset = nodes.new("ShaderNodeNewGeometry"), nodes.new("ShaderNodeVectorMath")
-    shine, output = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
-    offset.inputs[1].default_value = (200, 200, 200)
-    links.new(place.outputs["Position"], offset.inputs[0])
-    links.new(offset.outputs[0], shine.inputs["Color"])
-    links.new(shine.outputs[0], output.inputs["Surface"])
-    wall.data.materials.append(material)
+    shine_as_position(wall, 200)
     scene.camera.data.clip_end = 1000
     bpy.context.view_layer.update()
     camera = part("addon.export.camera").export_camera(scene.camera, render)
