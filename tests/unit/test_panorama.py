@@ -20,6 +20,7 @@ from drgs_blender.core.frame import (
     Camera,
     Frame,
     Light,
+    Material,
     MeshState,
     MotionStep,
     ObjectState,
@@ -35,11 +36,14 @@ from drgs_blender.render import pipeline
 from drgs_blender.render.camera import camera_parameters, camera_ray, check_camera, sample_ray
 from drgs_blender.render.denoise import noisy_frames
 from drgs_blender.render.film.motion_vectors import project
+from drgs_blender.render.gbuffer.camera_hits import trace_camera
 from drgs_blender.render.gbuffer.surfel_rays import SurfelRays, blend_along_rays
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.lights.light_sampler import Lights
 from drgs_blender.render.prepared_scene import PreparedScene
 from drgs_blender.render.progressive import coarse
+from drgs_blender.render.scene.ray_masks import ORDINARY
+from drgs_blender.render.scene.trace_scene import TraceScene
 from drgs_blender.render.surfel_columns import ALBEDO, NORMAL
 from drgs_blender.render.surfels.surfel_bvh import SurfelBVH
 
@@ -222,6 +226,22 @@ def test_beyond_a_fisheye_all_is_black_and_opaque_as_in_cycles() -> None:
         inside = (0, 0, 0, 0) if transparent else (0.3, 0.5, 0.7, 1)
         assert np.allclose(combined[far < 19], inside, atol=1e-6)
     tree.close()
+
+
+@pytest.mark.parametrize("alpha", [1.0, 0.5])
+def test_beyond_a_fisheye_nothing_is_met(alpha: float) -> None:
+    """From inside a ball, also one that is half there."""
+    scene = TraceScene()
+    materials = [Material("Veil", alpha=alpha)]
+    mesh = MeshState("Ball", *sphere_mesh(2), np.diag((9, 9, 9, 1))[None], np.zeros(1, np.int32), materials=materials)
+    scene.update([], [mesh])
+    camera = panorama("fisheye", 40, 40)
+    parameters = camera_parameters(camera, SETTINGS, 1)
+    owner = trace_camera(scene, parameters, 0, 0, (40, 40, 1), ORDINARY).owner[..., 0]
+    y, x = np.mgrid[0:40, 0:40] + 0.5
+    far = np.hypot(x - 20, y - 20)
+    assert (owner[far > 21] == -1).all() and (owner[far < 19] == 0).mean() > 0.8 * alpha
+    scene.close()
 
 
 def test_motion_goes_the_shorter_way_round(tmp_path: Path) -> None:

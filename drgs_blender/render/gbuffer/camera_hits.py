@@ -196,6 +196,9 @@ def trace_through_samples(thread, stride, scratch, seen, view_of, mask, owners, 
             x, y, k = n // subpixels % columns, n // (subpixels * columns), n % subpixels
             pixel = (y0 + y) * width + x0 + x
             ox, oy, oz, dx, dy, dz = sample_ray(p, pixel, k)
+            if dx * dx + dy * dy + dz * dz == 0.0:  # beyond the picture of a fisheye lens
+                owner[y, x, k] = -1
+                continue
             number = pixel_shift(p, pixel)[0] * _HASHED + k * _SILVER
             number = number - math.floor(number)
             ray = Ray((F(ox), F(oy), F(oz)), (F(dx), F(dy), F(dz)), near, far, mask)
