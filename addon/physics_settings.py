@@ -17,6 +17,7 @@ from bpy.props import (
 )
 
 from ..drgs_blender.core.sim_materials import MATERIALS
+from . import blend_paths
 
 #: Numbers of every material, and those that some models have besides.
 BASIC = ("youngs_modulus", "poisson", "density")
@@ -29,9 +30,6 @@ OF_MODEL = {
 #: Numbers that Blender keeps in radians and the engine in degrees.
 ANGLES = ("friction_angle",)
 _FIRST = MATERIALS["jelly"]
-#: Newer Blenders need this option on paths that may start with "//".
-_BLEND_RELATIVE = "is_path_supports_blend_relative" in bpy.types.StringProperty.bl_rna.properties
-_RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"} if _BLEND_RELATIVE else set()
 
 MATERIAL_ITEMS = [(name, name.title(), row.about[:1].upper() + row.about[1:]) for name, row in MATERIALS.items()]
 CONTACT_ITEMS = (
@@ -342,7 +340,7 @@ class DrgsPhysicsSettings(_MaterialNumbers, bpy.types.PropertyGroup):
         name="Cache Folder",
         description="Folder of the frames; empty is drgs_cache/OBJECT beside the .blend. One folder per object",
         subtype="DIR_PATH",
-        options=_RELATIVE,
+        options=blend_paths.RELATIVE,
     )
 
 

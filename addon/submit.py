@@ -15,15 +15,9 @@ from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
 from ..drgs_blender.core.errors import DeviceError, UsageError
 from ..drgs_blender.ipc.child_process import clean_environment
-from . import engine_link, messages, output_check
+from . import blend_paths, engine_link, messages, output_check
 
 INTERVAL = 0.2
-#: Newer Blenders warn of a leading // where a property does not say that it may have one.
-_RELATIVE = (
-    {"PATH_SUPPORTS_BLEND_RELATIVE"}
-    if "is_path_supports_blend_relative" in bpy.types.StringProperty.bl_rna.properties
-    else set()
-)
 MANAGERS = (
     ("openjd", "OpenJD", "A job bundle of the Open Job Description, for Deadline Cloud and other schedulers"),
     ("slurm", "Slurm", "An array job"),
@@ -42,7 +36,7 @@ class DrgsSubmitSettings(bpy.types.PropertyGroup):
         description="EXR files; #### becomes the frame's number, // is the folder of the .blend",
         default="//frames/####.exr",
         subtype="FILE_PATH",
-        options=_RELATIVE,
+        options=blend_paths.RELATIVE,
     )
     use_denoise: BoolProperty(
         name="Temporal Denoising",
@@ -54,7 +48,7 @@ class DrgsSubmitSettings(bpy.types.PropertyGroup):
         description="EXR files of the second step",
         default="//denoised/####.exr",
         subtype="FILE_PATH",
-        options=_RELATIVE,
+        options=blend_paths.RELATIVE,
     )
     chunk: IntProperty(
         name="Frames per Task", description="Frames that a node renders in one go", min=1, soft_max=100, default=5
@@ -64,7 +58,7 @@ class DrgsSubmitSettings(bpy.types.PropertyGroup):
         description="Where the job is written",
         default="//job",
         subtype="DIR_PATH",
-        options=_RELATIVE,
+        options=blend_paths.RELATIVE,
     )
     use_check: BoolProperty(
         name="Check Scene",
@@ -75,7 +69,7 @@ class DrgsSubmitSettings(bpy.types.PropertyGroup):
         name="Shared Folder",
         description="Folder that all nodes share under the same path; files outside are reported. Empty: not checked",
         subtype="DIR_PATH",
-        options=_RELATIVE,
+        options=blend_paths.RELATIVE,
     )
     program: StringProperty(
         name="Program", description="Command by which a node of the farm starts drgs", default="drgs"

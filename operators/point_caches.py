@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
-from ..addon import assets, point_caches
+from ..addon import assets, blend_paths, point_caches
 from ..drgs_blender.core.asset import Mesh
 from ..drgs_blender.core.errors import UsageError
 from . import selection
@@ -28,7 +28,7 @@ class DRGS_OT_play_point_cache(CommandOperator, selection.ObjectMode, bpy.types.
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
     filepath: StringProperty(
-        description="The point cache", subtype="FILE_PATH", options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"}
+        description="The point cache", subtype="FILE_PATH", options={"SKIP_SAVE", *blend_paths.RELATIVE}
     )
     filter_glob: StringProperty(default="*.pc2;*.mdd", options={"HIDDEN"})
     vertex_order: EnumProperty(name="Vertices", description="What the cache moves", items=_ORDERS, default="AUTO")
