@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import bpy
 import numpy as np
+import pytest
 from scenes import new_world, read_exr
+
+#: Before 5.0 Cycles turned steep normals of maps towards the viewer for diffuse light as well, up to a fifth brighter.
+needs_current_normals = pytest.mark.skipif(
+    bpy.app.version < (5, 0), reason="Cycles shades steep normals of maps otherwise before Blender 5.0"
+)
 
 
 def set_up(scene: bpy.types.Scene, size: int, samples: int = 256, bounces: int = 2, subpixels: int = 16) -> None:

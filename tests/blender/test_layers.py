@@ -182,6 +182,7 @@ def test_coordinates_that_cannot_be_are_named(scene, export):
 
 
 @pytest.mark.slow
+@parity.needs_current_normals
 def test_painted_things_look_as_in_cycles(scene, export):
     """Colour, roughness and glow by attributes, a bump by one, two UV maps: on balls, one of them in several places."""
     tree, principled = material("Painted")

@@ -197,6 +197,7 @@ def test_curves_of_normal_maps_keep_their_bytes(scene, export):
 
 
 @pytest.mark.slow
+@parity.needs_current_normals
 def test_normal_and_bump_maps_look_as_in_cycles(scene, export):
     furnish(scene)
     parity.set_up(scene, 96)
