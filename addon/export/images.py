@@ -13,15 +13,11 @@ import numpy as np
 
 from ...drgs_blender.core.color import linear_to_srgb, srgb_to_linear
 from ...drgs_blender.core.frame import Image
-from . import image_cubic, image_grid, image_parts
+from . import image_cubic, image_grid, image_parts, image_pixels
 
 Array = np.ndarray
 Warn = Callable[[str], None]
 
-#: Colour spaces of 8-bit images that store linear light (or no colour).
-LINEAR = {"Linear Rec.709", "Linear", "Non-Color", "Raw", "scene_linear"}
-#: Those that are no colour.
-DATA = {"Non-Color", "Raw"}
 #: What Cycles shows for an image it cannot read.
 MISSING = (1.0, 0.0, 1.0)
 #: Exports for which an image that none of them used is remembered: view layers and scenes take turns.
@@ -79,7 +75,7 @@ def linear_pixels(image: bpy.types.Image, warn: Warn) -> Array | None:
     if image.source == "TILED" and len(image.tiles) > 1:
         warn(f'Image "{image.name}": of its {len(image.tiles)} UDIM tiles only the first is used')
     _check(image, warn)
-    return _remembered(image, "light", _linear)
+    return _remembered(image, "light", image_pixels.linear)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +111,8 @@ def show(image: bpy.types.Image, straight: bool, warn: Warn, lookup: Lookup) -> 
     """What a node shows of an image; None when it has no pixels. Parameters as of `export_image`."""
     global _moving
     _check(image, warn)
-    make, name = (_straight, f"{image.name_full} (straight)") if straight else (_associated, image.name_full)
+    make = image_pixels.straight if straight else image_pixels.associated
+    name = image.name_full + (" (straight)" if straight else "")
     kind = "straight" if straight else "associated"
     if image.source == "TILED":
         picture = _tiled(image, kind, make, name, lookup, warn)
@@ -276,87 +273,26 @@ def forget() -> None:
 def _check(image: bpy.types.Image, warn: Warn) -> None:
     """Say what is not as in Cycles."""
     space = image.colorspace_settings.name
-    if not image.is_float and space not in (*LINEAR, "sRGB", ""):  # "": of a movie that was not read yet
+    if space in (*image_pixels.LINEAR, "sRGB", ""):  # "": of a movie that was not read yet
+        return
+    if not _remembered(image, "float", lambda i: i.is_float):
         warn(f'Image "{image.name}": colour space {space} of an 8-bit image is read as sRGB')
 
 
-def _read(image: bpy.types.Image) -> Array | None:
-    """(h, w, c) float32 as Blender holds them, row 0 at the top; None when the image has no pixels."""
-    width, height = image.size
-    if width * height == 0 or len(image.pixels) == 0:
-        return None
-    pixels = np.empty(width * height * image.channels, np.float32)
-    image.pixels.foreach_get(pixels)
-    return pixels.reshape(height, width, image.channels)[::-1]
-
-
-def _is_srgb(image: bpy.types.Image) -> bool:
-    return not image.is_float and image.colorspace_settings.name not in LINEAR
-
-
-def _linear(image: bpy.types.Image) -> Array | None:
-    pixels = _read(image)
-    if pixels is None:
-        return None
-    pixels = pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
-    if _is_srgb(image):
-        pixels = srgb_to_linear(pixels)
-    pixels = np.array(pixels, np.float32, order="C")
-    pixels.flags.writeable = False
-    return pixels
-
-
-def _straight(image: bpy.types.Image) -> Image | None:
-    pixels = _rgba(image)
-    if pixels is None:
-        return None
-    alpha = pixels[..., 3:]
-    if image.is_float and _has_alpha(image):
-        np.divide(pixels[..., :3], alpha, out=pixels[..., :3], where=alpha > 0)
-    return _picture(image, pixels)
-
-
-def _associated(image: bpy.types.Image) -> Image | None:
-    pixels = _rgba(image)
-    if pixels is None:
-        return None
-    if not image.is_float and _has_alpha(image) and (pixels[..., 3] != 255).any():
-        # Of the encoded values and rounded down, as Cycles does.
-        pixels[..., :3] = pixels[..., :3].astype(np.uint16) * pixels[..., 3:] // 255
-    return _picture(image, pixels)
-
-
-def _has_alpha(image: bpy.types.Image) -> bool:
-    """Whether alpha belongs to the colours."""
-    return image.alpha_mode in ("STRAIGHT", "PREMUL") and image.colorspace_settings.name not in DATA
-
-
-def _rgba(image: bpy.types.Image) -> Array | None:
-    """(h, w, 4) uint8 or float32, as Blender has them."""
-    pixels = _read(image)
-    if pixels is None:
-        return None
-    count = pixels.shape[2]
-    rgba = np.ones((*pixels.shape[:2], 4), np.float32)
-    rgba[..., : max(count, 3)] = pixels if count >= 3 else pixels[..., :1]
-    if image.alpha_mode == "NONE":
-        rgba[..., 3] = 1
-    return rgba if image.is_float else np.rint(rgba * 255).astype(np.uint8)
-
-
-def _picture(image: bpy.types.Image, pixels: Array) -> Image:
-    pixels.flags.writeable = False  # so that its identity says whether it changed
-    return Image("", pixels, "srgb" if _is_srgb(image) else "linear")
-
-
 def _remembered(image: bpy.types.Image, kind: str, make: Callable[[bpy.types.Image], Any], frame: int = 0) -> Any:
-    """What `make` makes of the image, from memory where the image did not change."""
+    """What `make` makes of the image, from memory where the image did not change.
+
+    What Blender reads of a file for that is given back, where it was not there before.
+    """
     key = _key(image, frame)
     if key is None:
         return make(image)
     key = (kind, *key)
     if key not in _known:
+        was_there = image.has_data or image.source != "FILE"
         _known[key] = _export, make(image)
+        if not was_there:
+            image.buffers_free()
     result = _known[key][1]
     _known[key] = _export, result
     return result
@@ -372,7 +308,8 @@ def _key(image: bpy.types.Image, frame: int) -> tuple[object, ...] | None:
         return *settings, *files, *(_digest(p.packed_file) for p in image.packed_files)
     stamp = _stamp(image_parts.frame_file(image, frame))
     packed = _digest(image.packed_file) if image.packed_file else b""
-    return *settings, *stamp, packed, *(tuple(image.size) if image.source == "FILE" else (frame,))
+    # Not its size: to say it, Blender reads the file.
+    return *settings, *stamp, packed, 0 if image.source == "FILE" else frame
 
 
 def _generated(tile: bpy.types.UDIMTile) -> tuple[object, ...]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import bpy
 import numpy as np
 
+from ...drgs_blender.core.arrays import shareable
 from ...drgs_blender.core.frame import Image, Layer, Material, MeshState
 from .. import mesh_arrays
 from ..bakes.requests import Wanted
@@ -161,10 +162,10 @@ class Meshes:
         return MeshState(
             name=item.object.name,
             vertices=arrays.vertices,
-            faces=_frozen(arrays.corner_vertices[corners]),
+            faces=_taken(arrays.corner_vertices, corners),
             matrices=np.empty((0, 4, 4)),
             pass_indices=np.empty(0, np.int32),
-            corner_normals=None if normals is None else _frozen(normals[corners]),
+            corner_normals=None if normals is None else _taken(normals, corners),
             uvs=self._uvs(item.object.name, mesh, corners, index, exported),
             uv_map=self._uv_map(mesh, corners),
             material_index=None if index is None or not index.any() else _frozen(index.astype(np.int32)),
@@ -197,7 +198,7 @@ class Meshes:
     def _uv_map(self, mesh: bpy.types.Mesh, corners: Array) -> Array | None:
         """(m, 3, 2) float32 frozen: the UV map that renders, for the pass UV; None without one."""
         values = mesh_arrays.read_uvs(mesh, "") if self._with_uv_map else None
-        return None if values is None else _frozen(values[corners])
+        return None if values is None else _taken(values, corners)
 
     def _uvs(
         self, name: str, mesh: bpy.types.Mesh, corners: Array, index: Array | None, exported: list[ExportedMaterial]
@@ -206,7 +207,7 @@ class Meshes:
         requested = [material.uv_map for material in exported]
         if all(uv_map is None for uv_map in requested):
             return None
-        uvs = np.zeros((len(corners), 3, 2), np.float32)
+        uvs = shareable((len(corners), 3, 2), np.float32)
         for uv_map in {u for u in requested if u is not None}:
             values = mesh_arrays.read_uvs(mesh, uv_map)
             if values is None:
@@ -256,6 +257,13 @@ def _seen(
         return (corners[:0], polygons[:0], None) if 0 in unseen else (corners, polygons, None)
     kept = ~np.isin(index, unseen)
     return corners[kept], polygons[kept], index[kept]
+
+
+def _taken(values: Array, corners: Array) -> Array:
+    """Frozen rows of `values` at corners, which the engine can map."""
+    found = shareable((*corners.shape, *values.shape[1:]), values.dtype)
+    np.take(values, corners, axis=0, out=found, mode="clip")  # others are buffered
+    return _frozen(found)
 
 
 def _frozen(array: Array) -> Array:

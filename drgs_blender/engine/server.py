@@ -12,6 +12,7 @@ import logging
 import os
 import queue
 import signal
+import socket
 import sys
 import threading
 import time
@@ -265,6 +266,7 @@ def shake_hands(link: Link) -> None:
     try:
         link.incoming = Region(welcome.to_engine) if welcome.to_engine > 2 else None
         link.outgoing = Region(welcome.to_client) if welcome.to_client > 2 else None
+        link.files = socket.socket(fileno=welcome.files) if welcome.files > 2 else None
     except OSError as error:
         _refuse(link, f"the shared regions cannot be used ({error})")
 

@@ -11,6 +11,7 @@ import contextlib
 import logging
 import os
 import queue
+import socket
 import subprocess
 import sys
 import threading
@@ -83,6 +84,10 @@ class Child:
         self._process: subprocess.Popen[bytes] | None = None
         self._to_engine = Region.create() if shared else None
         self._to_client = Region.create() if shared and self._to_engine is not None else None
+        pair = socket.socketpair() if self._to_client is not None else None
+        self._files = pair[0] if pair is not None else None
+        self._files_of_engine = pair[1] if pair is not None else None
+        self._inherited_socket = pair[1].fileno() if pair is not None else -1
         self._started = threading.Event()
         self._threads = [threading.Thread(target=self._run, name="drgs-read", daemon=True)]
         self._threads[0].start()
@@ -113,10 +118,12 @@ class Child:
 
     def welcome(self) -> None:
         """Answer the engine's Hello, handing it the shared regions."""
-        files = [region.fd if region is not None else -1 for region in (self._to_engine, self._to_client)]
-        self.send(protocol.Welcome(protocol.PROTOCOL, protocol.__version__, *files))
+        to_engine, to_client = (r.fd if r is not None else -1 for r in (self._to_engine, self._to_client))
+        inherited = to_engine, to_client, self._inherited_socket
+        self.send(protocol.Welcome(protocol.PROTOCOL, protocol.__version__, *inherited))
         if self.link is not None:
             self.link.outgoing, self.link.incoming = self._to_engine, self._to_client
+            self.link.files = self._files
         self.greeted = True
 
     def send(self, message: Any, arrays: dict[str, Array] | None = None) -> None:
@@ -175,7 +182,8 @@ class Child:
 
     def _run(self) -> None:
         regions = [region for region in (self._to_engine, self._to_client) if region is not None]
-        options: dict[str, Any] = {"pass_fds": [region.fd for region in regions]} if regions else {}
+        inherited = [region.fd for region in regions] + [self._inherited_socket] * (self._files is not None)
+        options: dict[str, Any] = {"pass_fds": inherited} if inherited else {}
         if sys.platform == "win32":
             options["creationflags"] = subprocess.CREATE_NO_WINDOW
         pipe = subprocess.PIPE
@@ -187,6 +195,9 @@ class Child:
             self.inbox.put(error)
             self._started.set()
             return
+        finally:
+            if self._files_of_engine is not None:
+                self._files_of_engine.close()
         self.link = link = Link(process.stdout, process.stdin, self._note)  # type: ignore[arg-type]
         self._log_thread = threading.Thread(target=self._gather, name="drgs-log", daemon=True)
         writing = threading.Thread(target=self._send_all, name="drgs-write", daemon=True)
@@ -209,6 +220,8 @@ class Child:
         process.stdout.close()  # type: ignore[union-attr]
         for region in regions:
             region.close()
+        if self._files is not None:
+            self._files.close()
 
     def _note(self) -> None:
         self.reads += 1

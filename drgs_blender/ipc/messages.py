@@ -92,12 +92,13 @@ class Alive:
 
 @dataclass(slots=True)
 class Welcome:
-    """The client's answer to Hello: its version, and the inherited files of the shared regions (-1: none)."""
+    """The client's answer to Hello: its version, and what the engine inherits: shared regions, a socket (-1: none)."""
 
     protocol: int
     version: str
     to_engine: int
     to_client: int
+    files: int
 
 
 @dataclass(slots=True)

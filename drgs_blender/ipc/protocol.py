@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import socket
 import struct
 import threading
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ..core.arrays import SHARED_FILES, mapped, shared_file
 from ..core.version import __version__
 from .codec import CodecError, decode, encode
 from .messages import (
@@ -81,7 +83,7 @@ __all__ = [  # the messages are part of it
 Array = np.ndarray
 
 #: Raised with every change of the messages. Two sides work together only when it and the version are the same.
-PROTOCOL = 8
+PROTOCOL = 9
 
 MAGIC = b"DRGS"
 PREFIX = struct.Struct("<4sIQ")  # magic, bytes of the header, bytes of arrays behind it in the pipe
@@ -125,15 +127,21 @@ def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def sendable(array: Array) -> Array:
     """`array` C-contiguous, little-endian and of a dtype that may be sent, copied only where needed."""
-    array = np.ascontiguousarray(array).reshape(np.shape(array))
+    if not (isinstance(array, np.ndarray) and array.flags.c_contiguous):  # a view of it would not be frozen
+        array = np.ascontiguousarray(array).reshape(np.shape(array))
     dtype = array.dtype.newbyteorder("<")
     if dtype.str not in DTYPES:
         raise CodecError(f"an array of {array.dtype} cannot be sent, only {', '.join(DTYPES)}")
     return array.astype(dtype, copy=False)
 
 
-def pack(message: Any, arrays: dict[str, Array], where: str) -> tuple[bytes, int]:
-    """Header of `message` with `arrays` (all `sendable`); return (header bytes, bytes of the arrays)."""
+def pack(
+    message: Any, arrays: dict[str, Array], where: str, files: dict[str, Array] | None = None
+) -> tuple[bytes, int]:
+    """Header of `message` with `arrays` (all `sendable`); return (header bytes, bytes of the arrays).
+
+    `files` are further arrays, each in an open file that follows on the socket.
+    """
     table = []
     offset = 0
     for name, array in arrays.items():
@@ -144,6 +152,7 @@ def pack(message: Any, arrays: dict[str, Array], where: str) -> tuple[bytes, int
         "body": encode(type(message), message, "", {}),
         "where": where if offset else "inline",
         "arrays": table,
+        "files": [[name, array.dtype.str, list(array.shape), 0] for name, array in (files or {}).items()],
     }
     text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode("ascii")
     if len(text) > MAX_HEADER:
@@ -162,8 +171,8 @@ class ArrayHeader:
     size: int
 
 
-def unpack(header: bytes) -> tuple[Any, str, list[ArrayHeader], int]:
-    """Check a header; return (message, "inline" or "shared", its arrays, bytes of the bulk).
+def unpack(header: bytes) -> tuple[Any, str, list[ArrayHeader], list[ArrayHeader], int]:
+    """Check a header; return (message, "inline" or "shared", its arrays, those in files, bytes of the bulk).
 
     Raises
     ------
@@ -174,15 +183,16 @@ def unpack(header: bytes) -> tuple[Any, str, list[ArrayHeader], int]:
         data = json.loads(header, parse_constant=_no_constant, object_pairs_hook=_no_duplicates)
     except (ValueError, RecursionError) as error:
         raise ProtocolError(f"the header cannot be read ({error})") from error
-    if not isinstance(data, dict) or set(data) != {"type", "body", "where", "arrays"}:
+    if not isinstance(data, dict) or set(data) != {"type", "body", "where", "arrays", "files"}:
         raise ProtocolError("the header does not have the parts of a message")
     kind = data["type"]
     if not isinstance(kind, str) or kind not in MESSAGES:
         raise ProtocolError(f"unknown message {str(kind)[:100]!r}")
     if data["where"] not in ("inline", "shared"):
         raise ProtocolError("the arrays are neither inline nor shared")
-    if not isinstance(data["arrays"], list) or len(data["arrays"]) > MAX_ARRAYS:
-        raise ProtocolError(f"the arrays are not a list of at most {MAX_ARRAYS}")
+    for key, most in (("arrays", MAX_ARRAYS), ("files", SHARED_FILES)):
+        if not isinstance(data[key], list) or len(data[key]) > most:
+            raise ProtocolError(f"the {key} are not a list of at most {most}")
     try:
         message = decode(MESSAGES[kind], data["body"], "", {})
     except CodecError as error:
@@ -195,9 +205,10 @@ def unpack(header: bytes) -> tuple[Any, str, list[ArrayHeader], int]:
         offset = _aligned(item.offset + item.size)
         if offset > MAX_BULK:
             raise ProtocolError(f"the arrays have more than {MAX_BULK} bytes")
-    if len({item.name for item in headers}) != len(headers):
+    files = [_array_header(entry, 0) for entry in data["files"]]
+    if len({item.name for item in headers + files}) != len(headers) + len(files):
         raise ProtocolError("two arrays have the same name")
-    return message, data["where"], headers, offset
+    return message, data["where"], headers, files, offset
 
 
 def _array_header(entry: Any, offset: int) -> ArrayHeader:
@@ -237,6 +248,9 @@ class Link:
     ----------
     incoming, outgoing : Region or None
         Shared memory of arrays; None: they travel in the pipe.
+    files : socket.socket, optional
+        What the client sends the open files of `shareable` arrays by, and the engine receives them; None: they are
+        copied as others are.
     """
 
     def __init__(self, reader: RawIO, writer: RawIO, on_read: Callable[[], None] | None = None) -> None:
@@ -244,6 +258,7 @@ class Link:
         self._sending = threading.Lock()
         self.incoming: Region | None = None
         self.outgoing: Region | None = None
+        self.files: socket.socket | None = None
         self.bulk_sent = 0
         self.bulk_received = 0
 
@@ -258,10 +273,14 @@ class Link:
             When the message cannot be expressed.
         """
         ready = {name: sendable(array) for name, array in (arrays or {}).items()}
+        shared: dict[str, Array] = {}
+        if self.files is not None:
+            shared = {name: array for name, array in ready.items() if shared_file(array) is not None}
+            ready = {name: array for name, array in ready.items() if name not in shared}
         with self._sending:
             size = sum(_aligned(array.nbytes) for array in ready.values())
             region = self.outgoing.writable(size) if self.outgoing is not None and size else None
-            header, _ = pack(message, ready, "inline" if region is None else "shared")
+            header, _ = pack(message, ready, "inline" if region is None else "shared", shared)
             self.bulk_sent += size
             offset = 0
             if region is not None:
@@ -271,6 +290,9 @@ class Link:
                     offset = _aligned(offset + array.nbytes)
                 size = 0
             self._write(PREFIX.pack(MAGIC, len(header), size) + header)
+            for array in shared.values():
+                assert self.files is not None
+                socket.send_fds(self.files, [b"\0"], [shared_file(array) or 0])
             if size:
                 for array in ready.values():
                     self._write(array.reshape(-1).view(np.uint8).data)
@@ -294,19 +316,31 @@ class Link:
             raise ProtocolError(f"a header of {header_size} bytes is announced, at most {MAX_HEADER} are allowed")
         header = bytearray(header_size)
         self._read(memoryview(header))
-        message, where, headers, size = unpack(bytes(header))
+        message, where, headers, files, size = unpack(bytes(header))
         if inline_size != (size if where == "inline" else 0):
             raise ProtocolError(f"{inline_size} bytes of arrays are announced, the header describes {size}")
         self.bulk_received += size
+        arrays = {item.name: self._map(item) for item in files}
         if where == "shared":
-            return message, self._copy_shared(headers, size)
-        arrays: dict[str, Array] = {}
+            return message, arrays | self._copy_shared(headers, size)
         padding = bytearray(ALIGNMENT)
         for item in headers:
             arrays[item.name] = array = self._allocate(item)
             self._read(array.reshape(-1).view(np.uint8).data)
             self._read(memoryview(padding)[: _aligned(item.size) - item.size])
         return message, arrays
+
+    def _map(self, item: ArrayHeader) -> Array:
+        """The array in the next file that arrives."""
+        if self.files is None:
+            raise ProtocolError("arrays are announced in files, but there is no socket")
+        try:
+            word, files, _, _ = socket.recv_fds(self.files, 1, 1)
+            if len(word) != 1 or len(files) != 1:
+                raise ProtocolError(f"the file of array {item.name[:100]!r} did not arrive")
+            return mapped(files[0], item.shape, item.dtype)
+        except (ValueError, OSError) as error:
+            raise ProtocolError(f"array {item.name[:100]!r}: {error}") from error
 
     def _copy_shared(self, headers: list[ArrayHeader], size: int) -> dict[str, Array]:
         if self.incoming is None:
@@ -320,6 +354,7 @@ class Link:
             source = np.frombuffer(region, item.dtype, math.prod(item.shape), item.offset)
             arrays[item.name] = array = self._allocate(item)
             array.reshape(-1)[:] = source
+        self.incoming.done(size)
         return arrays
 
     @staticmethod

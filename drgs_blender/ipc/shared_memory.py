@@ -8,6 +8,7 @@ Where the system has no such file (macOS, Windows) the arrays travel in the pipe
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import mmap
 import os
@@ -17,6 +18,8 @@ logger = logging.getLogger(__name__)
 
 _MAX_BYTES = 512 << 20
 _STEP = 1 << 20
+#: What a message had beyond this is given back to the system once it is read.
+_KEPT_BYTES = 64 << 20
 
 
 class Region:
@@ -69,6 +72,12 @@ class Region:
             self._remap(whole)
         assert self._map is not None
         return memoryview(self._map)[:size]
+
+    def done(self, size: int) -> None:
+        """Say that the first `size` bytes have been read: the memory of a large message is given back."""
+        if self._map is not None and size > _KEPT_BYTES and sys.platform == "linux":
+            with contextlib.suppress(OSError):
+                self._map.madvise(mmap.MADV_REMOVE, _KEPT_BYTES, len(self._map) - _KEPT_BYTES)
 
     def _remap(self, size: int) -> None:
         self._map = mmap.mmap(self.fd, size)

@@ -243,3 +243,21 @@ def test_a_movie_that_cannot_be_read_is_named(scene, export, tmp_path):
     frame, warnings = export()
     assert any('"Broken"' in w and "broken.avi" in w for w in warnings)
     assert frame.meshes[0].materials[0].emission == (1, 0, 1)
+
+
+def test_reading_a_file_leaves_nothing_of_it_in_blender(scene, export, tmp_path):
+    """What an export reads of a file is given back, and known without being read again; painted pixels stay."""
+    path = save(tmp_path / "a.png", 512, 600)
+    image = bpy.data.images.load(str(path))
+    shown(image)
+    assert not image.has_data
+    first = export()[0].images[0]
+    assert not image.has_data
+    again = export()[0].images[0]
+    assert not image.has_data and again.pixels is first.pixels
+    reopened = bpy.data.images.load(str(path))
+    pixels = np.array(reopened.pixels[:], np.float32).reshape(512, 600, 4)[::-1]
+    np.testing.assert_array_equal(first.pixels, np.rint(255 * pixels))
+    painted = image.pixels[0] + 0.25 if image.pixels[0] < 0.5 else image.pixels[0] - 0.25
+    image.pixels[0] = painted
+    assert export()[0].images[0].pixels[-1, 0, 0] == round(255 * image.pixels[0]) and image.has_data

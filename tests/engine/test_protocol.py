@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import io
 import json
+import os
 import random
+import socket
 
 import numpy as np
 import pytest
 
+from drgs_blender.core.arrays import SHARED_BYTES, SHARED_FILES, SharedMemory, frozen, keep, shareable, shared_file
 from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
 from drgs_blender.ipc import protocol
 from drgs_blender.ipc.codec import CodecError, decode_frame, encode_frame
@@ -68,7 +72,7 @@ def receive(data: bytes) -> object:
 
 def header(**change: object) -> dict[str, object]:
     body = {"id": 1, "warnings": [], "statistics": {}}
-    return {"type": "Result", "body": body, "where": "inline", "arrays": []} | change
+    return {"type": "Result", "body": body, "where": "inline", "arrays": [], "files": []} | change
 
 
 def test_frame_survives_the_way_through_json():
@@ -299,3 +303,96 @@ def test_older_content_of_a_slot_is_not_taken_for_the_one_that_is_named():
     held, missing = receiver.update({"a": 2}, {"a": new})
     assert missing == [] and held["a"] is new
     assert receiver.update({"a": 1}, {}) == ({}, ["a"])  # nor the other way round
+
+
+def mapping_loop() -> tuple[Link, io.BytesIO]:
+    """A `loop` that sends files of shareable arrays to itself."""
+    if shared_file(frozen_shareable((SHARED_BYTES,), np.uint8)) is None:
+        pytest.skip("this system has no anonymous shared memory")
+    link, pipe = loop()
+    ends = socket.socketpair()
+    link.files = ends[0]
+    link.peer = ends[1]  # type: ignore[attr-defined]
+    return link, pipe
+
+
+def frozen_shareable(shape: tuple[int, ...], dtype: type) -> np.ndarray:
+    array = shareable(shape, dtype)
+    array[...] = np.arange(array.size).reshape(shape) % 251
+    array.flags.writeable = False
+    return array
+
+
+def passed_on(link: Link, pipe: io.BytesIO, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    pipe.seek(0)
+    pipe.truncate()
+    link.send(protocol.Result(1, [], {}), arrays)
+    pipe.seek(0)
+    link.files, link.peer = link.peer, link.files  # type: ignore[attr-defined]
+    try:
+        return link.receive()[1]
+    finally:
+        link.files, link.peer = link.peer, link.files  # type: ignore[attr-defined]
+
+
+def test_frozen_large_arrays_are_mapped_and_not_copied():
+    """Both sides see the same memory; neither can write; it outlives the sender's array, and its file is closed."""
+    link, pipe = mapping_loop()
+    large, small = frozen_shareable((512, 513, 4), np.float32), np.arange(6, dtype=np.float32)
+    expected, before = large.copy(), len(os.listdir("/proc/self/fd"))
+    found = passed_on(link, pipe, {"large": large, "small": small, "again": frozen_shareable((1 << 20,), np.uint8)})
+    assert link.bulk_sent < 1000 and frozen(found["large"]) and keep(found["large"]) is found["large"]
+    assert shared_file(found["large"]) is None  # what was mapped is not passed on
+    np.testing.assert_array_equal(found["small"], small)
+    with pytest.raises(ValueError):
+        found["large"].flags.writeable = True
+    del large
+    gc.collect()
+    np.testing.assert_array_equal(found["large"], expected)
+    del found
+    gc.collect()
+    assert len(os.listdir("/proc/self/fd")) <= before - 1
+
+
+def test_arrays_that_may_change_are_copied():
+    """Writable ones, views and parts of shareable arrays are no files of their own."""
+    whole = shareable((1 << 20,), np.float32)
+    assert shared_file(whole) is None
+    whole.flags.writeable = False
+    for part in (whole[1:], whole.reshape(1024, 1024)[:, :512], whole.reshape(1024, 1024)):
+        assert shared_file(part) is None
+    link, pipe = mapping_loop()
+    whole = shareable((1 << 20,), np.float32)
+    found = passed_on(link, pipe, {"a": whole})["a"]
+    whole[0] = 5.0
+    assert found[0] == 0.0 and found.flags.writeable
+
+
+def test_many_shareable_arrays_do_not_use_up_files():
+    kept = [shareable((SHARED_BYTES,), np.uint8) for _ in range(SHARED_FILES + 4)]
+    assert sum(isinstance(array.base, SharedMemory) for array in kept) <= SHARED_FILES
+    for array in kept:
+        array[:] = 1
+
+
+@pytest.mark.parametrize("fault", ["no socket", "no file", "wrong size", "may shrink"])
+def test_files_that_do_not_fit_are_refused(fault):
+    link, pipe = mapping_loop()
+    array = frozen_shareable((1 << 20,), np.uint8)
+    message = header(files=[["a", "|u1", [(1 << 20) + (fault == "wrong size")], 0]])
+    pipe.write(wire(message))
+    pipe.seek(0)
+    sender, link.files = link.files, link.peer  # type: ignore[attr-defined]
+    if fault == "no socket":
+        link.files = None
+    elif fault == "no file":
+        sender.send(b"\0")
+    elif fault == "may shrink":
+        fd = os.memfd_create("x", os.MFD_ALLOW_SEALING)
+        os.ftruncate(fd, 1 << 20)
+        socket.send_fds(sender, [b"\0"], [fd])
+        os.close(fd)
+    else:
+        socket.send_fds(sender, [b"\0"], [shared_file(array)])
+    with pytest.raises(ProtocolError, match="array"):
+        link.receive()

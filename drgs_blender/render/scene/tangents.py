@@ -6,11 +6,16 @@ texture. Faces that meet in a corner without sharing an edge there share it too,
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from ...geometry.distinct_rows import distinct_row_indices
+from ...compute.jit import njit, plain
 
 Array = np.ndarray
+
+_NUMBERS = 8  # that tell corners apart: three of the position, three of the normal, two of the texture
+_TINY = np.float64(np.finfo(np.float32).tiny)
 
 
 def corner_tangents(vertices: Array, faces: Array, normals: Array, uvs: Array) -> Array:
@@ -30,50 +35,139 @@ def corner_tangents(vertices: Array, faces: Array, normals: Array, uvs: Array) -
     (m, 3, 4) float32 array
         Unit tangent at each corner, object space; the sign of the bitangent, which is sign times normal x tangent.
     """
-    corners = vertices[faces].astype(np.float64)
-    edge = corners[:, 1:] - corners[:, :1]
-    turn = (uvs[:, 1:] - uvs[:, :1]).astype(np.float64)
-    area = turn[:, 0, 0] * turn[:, 1, 1] - turn[:, 0, 1] * turn[:, 1, 0]
-    sign = np.where(area > 0, 1.0, -1.0)
-    along = turn[:, 1, 1, None] * edge[:, 0] - turn[:, 0, 1, None] * edge[:, 1]
-    along = _unit(along) * sign[:, None]
-    known = (np.abs(area) > np.finfo(np.float32).tiny) & along.any(axis=1)
-    along[~known] = 0.0
-
-    columns = [vertices[faces].reshape(-1, 3), normals.reshape(-1, 3), uvs.reshape(-1, 2)]
-    alike = distinct_row_indices(*(column for group in columns for column in group.T))
-    group = 2 * alike + np.repeat(area > 0, 3)
-    n = normals.reshape(-1, 3).astype(np.float64)
-    weighted = _angles(corners, normals)[:, None] * _in_plane(np.repeat(along, 3, axis=0), n)
-    sums = np.stack([np.bincount(group, weighted[:, k]) for k in range(3)], axis=1)
-    tangent = _unit(sums)[group]
-    # A face without extent in the texture takes the tangent of its neighbours, whichever way round they lie.
-    lost = ~tangent.any(axis=1)
-    other = np.where(group[lost] ^ 1 < len(sums), group[lost] ^ 1, group[lost])
-    tangent[lost] = _unit(sums)[other]
-    signs = np.repeat(sign, 3)
-    signs[lost] = np.where(tangent[lost].any(axis=1), -signs[lost], 1.0)
-    tangent[~tangent.any(axis=1)] = 1.0, 0.0, 0.0
-    return np.concatenate([tangent, signs[:, None]], axis=1).astype(np.float32).reshape(-1, 3, 4)
+    count = 3 * len(faces)
+    faces = plain(np.asarray(faces, np.int32))
+    given = [plain(np.asarray(array, np.float32)) for array in (vertices, normals, uvs)]
+    group = np.empty(count, np.int32)
+    table = np.full(1 << max(2 * count - 1, 1).bit_length(), -1, np.int32)
+    groups = _group(faces, *(array.view(np.uint32) for array in given), table, group)
+    del table
+    sums = np.zeros((2 * groups, 3))
+    _add_up(faces, *given, group, sums)
+    out = np.empty((len(faces), 3, 4), np.float32)
+    _share_out(faces, *given, group, sums, out)
+    return out
 
 
-def _unit(vectors: Array) -> Array:
+@njit
+def _bits(vertices, faces, normals, uvs, corner, k):  # type: ignore[no-untyped-def]
+    """Bits of number k of a corner; 0 is 0, whatever its sign."""
+    face, place = corner // 3, corner % 3
+    if k < 3:
+        bits = vertices[faces[face, place], k]
+    elif k < 6:
+        bits = normals[face, place, k - 3]
+    else:
+        bits = uvs[face, place, k - 6]
+    return np.uint32(0) if bits == np.uint32(0x80000000) else np.uint32(bits)
+
+
+@njit
+def _group(faces, vertices, normals, uvs, table, group):  # type: ignore[no-untyped-def]
+    """Number corners by what tells them apart, in the order of their first; how many groups there are.
+
+    `table` is a hash table, open addressing, of the first corner of each group; its size is a power of 2.
+    """
+    last, groups = np.int64(len(table) - 1), 0
+    for corner in range(len(group)):
+        mixed = np.uint32(2166136261)
+        for k in range(_NUMBERS):
+            mixed = np.uint32((mixed ^ _bits(vertices, faces, normals, uvs, corner, k)) * np.uint32(0x85EBCA6B))
+            mixed = np.uint32(mixed ^ (mixed >> np.uint32(13)))
+        slot = np.int64(mixed) & last
+        while True:
+            first = table[slot]
+            if first < 0:
+                table[slot], group[corner] = corner, groups
+                groups += 1
+                break
+            same = True
+            for k in range(_NUMBERS):
+                mine = _bits(vertices, faces, normals, uvs, corner, k)
+                same = same and mine == _bits(vertices, faces, normals, uvs, first, k)
+            if same:
+                group[corner] = group[first]
+                break
+            slot = (slot + 1) & last
+    return groups
+
+
+@njit
+def _unit(x, y, z):  # type: ignore[no-untyped-def]
     """At unit length; zero where there is none."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 1e-300)
+    length = math.sqrt(x * x + y * y + z * z)
+    if not length > 1e-300:
+        return 0.0, 0.0, 0.0
+    return x / length, y / length, z / length
 
 
-def _in_plane(vectors: Array, normals: Array) -> Array:
-    """Unit parts of (n, 3) vectors in the planes of normals."""
-    return _unit(vectors - (vectors * normals).sum(axis=1, keepdims=True) * normals)
+@njit
+def _in_plane(x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """Unit part of a vector in the plane of a normal."""
+    along = x * nx + y * ny + z * nz
+    return _unit(x - along * nx, y - along * ny, z - along * nz)
 
 
-def _angles(corners: Array, normals: Array) -> Array:
-    """(3 m,) angles of the corners of (m, 3, 3) triangles, seen along their normals, radians."""
-    found = []
-    for k in range(3):
-        n = normals[:, k].astype(np.float64)
-        a = _in_plane(corners[:, (k + 1) % 3] - corners[:, k], n)
-        b = _in_plane(corners[:, (k + 2) % 3] - corners[:, k], n)
-        found.append(np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0)))
-    return np.stack(found, axis=1).reshape(-1)
+@njit
+def _area(uvs, face):  # type: ignore[no-untyped-def]
+    """Twice the area of a face in the texture; positive if it is counter-clockwise there."""
+    u, v = np.float64(uvs[face, 0, 0]), np.float64(uvs[face, 0, 1])
+    au, av, bu, bv = uvs[face, 1, 0] - u, uvs[face, 1, 1] - v, uvs[face, 2, 0] - u, uvs[face, 2, 1] - v
+    return au * bv - av * bu, av, bv
+
+
+@njit
+def _add_up(faces, vertices, normals, uvs, group, sums):  # type: ignore[no-untyped-def]
+    """Sum the directions of u over the corners of each group, weighted by angle, per side of the texture."""
+    for face in range(len(faces)):
+        area, av, bv = _area(uvs, face)
+        if not abs(area) > _TINY:
+            continue
+        sign, side = (1.0, 1) if area > 0.0 else (-1.0, 0)
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        px, py, pz = np.float64(vertices[a, 0]), np.float64(vertices[a, 1]), np.float64(vertices[a, 2])
+        ux, uy, uz = vertices[b, 0] - px, vertices[b, 1] - py, vertices[b, 2] - pz
+        vx, vy, vz = vertices[c, 0] - px, vertices[c, 1] - py, vertices[c, 2] - pz
+        tx, ty, tz = _unit(
+            sign * (bv * ux - av * vx), sign * (bv * uy - av * vy), sign * (bv * uz - av * vz)
+        )  # fmt: skip
+        for k in range(3):
+            nx, ny, nz = (
+                np.float64(normals[face, k, 0]),
+                np.float64(normals[face, k, 1]),
+                np.float64(normals[face, k, 2]),
+            )
+            here, right, left = faces[face, k], faces[face, (k + 1) % 3], faces[face, (k + 2) % 3]
+            px, py, pz = np.float64(vertices[here, 0]), np.float64(vertices[here, 1]), np.float64(vertices[here, 2])
+            ex, ey, ez = _in_plane(
+                vertices[right, 0] - px, vertices[right, 1] - py, vertices[right, 2] - pz, nx, ny, nz
+            )  # fmt: skip
+            fx, fy, fz = _in_plane(
+                vertices[left, 0] - px, vertices[left, 1] - py, vertices[left, 2] - pz, nx, ny, nz
+            )  # fmt: skip
+            angle = math.acos(min(max(ex * fx + ey * fy + ez * fz, -1.0), 1.0))
+            gx, gy, gz = _in_plane(tx, ty, tz, nx, ny, nz)
+            row = 2 * group[3 * face + k] + side
+            sums[row, 0] += angle * gx
+            sums[row, 1] += angle * gy
+            sums[row, 2] += angle * gz
+
+
+@njit
+def _share_out(faces, vertices, normals, uvs, group, sums, out):  # type: ignore[no-untyped-def]
+    """Write the tangent of its group to each corner.
+
+    A face without extent in the texture takes the tangent of its neighbours, whichever way round they lie.
+    """
+    for face in range(len(faces)):
+        area, _, _ = _area(uvs, face)
+        side = 1 if area > 0.0 else 0
+        for k in range(3):
+            row, sign = 2 * group[3 * face + k] + side, 1.0 if side else -1.0
+            x, y, z = _unit(sums[row, 0], sums[row, 1], sums[row, 2])
+            if x == 0.0 and y == 0.0 and z == 0.0:
+                row, sign = row ^ 1, -sign
+                x, y, z = _unit(sums[row, 0], sums[row, 1], sums[row, 2])
+            if x == 0.0 and y == 0.0 and z == 0.0:
+                x, sign = 1.0, 1.0
+            out[face, k, 0], out[face, k, 1], out[face, k, 2], out[face, k, 3] = x, y, z, sign

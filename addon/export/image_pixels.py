@@ -1,0 +1,95 @@
+"""Pixels of image datablocks as the engine takes them; see `images`, which remembers them."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from ...drgs_blender.core.arrays import shareable
+from ...drgs_blender.core.color import srgb_to_linear
+from ...drgs_blender.core.frame import Image
+
+Array = np.ndarray
+
+#: Colour spaces of 8-bit images that store linear light (or no colour).
+LINEAR = {"Linear Rec.709", "Linear", "Non-Color", "Raw", "scene_linear"}
+#: Those that are no colour.
+DATA = {"Non-Color", "Raw"}
+#: Rows that are worked on at once: whole copies of a large image are larger than all the rest.
+_STRIP = 256
+
+
+def _read(image: bpy.types.Image) -> Array | None:
+    """(h, w, c) float32 as Blender holds them, row 0 at the top; None when the image has no pixels."""
+    width, height = image.size
+    if width * height == 0 or len(image.pixels) == 0:
+        return None
+    pixels = np.empty(width * height * image.channels, np.float32)
+    image.pixels.foreach_get(pixels)
+    return pixels.reshape(height, width, image.channels)[::-1]
+
+
+def _is_srgb(image: bpy.types.Image) -> bool:
+    return not image.is_float and image.colorspace_settings.name not in LINEAR
+
+
+def linear(image: bpy.types.Image) -> Array | None:
+    pixels = _read(image)
+    if pixels is None:
+        return None
+    pixels = pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
+    if _is_srgb(image):
+        pixels = srgb_to_linear(pixels)
+    pixels = np.array(pixels, np.float32, order="C")
+    pixels.flags.writeable = False
+    return pixels
+
+
+def straight(image: bpy.types.Image) -> Image | None:
+    pixels = _rgba(image)
+    if pixels is None:
+        return None
+    alpha = pixels[..., 3:]
+    if image.is_float and _has_alpha(image):
+        np.divide(pixels[..., :3], alpha, out=pixels[..., :3], where=alpha > 0)
+    return _picture(image, pixels)
+
+
+def associated(image: bpy.types.Image) -> Image | None:
+    pixels = _rgba(image)
+    if pixels is None:
+        return None
+    if not image.is_float and _has_alpha(image):
+        for first in range(0, len(pixels), _STRIP):
+            part = pixels[first : first + _STRIP]
+            if (part[..., 3] != 255).any():
+                # Of the encoded values and rounded down, as Cycles does.
+                part[..., :3] = part[..., :3].astype(np.uint16) * part[..., 3:] // 255
+    return _picture(image, pixels)
+
+
+def _has_alpha(image: bpy.types.Image) -> bool:
+    """Whether alpha belongs to the colours."""
+    return image.alpha_mode in ("STRAIGHT", "PREMUL") and image.colorspace_settings.name not in DATA
+
+
+def _rgba(image: bpy.types.Image) -> Array | None:
+    """(h, w, 4) uint8 or float32, as Blender has them."""
+    pixels = _read(image)
+    if pixels is None:
+        return None
+    count = pixels.shape[2]
+    rgba = shareable((*pixels.shape[:2], 4), np.float32 if image.is_float else np.uint8)
+    for first in range(0, len(rgba), _STRIP):
+        part, into = pixels[first : first + _STRIP], rgba[first : first + _STRIP]
+        if not image.is_float:
+            part = np.rint(part * 255)
+        into[..., : max(count, 3)] = part if count >= 3 else part[..., :1]
+        if count < 4 or image.alpha_mode == "NONE":
+            into[..., 3] = 1 if image.is_float else 255
+    return rgba
+
+
+def _picture(image: bpy.types.Image, pixels: Array) -> Image:
+    pixels.flags.writeable = False  # so that its identity says whether it changed
+    return Image("", pixels, "srgb" if _is_srgb(image) else "linear")
