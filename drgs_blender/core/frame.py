@@ -249,6 +249,19 @@ class SurfaceDetail:
     tangents: str = ""
 
 
+#: Fields of `Material` that ``Material.textures`` may vary over the surface.
+TEXTURED = (
+    "ior", "specular_level", "specular_tint", "anisotropy", "anisotropy_rotation", "coat", "coat_roughness", "coat_ior",
+    "coat_tint", "sheen", "sheen_roughness", "sheen_tint", "transmission", "diffuse_roughness", "translucency",
+)  # fmt: skip
+#: What makes a material more than a diffuse and a glossy lobe of IOR 1.5, and the values that add nothing.
+_PLAIN = {"specular_tint": (1.0, 1.0, 1.0), "anisotropy": 0.0, "coat": 0.0, "sheen": 0.0}
+#: The same of what a metal has not.
+_PLAIN_DIELECTRIC = {
+    "ior": 1.5, "specular_level": 0.5, "transmission": 0.0, "diffuse_roughness": 0.0, "translucency": 0.0,
+}  # fmt: skip
+
+
 @dataclass(slots=True)
 class Material:
     """Parameters of Blender's Principled BSDF for an ordinary surface. Numbers multiply their textures.
@@ -267,6 +280,41 @@ class Material:
         Done to the shading normal one after the other.
     pass_index : int
         Blender's material index pass.
+    ior : float
+        Above 0, inside over outside: of the glossy lobe and of what is transmitted.
+    specular_level : float
+        At least 0: the reflectance that `ior` gives at normal incidence, times twice this; of the glossy lobe alone,
+        not of what is transmitted. At 0 a dielectric has no glossy lobe.
+    specular_tint : tuple of float
+        Linear Rec.709 factors on reflection: of a dielectric at normal incidence, of a metal at grazing angles.
+    anisotropy : float
+        In [0, 1]: how much longer highlights are along the tangent.
+    anisotropy_rotation : float
+        Turns of the tangent about the normal.
+    tangent : str
+        Name of a layer whose directions highlights follow: of two numbers, texture coordinates, along whose u; of four,
+        the direction itself in object space, of any length, blended over the face. "" are the coordinates `uvs`.
+    coat, coat_roughness, coat_ior : float
+        Weight of a clear layer above all others, in [0, 1]; its roughness; its IOR, at least 1.
+    coat_tint : tuple of float
+        Linear Rec.709, what the layer lets through at normal incidence.
+    coat_details : bool
+        Whether `details` change the normal of the coat, too.
+    sheen, sheen_roughness : float
+        Weight of a layer of fibres below the coat; their roughness.
+    sheen_tint : tuple of float
+        Linear Rec.709.
+    transmission : float
+        In [0, 1]: share of the part that is no metal that is glass, whose refracted light has the colour
+        sqrt(base_colour).
+    thin_walled : bool
+        Whether the surface is a sheet, of which light leaves in the direction in which it came.
+    diffuse_roughness : float
+        In [0, 1], of the diffuse lobe.
+    translucency : float
+        In [0, 1]: share of the diffuse lobe that leaves on the other side.
+    textures : dict of str to Texture
+        By name of a field in `TEXTURED`.
     """
 
     name: str
@@ -282,11 +330,37 @@ class Material:
     alpha_texture: Texture | None = None
     details: list[SurfaceDetail] = field(default_factory=list)
     pass_index: int = 0
+    ior: float = 1.5
+    specular_level: float = 0.5
+    specular_tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    anisotropy: float = 0.0
+    anisotropy_rotation: float = 0.0
+    tangent: str = ""
+    coat: float = 0.0
+    coat_roughness: float = 0.03
+    coat_ior: float = 1.5
+    coat_tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    coat_details: bool = False
+    sheen: float = 0.0
+    sheen_roughness: float = 0.5
+    sheen_tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    transmission: float = 0.0
+    thin_walled: bool = False
+    diffuse_roughness: float = 0.0
+    translucency: float = 0.0
+    textures: dict[str, Texture] = field(default_factory=dict)
 
     @property
     def clear(self) -> bool:
-        """Whether light may pass it."""
+        """Whether light may pass it in a straight line."""
         return not self.alpha >= 1.0 or self.alpha_texture is not None
+
+    @property
+    def has_more_lobes(self) -> bool:
+        """Whether it is more than a diffuse and a glossy lobe of IOR 1.5."""
+        is_metal = self.metallic >= 1.0 and self.metallic_texture is None
+        plain = _PLAIN if is_metal else _PLAIN | _PLAIN_DIELECTRIC
+        return any(getattr(self, name) != value or name in self.textures for name, value in plain.items())
 
 
 @dataclass(slots=True)

@@ -214,6 +214,8 @@ def completed(hint: Any, data: Any) -> Any:
         return given
     if typing.get_origin(hint) in (list, tuple) and isinstance(data, list):
         return [completed(kind, item) for kind, item in zip(_item_hints(hint, len(data), ""), data)]
+    if typing.get_origin(hint) is dict and isinstance(data, dict):
+        return {key: completed(typing.get_args(hint)[1], item) for key, item in data.items()}
     return data
 
 
