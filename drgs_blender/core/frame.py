@@ -252,14 +252,12 @@ class SurfaceDetail:
 #: Fields of `Material` that ``Material.textures`` may vary over the surface.
 TEXTURED = (
     "ior", "specular_level", "specular_tint", "anisotropy", "anisotropy_rotation", "coat", "coat_roughness", "coat_ior",
-    "coat_tint", "sheen", "sheen_roughness", "sheen_tint", "transmission", "diffuse_roughness", "translucency",
+    "coat_tint", "sheen", "sheen_roughness", "sheen_tint", "transmission", "diffuse_roughness",
 )  # fmt: skip
 #: What makes a material more than a diffuse and a glossy lobe of IOR 1.5, and the values that add nothing.
 _PLAIN = {"specular_tint": (1.0, 1.0, 1.0), "anisotropy": 0.0, "coat": 0.0, "sheen": 0.0}
 #: The same of what a metal has not.
-_PLAIN_DIELECTRIC = {
-    "ior": 1.5, "specular_level": 0.5, "transmission": 0.0, "diffuse_roughness": 0.0, "translucency": 0.0,
-}  # fmt: skip
+_PLAIN_DIELECTRIC = {"ior": 1.5, "specular_level": 0.5, "transmission": 0.0, "diffuse_roughness": 0.0}
 
 
 @dataclass(slots=True)
@@ -311,10 +309,16 @@ class Material:
         Whether the surface is a sheet, of which light leaves in the direction in which it came.
     diffuse_roughness : float
         In [0, 1], of the diffuse lobe.
-    translucency : float
-        In [0, 1]: share of the diffuse lobe that leaves on the other side.
     textures : dict of str to Texture
         By name of a field in `TEXTURED`.
+    kind : {"principled", "diffuse", "glossy", "glass", "refraction", "translucent", "sheen"}
+        Blender's node of that name, with all of the above that it has: `base_colour` is its Color; "diffuse" has
+        `diffuse_roughness`, "sheen" `sheen_roughness` for its Roughness; "diffuse" and "translucent" have no gloss.
+    multiscatter : bool
+        Multiscatter GGX instead of GGX, of a material that `has_more_lobes`.
+    parts : list of Part
+        Mix and Add Shader: if there are any, the surface scatters their weighted sum, and of the material itself only
+        name, `alpha`, `emission`, `details` and `pass_index` count.
     """
 
     name: str
@@ -347,8 +351,10 @@ class Material:
     transmission: float = 0.0
     thin_walled: bool = False
     diffuse_roughness: float = 0.0
-    translucency: float = 0.0
     textures: dict[str, Texture] = field(default_factory=dict)
+    kind: Literal["principled", "diffuse", "glossy", "glass", "refraction", "translucent", "sheen"] = "principled"
+    multiscatter: bool = False
+    parts: list[Part] = field(default_factory=list)
 
     @property
     def clear(self) -> bool:
@@ -358,9 +364,33 @@ class Material:
     @property
     def has_more_lobes(self) -> bool:
         """Whether it is more than a diffuse and a glossy lobe of IOR 1.5."""
+        if self.parts or self.kind != "principled":
+            return True
         is_metal = self.metallic >= 1.0 and self.metallic_texture is None
         plain = _PLAIN if is_metal else _PLAIN | _PLAIN_DIELECTRIC
         return any(getattr(self, name) != value or name in self.textures for name, value in plain.items())
+
+
+@dataclass(slots=True)
+class Part:
+    """One of the surfaces that are mixed or added.
+
+    Attributes
+    ----------
+    material : Material
+        Without parts of its own.
+    weight : tuple of float
+        Linear Rec.709, at least 0.
+    weight_texture : Texture, optional
+        Multiplies the weight.
+    inverted : bool
+        One minus the texture instead of the texture, for the other part of a mix.
+    """
+
+    material: Material
+    weight: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    weight_texture: Texture | None = None
+    inverted: bool = False
 
 
 @dataclass(slots=True)
