@@ -24,6 +24,8 @@ _DEEPEST = 4
 
 
 Follow = Callable[[bpy.types.NodeSocket], bool]
+#: Shader nodes, as of `leaf_of`.
+Leaves = tuple[tuple[str, str], ...]
 
 
 class Tree(NamedTuple):
@@ -172,6 +174,9 @@ def moves(found: list[Tree]) -> bool:
     return any(image.source in ("SEQUENCE", "MOVIE") for _, image in images(found))
 
 
+#: Channels that are colours; others are numbers.
+COLOURS = {"base_colour", "emission", "specular_tint", "coat_tint", "sheen_tint"}
+_ANISOTROPIC: dict[str, tuple[str, ...] | float] = {"anisotropy": ("Anisotropy",), "anisotropy_rotation": ("Rotation",)}
 #: Kind of a shader node -> channel -> its inputs: of a colour, or of a number; or a number. Others are as "".
 SHADERS: dict[str, dict[str, tuple[str, ...] | float]] = {
     "BSDF_PRINCIPLED": {
@@ -179,15 +184,40 @@ SHADERS: dict[str, dict[str, tuple[str, ...] | float]] = {
         "roughness": ("Roughness",),
         "metallic": ("Metallic",),
         "emission": ("Emission Color", "Emission Strength"),
+        "alpha": ("Alpha",),
+        "ior": ("IOR",),
+        "specular_level": ("Specular IOR Level",),
+        "specular_tint": ("Specular Tint",),
+        "anisotropy": ("Anisotropic",),
+        "anisotropy_rotation": ("Anisotropic Rotation",),
+        "coat": ("Coat Weight",),
+        "coat_roughness": ("Coat Roughness",),
+        "coat_ior": ("Coat IOR",),
+        "coat_tint": ("Coat Tint",),
+        "sheen": ("Sheen Weight",),
+        "sheen_roughness": ("Sheen Roughness",),
+        "sheen_tint": ("Sheen Tint",),
+        "transmission": ("Transmission Weight",),
+        "diffuse_roughness": ("Diffuse Roughness",),
     },
-    "BSDF_DIFFUSE": {"base_colour": ("Color",), "roughness": 1.0},
-    "BSDF_GLOSSY": {"base_colour": ("Color",), "roughness": ("Roughness",), "metallic": 1.0},
-    "BSDF_METALLIC": {"base_colour": ("Base Color",), "roughness": ("Roughness",), "metallic": 1.0},
+    "BSDF_DIFFUSE": {"base_colour": ("Color",), "roughness": 1.0, "diffuse_roughness": ("Roughness",)},
+    "BSDF_GLOSSY": {"base_colour": ("Color",), "roughness": ("Roughness",), "metallic": 1.0, **_ANISOTROPIC},
+    "BSDF_METALLIC": {
+        "base_colour": ("Base Color",), "roughness": ("Roughness",), "metallic": 1.0, "specular_tint": ("Edge Tint",),
+        **_ANISOTROPIC,
+    },
+    "BSDF_GLASS": {"base_colour": ("Color",), "roughness": ("Roughness",), "ior": ("IOR",)},
+    "BSDF_REFRACTION": {"base_colour": ("Color",), "roughness": ("Roughness",), "ior": ("IOR",)},
+    "BSDF_TRANSLUCENT": {"base_colour": ("Color",), "roughness": 1.0},
+    "BSDF_SHEEN": {"base_colour": ("Color",), "roughness": 1.0, "sheen_roughness": ("Roughness",)},
+    "SUBSURFACE_SCATTERING": {"base_colour": ("Color",), "roughness": 1.0},
     "EMISSION": {"emission": ("Color", "Strength")},
     "BACKGROUND": {"emission": ("Color", "Strength")},
-    "BSDF_TRANSPARENT": {},
+    "BSDF_TRANSPARENT": {"alpha": 0.0},
     "": {"base_colour": ("Color",), "roughness": ("Roughness",)},
-}
+}  # fmt: skip
+#: Channels of which a shader without such an input has one.
+_WHOLE = ("alpha", "weight")
 #: Those that scatter no light.
 UNSCATTERED = ("EMISSION", "BACKGROUND", "BSDF_TRANSPARENT")
 _JOINTS = ("MIX_SHADER", "ADD_SHADER", "GROUP", "REROUTE", "GROUP_INPUT")
@@ -198,13 +228,26 @@ def is_shader(node: bpy.types.Node) -> bool:
     return node.type not in _JOINTS and any(socket.type == "SHADER" for socket in node.outputs)
 
 
-def shader_inputs(node: bpy.types.Node, channel: str) -> tuple[str, ...] | float:
-    """Inputs of a shader node that make a channel of its surface, or the number that it is."""
-    return SHADERS.get(node.type, SHADERS[""]).get(channel, 0.0)
+def leaf_of(node: bpy.types.Node) -> tuple[str, str]:
+    """A shader node by name: of its node group, "" in the material itself, and its own."""
+    tree = node.id_data
+    return "" if tree.is_embedded_data else tree.name, node.name
 
 
-def follow_channel(channel: str) -> Follow:
-    """For `trees`: only what a channel of a material's surface depends on."""
+def shader_inputs(node: bpy.types.Node, channel: str, leaves: Leaves | None = None) -> tuple[str, ...] | float:
+    """Inputs of a shader node that make a channel of its surface, or the number that it is.
+
+    Parameters
+    ----------
+    leaves : the only shaders that count; None: all do
+    """
+    if leaves is not None and leaf_of(node) not in leaves:
+        return 0.0
+    return SHADERS.get(node.type, SHADERS[""]).get(channel, float(channel in _WHOLE))
+
+
+def follow_channel(channel: str, leaves: Leaves | None = None) -> Follow:
+    """For `trees`: only what a channel of a material's surface depends on; `leaves` are as of `shader_inputs`."""
 
     def follow(socket: bpy.types.NodeSocket) -> bool:
         node = socket.node
@@ -212,7 +255,7 @@ def follow_channel(channel: str) -> Follow:
             return socket.name == "Surface"
         if not is_shader(node):
             return True
-        names = shader_inputs(node, channel)
+        names = shader_inputs(node, channel, leaves)
         return isinstance(names, tuple) and socket.name in names
 
     return follow

@@ -40,12 +40,13 @@ class LayerRef:
 
     Attributes
     ----------
-    source : "uv" is a UV map ("" the active one), "attribute" values, the others are coordinates by `matrix`
+    source : "uv" is a UV map ("" the active one), "attribute" values, "tangent" directions about the axis `name`, the
+        others are coordinates by `matrix`
     matrix : (4, 4), from the coordinates to those of a texture
     change, mark : function of (n, 4) values, and what tells it from others
     """
 
-    source: Literal["uv", "attribute", "generated", "object", "vector", "baked"]
+    source: Literal["uv", "attribute", "generated", "object", "vector", "baked", "tangent"]
     name: str = ""
     matrix: Matrix = _IDENTITY
     mark: str = ""
@@ -70,6 +71,9 @@ class LayerRef:
                 return None
             values = np.asarray(found if self.change is None else self.change(found), np.float32)
             return values[_elements(mesh.attributes[self.name].domain, corners, polygons, corner_vertices)]
+        if self.source == "tangent":
+            values = _tangents(_generated(mesh), self.name)
+            return values[_elements("POINT", corners, polygons, corner_vertices)]
         there = self._coordinates(mesh)
         if there is None:
             return None
@@ -85,11 +89,7 @@ class LayerRef:
         if self.source == "vector":
             found = attribute_values(mesh, self.name)
             return None if found is None else (found[:, :3], mesh.attributes[self.name].domain)
-        rest = np.empty(3 * len(mesh.vertices), np.float32)
-        mesh.vertices.foreach_get("undeformed_co", rest)
-        size = np.array(mesh.texspace_size)
-        size = np.divide(0.5, size, out=np.zeros(3), where=size != 0)
-        return (rest.reshape(-1, 3) - np.array(mesh.texspace_location)) * size + 0.5, "POINT"
+        return _generated(mesh), "POINT"
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +150,23 @@ def attribute_values(mesh: bpy.types.Mesh, name: str) -> Array | None:
     out[:, 3] = 1
     out[:, : max(width, 3) if width == 1 else width] = values
     return out
+
+
+def _generated(mesh: bpy.types.Mesh) -> Array:
+    """(n, 3) Generated coordinates of the vertices."""
+    rest = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("undeformed_co", rest)
+    size = np.array(mesh.texspace_size)
+    size = np.divide(0.5, size, out=np.zeros(3), where=size != 0)
+    return (rest.reshape(-1, 3) - np.array(mesh.texspace_location)) * size + 0.5
+
+
+def _tangents(generated: Array, axis: str) -> Array:
+    """(n, 4) float32 directions about an axis through the middle of Generated coordinates, as Cycles has them."""
+    x, y = {"X": (1, 2), "Y": (0, 2), "Z": (0, 1)}[axis]
+    values = np.zeros((len(generated), 4), np.float32)
+    values[:, x], values[:, y] = 0.5 - generated[:, y], generated[:, x] - 0.5
+    return values
 
 
 def colour_average(values: Array) -> Array:

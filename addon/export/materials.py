@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import bpy
 import numpy as np
 
-from ...drgs_blender.core.frame import Image, Material, SurfaceDetail, Texture
+from ...drgs_blender.core.frame import TEXTURED, Image, Material, Part, SurfaceDetail, Texture
+from ..bakes.node_trees import COLOURS, Leaves
+from .bsdfs import Bsdf, Surface
 from .layers import AttributeRef, LayerRef
+from .node_math import rgb
 from .normal_nodes import DetailRef
-from .socket_value import SocketValue, Warn
-from .surface_bake import CHANNELS, BakedRef, SurfaceBakes
+from .socket_value import SocketValue, Warn, uniform
+from .surface_bake import BakedRef, SurfaceBakes
 from .surface_nodes import SurfaceWalker
 from .texture_refs import TextureRef
 
@@ -35,6 +38,14 @@ class ExportedMaterial:
     is_baked: bool = False
 
 
+#: Says the name that a layer has in the frame.
+Label = Callable[[LayerRef], str]
+#: Least numbers, other than 0. Rotations have none.
+_LOWEST = {"ior": 1e-5, "coat_ior": 1.0, "anisotropy": -0.99, "anisotropy_rotation": -np.inf}
+_AT_MOST_1 = (
+    "roughness", "metallic", "alpha", "anisotropy", "coat", "coat_roughness", "sheen", "sheen_roughness",
+    "transmission", "diffuse_roughness",
+)  # fmt: skip
 DEFAULT_MATERIAL = Material("Default")
 DEFAULT = ExportedMaterial(DEFAULT_MATERIAL)
 
@@ -75,48 +86,69 @@ class Materials:
         return exported
 
     def _build(self, tree: SurfaceWalker, bakes: SurfaceBakes | None, approximations: list[str]) -> ExportedMaterial:
-        material = tree.material
         surface = tree.surface()
         if surface is None:
             self._say(approximations)
             return ExportedMaterial(None)
-        paints = {
-            "base_colour": surface.base,
-            "roughness": surface.roughness,
-            "metallic": surface.metallic,
-            "emission": surface.emission,
-            "alpha": surface.alpha,
-        }
+        found = _Paints(surface)
         done: set[str] = set()
         left = {text for detail in surface.details for text in detail.value.approximations}
-        for name, value in paints.items():
-            solved = False
-            if bakes is not None and name in CHANNELS and value.approximations:
-                paints[name], solved = bakes.channel(material, name, value, self._warn)
+        for values, name, leaves in found.all():
+            value, solved = values[name], False
+            if bakes is not None and value.approximations and found.are_apart:
+                values[name], solved = bakes.channel(tree.material, name, value, self._warn, leaves)
             (done if solved else left).update(value.approximations)
         self._say([text for text in approximations if text in left or text not in done])
-        textures = [value.texture for value in (*paints.values(), *(d.value for d in surface.details)) if value.texture]
+        textures = [values[name].texture for values, name, _ in found.all() if values[name].texture]
+        textures += [detail.value.texture for detail in surface.details if detail.value.texture]
         wanted = [t.layer for t in textures] + [d.tangents for d in surface.details if d.kind == "tangent"]
+        wanted += [part.bsdf.tangent for part in surface.parts if part.bsdf.tangent is not None]
         uv_map = next((layer.name for layer in wanted if layer.source == "uv"), None)
         layers = tuple(dict.fromkeys(layer for layer in wanted if layer != LayerRef("uv", uv_map or "")))
 
         def label(layer: LayerRef) -> str:
             return layer.label if layer in layers else ""
 
-        values: dict[str, Any] = {}
-        for name, value in paints.items():
-            values[name] = _usable(tree, name, value, getattr(DEFAULT_MATERIAL, name))
+        return ExportedMaterial(self._described(tree, surface, found, label), uv_map, layers, bool(done))
+
+    def _described(self, tree: SurfaceWalker, surface: Surface, found: _Paints, label: Label) -> Material:
+        """The material as frames hold it."""
+        material = tree.material
+        values = self._fields(tree, found.own, label)
+        values |= {
+            "details": [self._detail(tree, detail, label) for detail in surface.details],
+            "pass_index": material.pass_index,
+        }
+        if not found.parts:
+            bsdfs = [part.bsdf for part in surface.parts]
+            return Material(material.name, **values, **(_switched(bsdfs[0], label) if bsdfs else {}))
+        parts = []
+        for part, (weights, channels) in zip(surface.parts, found.parts, strict=True):
+            weight, name = weights["weight"], part.bsdf.leaves[0][1] if part.bsdf.leaves else material.name
+            texture = None if weight.texture is None else self._texture(weight.texture, label(weight.texture.layer))
+            scattering = Material(name, **self._fields(tree, channels, label), **_switched(part.bsdf, label))
+            inverted = part.inverted and not isinstance(weight.texture, BakedRef)
+            parts.append(Part(scattering, _finite(tree, "weight", weight, (1.0, 1.0, 1.0)), texture, inverted))
+        return Material(material.name, **values, **_mean_of(parts), parts=parts)
+
+    def _fields(self, tree: SurfaceWalker, values: dict[str, SocketValue], label: Label) -> dict[str, Any]:
+        """Fields of frame.Material with their textures."""
+        fields: dict[str, Any] = {}
+        for name, value in values.items():
+            fields[name] = _usable(tree, name, value)
             if value.texture is not None:
-                values[f"{name}_texture"] = self._texture(value.texture, label(value.texture.layer))
-        details = [self._detail(tree, detail, label) for detail in surface.details]
-        described = Material(material.name, **values, details=details, pass_index=material.pass_index)
-        return ExportedMaterial(described, uv_map, layers, bool(done))
+                texture = self._texture(value.texture, label(value.texture.layer))
+                if name in TEXTURED:
+                    fields.setdefault("textures", {})[name] = texture
+                else:
+                    fields[f"{name}_texture"] = texture
+        return fields
 
     def _say(self, texts: list[str]) -> None:
         for text in texts:
             self._warn(text)
 
-    def _detail(self, tree: SurfaceWalker, detail: DetailRef, label: Callable[[LayerRef], str]) -> SurfaceDetail:
+    def _detail(self, tree: SurfaceWalker, detail: DetailRef, label: Label) -> SurfaceDetail:
         texture, numbers = detail.value.texture, (*detail.value.colour, detail.strength, detail.distance)
         x, y, z = map(float, detail.value.colour)
         if not np.isfinite(numbers).all():
@@ -139,13 +171,71 @@ class Materials:
         return picture.texture(exported.name, layer)
 
 
-def _usable(tree: SurfaceWalker, name: str, value: SocketValue, default: tuple[float, float, float] | float) -> object:
-    """The number or colour of a field of frame.Material, finite and where it can be."""
+class _Paints:
+    """The values of a surface: its own, and of each of its parts the weight and the values, if it has parts."""
+
+    def __init__(self, surface: Surface) -> None:
+        self.own = {"emission": surface.emission, "alpha": surface.alpha}
+        self.parts: list[tuple[dict[str, SocketValue], dict[str, SocketValue]]] = []
+        self._leaves: list[Leaves] = []
+        if not surface.parts:
+            self.own |= {"base_colour": uniform(0), "roughness": uniform(1)}
+        elif len(surface.parts) == 1 and surface.parts[0].is_whole:
+            self.own |= surface.parts[0].bsdf.values
+        else:
+            self.parts = [({"weight": part.weight}, dict(part.bsdf.values)) for part in surface.parts]
+            self._leaves = [part.bsdf.leaves for part in surface.parts]
+
+    @property
+    def are_apart(self) -> bool:
+        """Whether each shader node is of one part alone; not where two of them are instances of a group."""
+        leaves = [leaf for own in self._leaves for leaf in own]
+        return len(leaves) == len(set(leaves))
+
+    def all(self) -> Iterator[tuple[dict[str, SocketValue], str, Leaves | None]]:
+        """Of each value where it is held, its name, and the shaders that count for it; None: all."""
+        for name in self.own:
+            yield self.own, name, None
+        for held, leaves in zip(self.parts, self._leaves, strict=True):
+            for values in held:
+                for name in values:
+                    yield values, name, leaves
+
+
+def _switched(bsdf: Bsdf, label: Label) -> dict[str, Any]:
+    """Fields of frame.Material that are no numbers."""
+    fields: dict[str, Any] = dict.fromkeys(bsdf.switches, True)
+    if bsdf.tangent is not None:
+        fields["tangent"] = label(bsdf.tangent)
+    return fields | {"kind": bsdf.kind}
+
+
+def _mean_of(parts: list[Part]) -> dict[str, Any]:
+    """The weighted means that readers of a material without its parts take it for."""
+    weights = np.array([np.mean(part.weight) for part in parts])
+    weights = weights / max(weights.sum(), 1e-9)
+    materials = [part.material for part in parts]
+    base = weights @ np.array([material.base_colour for material in materials])
+    numbers = {n: float(weights @ [getattr(m, n) for m in materials]) for n in ("roughness", "metallic")}
+    return {"base_colour": rgb(base), **numbers}
+
+
+def _finite(tree: SurfaceWalker, name: str, value: SocketValue, default: Any) -> tuple[float, float, float]:
+    """A value without its texture, at least 0; the default where it is no number."""
     colour = value.colour
     if not np.isfinite(colour).all():
         tree.report(f"its {name.replace('_', ' ')} is not finite; Blender's default is used. Check its drivers")
         colour = np.broadcast_to(default, 3)
-    colour = np.maximum(colour, 0)
-    if name in ("roughness", "metallic", "alpha") and value.texture is None:
-        colour = np.minimum(colour, 1)
-    return tuple(map(float, colour)) if name in ("base_colour", "emission") else float(colour[0])
+    lowest = _LOWEST.get(name, 0.0)
+    if name == "ior" and (colour < lowest).any():
+        tree.report("an IOR of 0 or less is none; as in Cycles it is taken as nearly 0. Choose one of 1 or more")
+    return rgb(np.maximum(colour, lowest))
+
+
+def _usable(tree: SurfaceWalker, name: str, value: SocketValue) -> tuple[float, float, float] | float:
+    """The number or colour of a field of frame.Material, finite and where it can be."""
+    colour = _finite(tree, name, value, getattr(DEFAULT_MATERIAL, name))
+    if name in COLOURS:
+        return colour
+    number = colour[0]
+    return min(number, 1.0) if name in _AT_MOST_1 and value.texture is None else number

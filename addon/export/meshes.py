@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.core.arrays import shareable
-from ...drgs_blender.core.frame import Image, Layer, Material, MeshState
+from ...drgs_blender.core.frame import Image, Layer, MeshState
 from .. import mesh_arrays
 from ..bakes.requests import Wanted
 from .export_cache import ExportCache, uid
@@ -240,10 +240,8 @@ def _images_of(state: MeshState | None) -> set[str]:
     """Names of the images that its textures refer to."""
     if state is None:
         return set()
-    names = [name for name in Material.__dataclass_fields__ if name.endswith("_texture")]
-    textures = [getattr(material, name) for material in state.materials for name in names]
-    textures += [detail.texture for material in state.materials for detail in material.details]
-    return {texture.image for texture in textures if texture is not None and texture.image}
+    textures = [texture for material in state.materials for texture in material.all_textures()]
+    return {texture.image for texture in textures if texture.image}
 
 
 def _seen(

@@ -117,3 +117,30 @@ def reflectance(ior: float) -> float:
     """Fresnel reflectance of a dielectric in air at normal incidence; below 0 as at 0."""
     ior = max(ior, 0.0)
     return ((ior - 1) / (ior + 1)) ** 2
+
+
+def conductor(ior: Array, extinction: Array) -> tuple[Array, Array]:
+    """Base colour and edge tint by which the F82 model (Kutz, Hasan and Edmondson 2021) shows a conductor.
+
+    Parameters
+    ----------
+    ior, extinction : (3,)
+        Real and imaginary part of the refractive index for red, green and blue.
+    """
+    n, k = np.maximum(ior, 0.0), np.maximum(extinction, 0.0)
+    normal = _conductor_at(n, k, 1.0)
+    falloff = (1 - 1 / 7) ** 5
+    schlick = normal + (1 - normal) * falloff
+    return normal, np.clip(divide(_conductor_at(n, k, 1 / 7), schlick), 0, 1)
+
+
+def _conductor_at(n: Array, k: Array, cosine: float) -> Array:
+    """(3,) unpolarised Fresnel reflectance of a conductor in air."""
+    square = cosine * cosine
+    sine = 1 - square
+    t = n * n - k * k - sine
+    length = np.sqrt(t * t + 4 * n * n * k * k)
+    a = np.sqrt(np.maximum((length + t) / 2, 0))
+    s = (length + square - 2 * a * cosine) / (length + square + 2 * a * cosine)
+    p = s * (square * length + sine * sine - 2 * a * cosine * sine)
+    return (s + p / (square * length + sine * sine + 2 * a * cosine * sine)) / 2

@@ -37,6 +37,10 @@ class SocketValue:
         """Scaled."""
         return replace(self, colour=self.colour * factor)
 
+    def same(self, other: SocketValue) -> bool:
+        """Whether both are the same everywhere."""
+        return self.texture == other.texture and bool((self.colour == other.colour).all())
+
     @property
     def black(self) -> bool:
         return not self.colour.any()

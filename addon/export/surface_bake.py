@@ -24,8 +24,6 @@ from .sockets import surface_of
 Array = np.ndarray
 Warn = Callable[[str], None]
 
-#: Channels that are baked, and whether each is a colour.
-CHANNELS = {"base_colour": True, "roughness": False, "metallic": False, "emission": True}
 #: Outputs that are another for every ray, view, instance or frame, by the type of their node; None is all of them.
 _NEVER: dict[str, set[str] | None] = {
     **dict.fromkeys(("LIGHT_PATH", "LAYER_WEIGHT", "FRESNEL", "CAMERA", "PARTICLE_INFO", "HAIR_INFO"), None),
@@ -105,7 +103,12 @@ class SurfaceBakes:
         self._arrays: dict[str, Array] | None = None
 
     def channel(
-        self, material: bpy.types.Material, name: str, value: SocketValue, note: Warn
+        self,
+        material: bpy.types.Material,
+        name: str,
+        value: SocketValue,
+        note: Warn,
+        leaves: node_trees.Leaves | None = None,
     ) -> tuple[SocketValue, bool]:
         """A channel of a material, and whether its approximations are no matter any more.
 
@@ -113,15 +116,16 @@ class SurfaceBakes:
         ----------
         value : as it is approximated
         note : called with the reason where it cannot be baked
+        leaves : the only shaders that count; None: all do
         """
-        follow = node_trees.follow_channel(name)
+        follow = node_trees.follow_channel(name, leaves)
         surface = surface_of(material.node_tree)
         if surface is None:
             return value, False
         found = node_trees.trees(material.node_tree, surface.node, follow)
         if _never(found):
             return value, False
-        made = self._request(material, name, found, follow)
+        made = self._request(material, name, found, follow, leaves)
         baked = self._wanted.find(made)
         if baked is not None:
             return self._value(made.key, name, baked), True
@@ -137,7 +141,12 @@ class SurfaceBakes:
         self._arrays = None
 
     def _request(
-        self, material: bpy.types.Material, name: str, found: list[node_trees.Tree], follow: node_trees.Follow
+        self,
+        material: bpy.types.Material,
+        name: str,
+        found: list[node_trees.Tree],
+        follow: node_trees.Follow,
+        leaves: node_trees.Leaves | None,
     ) -> Request:
         arrays, mesh, obj = self._read(), self._mesh, self._obj
         numbers = [i for i, slot in enumerate(self._slots) if slot is not None and slot == material]
@@ -161,7 +170,7 @@ class SurfaceBakes:
         colours = mesh.color_attributes
         active = mesh.uv_layers.active
         rendered = next((layer.name for layer in mesh.uv_layers if layer.active_render), active.name if active else "")
-        about = {
+        about: dict[str, Any] = {
             "channel": name,
             "size": self._wanted.texture_size,
             "mesh": digest.hexdigest(),
@@ -171,6 +180,8 @@ class SurfaceBakes:
             "attributes": [spec for spec, _ in attributes],
             "active_colour": colours[max(colours.render_color_index, 0)].name if len(colours) else "",
         }
+        if leaves is not None:
+            about["leaves"] = [list(leaf) for leaf in leaves]
 
         def write(folder: Path) -> None:
             with open(folder / "mesh.npz", "wb") as file:
@@ -207,9 +218,10 @@ class SurfaceBakes:
         return self._arrays
 
     def _value(self, key: str, name: str, baked: Baked) -> SocketValue:
-        image = Image(f"baked {key}", baked["pixels"], "srgb" if name == "base_colour" else "linear")
+        colour = name in node_trees.COLOURS
+        image = Image(f"baked {key}", baked["pixels"], "srgb" if colour and name != "emission" else "linear")
         layer = LayerRef("uv") if len(baked["uvs"]) == 0 else BakedLayer(baked["uvs"])
-        channel = "rgb" if CHANNELS[name] else "r"
+        channel = "rgb" if colour else "r"
         return SocketValue(np.full(3, float(baked["factor"])), BakedRef(image, image.name, channel, layer))
 
 

@@ -2,51 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import bpy
 import numpy as np
 
-from .node_math import reflectance
-from .normal_nodes import DetailRef, NormalWalker
-from .socket_value import Array, SocketValue, constant, once, uniform
+from ..bakes.node_trees import COLOURS, SHADERS, leaf_of
+from .bsdfs import Bsdf, MixingWalker, Part, Surface
+from .layers import LayerRef
+from .node_math import conductor
+from .normal_nodes import DetailRef
+from .socket_value import SocketValue, constant, once, uniform
 from .sockets import SocketRef, surface_of
 
 #: Least alpha of a surface that gives off light and lets all light pass, which no alpha says.
 _LEAST_ADDED = 0.25
-#: Of the Principled BSDF: inputs that must be zero, and what they are called in the warning.
-_LOBES = {
-    "Subsurface Weight": "subsurface",
-    "Transmission Weight": "transmission",
-    "Coat Weight": "coat",
-    "Sheen Weight": "sheen",
-    "Anisotropic": "anisotropy",
-    "Thin Film Thickness": "thin film",
-    "Diffuse Roughness": "diffuse roughness",
+#: What BSDFs have that is not rendered, if its input is not zero.
+_UNRENDERED = {"Subsurface Weight": "subsurface scattering (it is diffuse)", "Thin Film Thickness": "thin film"}
+#: Channels that do not matter where others are zero.
+_BELONGS = {
+    "anisotropy_rotation": "anisotropy",
+    **dict.fromkeys(("coat_roughness", "coat_ior", "coat_tint"), "coat"),
+    **dict.fromkeys(("sheen_roughness", "sheen_tint"), "sheen"),
 }
+#: Channels that metals have not.
+_DIELECTRIC = ("ior", "specular_level", "transmission", "diffuse_roughness")
+#: Channels that are no part of a BSDF.
+_APART = ("emission", "alpha")
 
 
-@dataclass(slots=True)
-class Surface:
-    """Result of a shader.
-
-    Attributes
-    ----------
-    base, emission : light reflected and given off by the part that is there; ``base`` is times `scattered`
-    scattered : share of that part that is scattered
-    alpha : share that is there; light passes the rest
-    """
-
-    base: SocketValue = field(default_factory=lambda: uniform(0))
-    roughness: SocketValue = field(default_factory=lambda: uniform(1))
-    metallic: SocketValue = field(default_factory=lambda: uniform(0))
-    emission: SocketValue = field(default_factory=lambda: uniform(0))
-    scattered: float = 0.0
-    alpha: SocketValue = field(default_factory=lambda: uniform(1))
-    details: tuple[DetailRef, ...] = ()
-
-
-class SurfaceWalker(NormalWalker):
+class SurfaceWalker(MixingWalker):
     """Evaluates a material on a mesh."""
 
     def surface(self) -> Surface | None:
@@ -54,8 +39,7 @@ class SurfaceWalker(NormalWalker):
         material = self.material
         # From Blender 5.0 on every material has nodes, and the switch is deprecated.
         if material.node_tree is None or (bpy.app.version < (5, 0, 0) and not material.use_nodes):
-            base, rough, metal = material.diffuse_color[:3], material.roughness, material.metallic
-            return Surface(uniform(base), uniform(rough), uniform(metal), scattered=1)
+            return _plain(uniform(material.diffuse_color[:3]), uniform(material.roughness), uniform(material.metallic))
         ref = surface_of(material.node_tree)
         linked = ref is not None and ref.origin().socket.is_output
         output = ref and ref.node
@@ -67,13 +51,13 @@ class SurfaceWalker(NormalWalker):
                 return None
         if not linked:
             self.report("has no surface, which is black in Blender; its viewport colour is used")
-            return Surface(uniform(material.diffuse_color[:3]), uniform(material.roughness), scattered=1)
+            return _plain(uniform(material.diffuse_color[:3]), uniform(material.roughness))
         surface = self.shader(ref)
-        return None if surface.alpha.black else surface
+        return None if surface.alpha.black else self.settled(output, surface)
 
     # Shaders
 
-    @once(lambda self: Surface(uniform(self.unknown), scattered=1))
+    @once(lambda self: _plain(uniform(self.unknown)))
     def shader(self, ref: SocketRef) -> Surface:
         """The surface of a shader input."""
         origin = ref.origin()
@@ -89,49 +73,114 @@ class SurfaceWalker(NormalWalker):
         emission = uniform(0)
         if not strength.black:
             emission = self.combine(node, np.multiply, self.colour(output.input("Emission Color")), strength)
-        unsupported = [text for name, text in _LOBES.items() if name in node.inputs and _used(output.input(name))]
-        if not 0.03 < self.reflectance(output) < 0.05:
-            unsupported.append("specular other than that of IOR 1.5")
-        self.warn_unsupported(output, unsupported)
-        return Surface(
-            self.colour(output.input("Base Color")),
-            self.number(output.input("Roughness")),
-            self.number(output.input("Metallic")),
-            emission,
-            scattered=1,
-            alpha=alpha,
-            details=self.normal_of(output),
-        )
+        details = self.normal_of(output)
+        bsdf = self.bsdf(output, "principled")
+        switches = {name for name, on in (("thin_walled", self.is_thin(output)),) if on}
+        if "coat" in bsdf.values and self.is_coat_detailed(output, details):
+            switches.add("coat_details")
+        return Surface((Part(replace(bsdf, switches=bsdf.switches | switches)),), emission, alpha, details)
 
-    def reflectance(self, output: SocketRef) -> float:
-        """Reflectance of a Principled BSDF at normal incidence; that of IOR 1.5 where it varies."""
-        ior, level = output.input("IOR").origin().socket, output.input("Specular IOR Level").origin().socket
-        if ior.is_output or level.is_output:
-            return float("nan")
-        return reflectance(ior.default_value) * 2 * level.default_value
+    def bsdf(self, output: SocketRef, kind: str) -> Bsdf:
+        """A BSDF of a kind, with the inputs of its node."""
+        node = output.node
+        values: dict[str, SocketValue] = {}
+        channels = SHADERS[node.type]
+        for channel, source in channels.items():
+            owner = _BELONGS.get(channel)
+            if channel in _APART or (owner in channels and owner not in values):
+                continue
+            if channel in _DIELECTRIC and _is_one(values.get("metallic")):
+                continue
+            if not isinstance(source, tuple):
+                values[channel] = uniform(source)
+            elif source[0] in node.inputs:
+                ref = output.input(source[0])
+                value = self.colour(ref) if channel in COLOURS else self.number(ref)
+                if channel not in _BELONGS.values() or not value.black:
+                    values[channel] = value
+        self.warn_unrendered(output, values)
+        tangent = self.tangent(output) if "anisotropy" in values else None
+        switches = {"multiscatter"} if getattr(node, "distribution", "") == "MULTI_GGX" else set()
+        return Bsdf(kind, values, frozenset(switches), tangent, (leaf_of(node),))
 
-    def warn_unsupported(self, output: SocketRef, unsupported: list[str]) -> None:
-        """One warning for all that a shader node does beyond the supported."""
-        if unsupported:
-            self.note(output.node, f"not rendered: {', '.join(unsupported)}")
+    def warn_unrendered(self, output: SocketRef, values: dict[str, SocketValue]) -> None:
+        """One warning for all that a BSDF does and that is not rendered."""
+        node = output.node
+        found = [text for name, text in _UNRENDERED.items() if name in node.inputs and _used(output.input(name))]
+        rough = values.get("roughness", uniform(1))
+        shape = getattr(node, "distribution", "")
+        if shape in ("BECKMANN", "ASHIKHMIN_SHIRLEY") and not rough.black:
+            found.append(f"{shape.replace('_', '-').title()} distribution (GGX is used)")
+        elif shape == "ASHIKHMIN":
+            found.append("Ashikhmin distribution (Microfiber is used)")
+        if found:
+            self.note(node, f"not rendered: {', '.join(found)}")
+
+    def is_thin(self, output: SocketRef) -> bool:
+        """Whether a Principled BSDF is a sheet; Blender has that from 5.2 on."""
+        if "Thin Wall" not in output.node.inputs:
+            return False
+        origin = output.input("Thin Wall").origin()
+        if origin.socket.is_output:
+            self.note(output.node, "Thin Wall cannot vary; it is off")
+            return False
+        return bool(constant(origin.socket)[0])
+
+    def is_coat_detailed(self, output: SocketRef, details: tuple[DetailRef, ...]) -> bool:
+        """Whether the coat has the normal of what is below, and not the smooth one."""
+        own = self.normal(output.input("Coat Normal"))
+        if own and not (len(own) == len(details) and all(map(DetailRef.same, own, details))):
+            self.note(output.node, "the coat has a normal of its own; that of the surface below is used")
+        return bool(own)
+
+    def tangent(self, output: SocketRef) -> LayerRef:
+        """What highlights follow."""
+        origin = output.input("Tangent").origin()
+        node = origin.node
+        if origin.socket.is_output:
+            if node.type == "TANGENT":
+                return (
+                    LayerRef("uv", node.uv_map) if node.direction_type == "UV_MAP" else LayerRef("tangent", node.axis)
+                )
+            if not (node.type == "NEW_GEOMETRY" and origin.socket.name == "Tangent"):
+                self.warn(node, f"{node.bl_label} is not supported for tangents; they run around the Z axis")
+        return LayerRef("tangent", "Z")
+
+    def single(self, output: SocketRef, kind: str) -> Surface:
+        return Surface((Part(self.bsdf(output, kind)),), details=self.normal_of(output))
 
     def shader_bsdf_diffuse(self, output: SocketRef) -> Surface:
-        self.warn_unsupported(output, [])
-        return Surface(self.colour(output.input("Color")), scattered=1, details=self.normal_of(output))
+        return self.single(output, "diffuse")
 
     def shader_bsdf_glossy(self, output: SocketRef) -> Surface:
-        self.warn_unsupported(output, ["anisotropy"] if _used(output.input("Anisotropy")) else [])
-        base, roughness = self.colour(output.input("Color")), self.number(output.input("Roughness"))
-        return Surface(base, roughness, uniform(1), scattered=1, details=self.normal_of(output))
+        return self.single(output, "glossy")
+
+    def shader_bsdf_glass(self, output: SocketRef) -> Surface:
+        return self.single(output, "glass")
+
+    def shader_bsdf_refraction(self, output: SocketRef) -> Surface:
+        return self.single(output, "refraction")
+
+    def shader_bsdf_translucent(self, output: SocketRef) -> Surface:
+        return self.single(output, "translucent")
+
+    def shader_bsdf_sheen(self, output: SocketRef) -> Surface:
+        return self.single(output, "sheen")
+
+    def shader_subsurface_scattering(self, output: SocketRef) -> Surface:
+        self.note(output.node, "not rendered: subsurface scattering (it is diffuse)")
+        return self.single(output, "diffuse")
 
     def shader_bsdf_metallic(self, output: SocketRef) -> Surface:
+        surface = self.single(output, "principled")
         node = output.node
-        unsupported = ["anisotropy"] if _used(output.input("Anisotropy")) else []
-        if node.fresnel_type != "F82":
-            unsupported.append("physical conductor (its Base Color is used)")
-        self.warn_unsupported(output, unsupported)
-        base, roughness = self.colour(output.inputs()["Base Color"]), self.number(output.input("Roughness"))
-        return Surface(base, roughness, uniform(1), scattered=1, details=self.normal_of(output))
+        if node.fresnel_type == "F82":
+            return surface
+        self.note(node, "its physical Fresnel is approximated by that of F82")
+        part = surface.parts[0]
+        base, edge = conductor(self.fixed(output.input("IOR")), self.fixed(output.input("Extinction")))
+        values = part.bsdf.values | {"base_colour": uniform(base), "specular_tint": uniform(edge)}
+        return replace(surface, parts=(replace(part, bsdf=replace(part.bsdf, values=values)),))
 
     def shader_emission(self, output: SocketRef) -> Surface:
         operands = self.colour(output.input("Color")), self.number(output.input("Strength"))
@@ -174,46 +223,10 @@ class SurfaceWalker(NormalWalker):
         if first.alpha.black and second.alpha.black:
             return first
         a, b = (float(self.flat(node, surface.alpha)[0]) for surface in (first, second))
-        sum_ = self.mixed(node, first, second, uniform(b / (a + b)))
         alpha = max(1 - (2 - a - b), _LEAST_ADDED)
         if a + b < 2:
             self.warn(node, f"light added to what passes: the surface hides {alpha:.0%} of what is behind it")
-        scale = (a + b) / alpha
-        return replace(
-            sum_, base=sum_.base.times(scale), emission=sum_.emission.times(scale), alpha=uniform(alpha),
-            scattered=min(1.0, sum_.scattered * scale),
-        )  # fmt: skip
-
-    def mixed(self, node: bpy.types.Node, first: Surface, second: Surface, share: SocketValue) -> Surface:
-        """`share` of the second surface, the rest of the first; of roughness and metallic by what each scatters."""
-
-        def mix(f: Array, a: Array, b: Array) -> Array:
-            return a * (1 - f) + b * f
-
-        mean = float(share.colour[0] * (1 if share.texture is None else self.mean(share.texture)[0]))
-        weights = (1 - mean) * first.scattered, mean * second.scattered
-        if first.scattered == second.scattered:
-            rough_share = share
-        else:
-            rough_share = replace(share, colour=np.full(3, weights[1] / max(sum(weights), 1e-9)), texture=None)
-        return Surface(
-            self.combine(node, mix, share, first.base, second.base),
-            self.combine(node, mix, rough_share, first.roughness, second.roughness),
-            self.combine(node, mix, rough_share, first.metallic, second.metallic),
-            self.combine(node, mix, share, first.emission, second.emission),
-            scattered=sum(weights),
-            details=self.stronger_details(node, first, second, weights),
-        )
-
-    def stronger_details(
-        self, node: bpy.types.Node, first: Surface, second: Surface, weights: tuple[float, float]
-    ) -> tuple[DetailRef, ...]:
-        """Normal and bump maps of the surface that scatters more, for both."""
-        more = first if weights[0] >= weights[1] else second
-        alike = len(first.details) == len(second.details) and all(map(DetailRef.same, first.details, second.details))
-        if min(weights) > 0 and not alike:
-            self.warn(node, "its shaders have other normal or bump maps; those of the stronger one are used for both")
-        return more.details if max(weights) > 0 else ()
+        return replace(self.added(node, first, second, a / alpha, b / alpha), alpha=uniform(alpha))
 
     def other_shader(self, output: SocketRef) -> Surface:
         """The nearest to a shader that is not known: its colour, scattered."""
@@ -223,7 +236,17 @@ class SurfaceWalker(NormalWalker):
         base = self.colour(SocketRef(colours[0], output.groups)) if colours else uniform(0.8)
         rough = output.input("Roughness") if "Roughness" in node.inputs else None
         rough_value = self.number(rough) if rough else uniform(1)
-        return Surface(base, rough_value, scattered=1, details=self.normal_of(output))
+        return replace(_plain(base, rough_value), details=self.normal_of(output))
+
+
+def _plain(base: SocketValue, roughness: SocketValue | None = None, metallic: SocketValue | None = None) -> Surface:
+    """A Principled BSDF of which no more is known."""
+    values = {"base_colour": base, "roughness": roughness or uniform(1), "metallic": metallic or uniform(0)}
+    return Surface((Part(Bsdf("principled", values)),))
+
+
+def _is_one(value: SocketValue | None) -> bool:
+    return value is not None and value.texture is None and bool((value.colour >= 1).all())
 
 
 def _unit(value: SocketValue) -> SocketValue:

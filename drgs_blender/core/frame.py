@@ -370,6 +370,15 @@ class Material:
         plain = _PLAIN if is_metal else _PLAIN | _PLAIN_DIELECTRIC
         return any(getattr(self, name) != value or name in self.textures for name, value in plain.items())
 
+    def all_textures(self) -> list[Texture]:
+        """Textures of the material and its parts."""
+        names = ("base_colour", "roughness", "metallic", "emission", "alpha")
+        found = [getattr(self, f"{name}_texture") for name in names]
+        found += [*self.textures.values(), *(detail.texture for detail in self.details)]
+        for part in self.parts:
+            found += [part.weight_texture, *part.material.all_textures()]
+        return [texture for texture in found if texture is not None]
+
 
 @dataclass(slots=True)
 class Part:

@@ -199,6 +199,81 @@ def test_mixed_shaders_within_groups_are_baked(scene, bake):
     assert psnr(found, (1 - share) * (0.8, 0.1, 0.1) + share * (0.1, 0.1, 0.9)) > 40
 
 
+def lone_image(frame, texture) -> np.ndarray:
+    """(64, 64): the first channel of a baked picture of the whole square, at the pixels of the camera."""
+    pixels = next(i for i in frame.images if i.name == texture.image).pixels[..., 0] / 255
+    size = len(pixels) // 64
+    return pixels.reshape(64, size, 64, size).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("name, field", [
+    ("Alpha", "alpha"), ("Transmission Weight", "transmission"), ("Coat Weight", "coat"), ("IOR", "ior"),
+])  # fmt: skip
+def test_procedural_numbers_of_all_lobes_are_baked(scene, bake, jobs, name, field):  # noqa: F811
+    obj = square()
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    texture = noise(tree, shader.inputs[name])
+    stretched = tree.nodes.new("ShaderNodeMath")
+    stretched.operation = "MULTIPLY"
+    stretched.inputs[1].default_value = 2.4 if field == "ior" else 0.9
+    tree.links.new(texture.outputs[0], stretched.inputs[0])
+    tree.links.new(stretched.outputs[0], shader.inputs[name])
+    frame, warnings = bake()
+    found = frame.meshes[0].materials[0]
+    assert not warnings and [job["channel"] for job in jobs] == [field]
+    texture = found.alpha_texture if field == "alpha" else found.textures[field]
+    ours = lone_image(frame, texture) * getattr(found, field)
+    theirs = shining(obj, shader.inputs[name])[..., 0]
+    assert psnr(ours, theirs) > 40 and theirs.std() > 0.05
+
+
+def test_a_procedural_mix_with_what_is_clear_is_baked(scene, bake):
+    obj = square()
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    mix, clear = tree.nodes.new("ShaderNodeMixShader"), tree.nodes.new("ShaderNodeBsdfTransparent")
+    texture = noise(tree, shader.inputs["Roughness"])
+    tree.links.remove(shader.inputs["Roughness"].links[0])
+    tree.links.new(texture.outputs[0], mix.inputs[0])
+    tree.links.new(clear.outputs[0], mix.inputs[1])
+    tree.links.new(shader.outputs[0], mix.inputs[2])
+    tree.links.new(mix.outputs[0], tree.get_output_node("ALL").inputs["Surface"])
+    frame, warnings = bake()
+    found = frame.meshes[0].materials[0]
+    assert not warnings and found.alpha == 1 and found.base_colour_texture is None
+    tree.links.new(texture.outputs[0], shader.inputs["Roughness"])
+    assert psnr(lone_image(frame, found.alpha_texture), shining(obj, shader.inputs["Roughness"])[..., 0]) > 40
+
+
+def test_procedural_weights_and_colours_of_parts_are_baked(scene, bake, jobs):  # noqa: F811
+    """A noise between glass of another noise and a diffuse surface: each of the two, and only what it has."""
+    obj = square()
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    mix, glass, paint = (tree.nodes.new(f"ShaderNode{n}") for n in ("MixShader", "BsdfGlass", "BsdfDiffuse"))
+    paint.inputs["Color"].default_value = (0.1, 0.2, 0.3, 1)
+    texture = noise(tree, glass.inputs["Color"])
+    tree.links.new(texture.outputs[0], mix.inputs[0])
+    tree.links.new(glass.outputs[0], mix.inputs[1])
+    tree.links.new(paint.outputs[0], mix.inputs[2])
+    tree.links.new(mix.outputs[0], tree.get_output_node("ALL").inputs["Surface"])
+    frame, warnings = bake()
+    found = frame.meshes[0].materials[0]
+    assert not warnings and sorted(job["channel"] for job in jobs) == ["base_colour", "weight", "weight"]
+    first, second = found.parts
+    assert (first.material.kind, second.material.kind) == ("glass", "diffuse")
+    assert not first.inverted and not second.inverted
+    assert second.material.base_colour == pytest.approx((0.1, 0.2, 0.3)) and not second.material.base_colour_texture
+    tree.links.new(texture.outputs[0], shader.inputs["Roughness"])
+    share = shining(obj, shader.inputs["Roughness"])[..., 0]
+    tree.links.new(mix.outputs[0], tree.get_output_node("ALL").inputs["Surface"])
+    assert psnr(lone_image(frame, first.weight_texture), 1 - share) > 40
+    assert psnr(lone_image(frame, second.weight_texture), share) > 40
+    frame.meshes[0].materials[0] = first.material
+    assert psnr(seen(frame), shining(obj, glass.inputs["Color"])) > 40
+
+
 @pytest.mark.slow
 def test_results_are_kept_by_content(scene, bake, jobs):  # noqa: F811
     obj = square()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,9 @@ import numpy as np
 from mathutils import Matrix
 
 _SAMPLES = 4
+#: Numbers of which 1 is the most.
+_UNIT = ("roughness", "metallic", "alpha", "anisotropy", "coat", "coat_roughness", "sheen", "sheen_roughness",
+         "transmission", "diffuse_roughness")  # fmt: skip
 #: Pixels by which islands are continued, of textures of 1024.
 _MARGIN = 8
 #: Side of the picture in which faces of a UV map are looked for that overlap, and the part of it that may.
@@ -29,11 +33,12 @@ _IMPLICIT = ("TEX_NOISE", "TEX_VORONOI", "TEX_WAVE", "TEX_MAGIC", "TEX_CHECKER",
 def bake(job: dict[str, Any]) -> None:
     """Write ``pixels`` (h, w, 4), row 0 at the top, their ``factor``, and ``uvs`` (loops, 2), empty for the mesh's own.
 
-    Colours are bytes, encoded as sRGB, numbers are bytes, emission is float32.
+    Colours are bytes, encoded as sRGB, numbers are bytes, emission is float32. With ``leaves`` no other shaders count.
     """
     channel, size = job["channel"], job["size"]
+    leaves = tuple(map(tuple, job["leaves"])) if "leaves" in job else None
     material = cycles_scene.load(job, "materials")
-    found = cycles_scene.evaluated(material, job, node_trees.follow_channel(channel))
+    found = cycles_scene.evaluated(material, job, node_trees.follow_channel(channel, leaves))
     scene = cycles_scene.set_up(job, _SAMPLES)
     with np.load(Path(job["folder"]) / "mesh.npz", allow_pickle=False) as data:
         arrays = {name: data[name] for name in data.files}
@@ -43,15 +48,22 @@ def bake(job: dict[str, Any]) -> None:
         _unwrap(obj)
     for tree in found:
         _generated(tree)
-    shares = any(node.type in node_trees.UNSCATTERED for tree in found for node in tree.nodes) and channel != "emission"
-    clear = any(node.type == "BSDF_TRANSPARENT" for tree in found for node in tree.nodes)
-    pixels = _baked(scene, obj, found, lambda node: node_trees.shader_inputs(node, channel), size)
-    if channel in ("roughness", "metallic") and shares:
-        weight = _baked(scene, obj, found, lambda node: float(node.type not in node_trees.UNSCATTERED), size)
-        pixels = np.divide(pixels, weight, out=np.zeros_like(pixels), where=weight > 1e-4)
-    elif channel in ("base_colour", "emission") and clear:
-        weight = _baked(scene, obj, found, lambda node: float(node.type != "BSDF_TRANSPARENT"), size)
-        pixels = np.divide(pixels, weight, out=np.zeros_like(pixels), where=weight > 1e-4)
+    kinds = {node.type for tree in found for node in tree.nodes}
+
+    def weight(counts: Callable[[bpy.types.Node], bool]) -> np.ndarray:
+        return _baked(scene, obj, found, lambda node: float(counts(node)), size)
+
+    pixels = _baked(scene, obj, found, lambda node: node_trees.shader_inputs(node, channel, leaves), size)
+    whole = None
+    if leaves is not None and channel != "weight":
+        whole = weight(lambda node: node_trees.leaf_of(node) in leaves)
+    elif channel in ("base_colour", "emission", "weight"):
+        if "BSDF_TRANSPARENT" in kinds:
+            whole = weight(lambda node: node.type != "BSDF_TRANSPARENT")
+    elif channel != "alpha" and kinds.intersection(node_trees.UNSCATTERED):
+        whole = weight(lambda node: node.type not in node_trees.UNSCATTERED)
+    if whole is not None:
+        pixels = np.divide(pixels, whole, out=np.zeros_like(pixels), where=whole > 1e-4)
     uvs = np.empty((0, 2), np.float32) if own else _uvs(obj.data)
     pixels, factor = _encoded(channel, pixels)
     cycles_scene.write(job, pixels=pixels, factor=np.array(factor), uvs=uvs)
@@ -59,14 +71,15 @@ def bake(job: dict[str, Any]) -> None:
 
 def _encoded(channel: str, pixels: np.ndarray) -> tuple[np.ndarray, float]:
     """(h, w, 4) of a channel, as `bake` writes it, and what it is to be multiplied with."""
-    values = np.maximum(np.nan_to_num(pixels, posinf=0.0), 0)
+    values = np.nan_to_num(pixels, posinf=0.0, neginf=0.0)
+    values = values % 1.0 if channel == "anisotropy_rotation" else np.maximum(values, 0)
     whole = np.ones((*values.shape[:2], 4), np.float32)
     whole[..., :3] = values
     if channel == "emission":
         return whole, 1.0
-    factor = max(1.0, float(values.max(initial=0.0))) if channel == "base_colour" else 1.0
+    factor = 1.0 if channel in _UNIT else max(1.0, float(values.max(initial=0.0)))
     unit = np.minimum(values / factor, 1)
-    if channel == "base_colour":
+    if channel in node_trees.COLOURS:
         unit = np.where(unit <= 0.0031308, 12.92 * unit, 1.055 * unit ** (1 / 2.4) - 0.055)
     whole[..., :3] = unit
     return np.rint(whole * 255).astype(np.uint8), factor
