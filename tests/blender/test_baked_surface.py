@@ -207,7 +207,8 @@ def lone_image(frame, texture) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name, field", [
-    ("Alpha", "alpha"), ("Transmission Weight", "transmission"), ("Coat Weight", "coat"), ("IOR", "ior"),
+    ("Alpha", "alpha"), ("IOR", "ior"), pytest.param("Transmission Weight", "transmission", marks=pytest.mark.slow),
+    pytest.param("Coat Weight", "coat", marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_procedural_numbers_of_all_lobes_are_baked(scene, bake, jobs, name, field):  # noqa: F811
     obj = square()
