@@ -29,6 +29,16 @@ SCENES = {
     "procedural": "Voronoi cells as colour, noise as roughness",
     "forest": "all at once: leaves, statue, captured object, sky",
     "workshop": "all at once: helmet, bumps, cells, captured object, four lamps, World of noise",
+    "coat": "coats: clear, rough and tinted",
+    "sheen": "sheen over cloth, Sheen BSDF",
+    "glass": "smooth glass, IOR 1.33 to 2.4",
+    "rough_glass": "frosted glass, half glass",
+    "thin_glass": "a pane of glass",
+    "anisotropy": "brushed metals",
+    "specular": "IOR, specular level and tint, rough Diffuse BSDF",
+    "glass_nodes": "Glass, Refraction and Glossy BSDF",
+    "translucent": "Translucent BSDF, mixed with Diffuse",
+    "mixes": "Mix and Add of unlike BSDFs",
 }
 
 

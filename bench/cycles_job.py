@@ -37,7 +37,7 @@ def plain_shading() -> None:
     """
     for material in bpy.data.materials:
         for node in material.node_tree.nodes if material.node_tree else ():
-            if node.type == "BSDF_PRINCIPLED":
+            if getattr(node, "distribution", "") == "MULTI_GGX":
                 node.distribution = "GGX"
     for obj in bpy.data.objects:
         obj.shadow_terminator_geometry_offset = obj.shadow_terminator_shading_offset = 0.0

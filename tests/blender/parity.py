@@ -13,11 +13,18 @@ needs_current_normals = pytest.mark.skipif(
 )
 
 
-def set_up(scene: bpy.types.Scene, size: int, samples: int = 256, bounces: int = 2, subpixels: int = 16) -> None:
+def set_up(
+    scene: bpy.types.Scene,
+    size: int,
+    samples: int = 256,
+    bounces: int = 2,
+    subpixels: int = 16,
+    multiscatter: bool = False,
+) -> None:
     """Both engines with the same bounces and pixel filter, nothing clamped or denoised."""
     for material in bpy.data.materials:
         for node in material.node_tree.nodes if material.node_tree else ():
-            if node.type in ("BSDF_PRINCIPLED", "BSDF_GLOSSY"):
+            if not multiscatter and getattr(node, "distribution", "") == "MULTI_GGX":
                 node.distribution = "GGX"
     for obj in bpy.data.objects:
         holder = obj if hasattr(obj, "shadow_terminator_geometry_offset") else obj.cycles  # the latter before 5.0
@@ -28,6 +35,7 @@ def set_up(scene: bpy.types.Scene, size: int, samples: int = 256, bounces: int =
     cycles.device, cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = "CPU", samples, False, False
     cycles.pixel_filter_type, cycles.filter_width = "BOX", 1.0
     cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = settings.bounces = bounces
+    cycles.transmission_bounces = bounces
     cycles.transparent_max_bounces = 64
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = cycles.blur_glossy = cycles.light_sampling_threshold = 0
     cycles.caustics_reflective = True
