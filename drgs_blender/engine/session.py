@@ -288,7 +288,8 @@ class Session:
     def _warnings(self, settings: RenderSettings) -> list[str]:
         trouble = cache_folder().trouble
         linked = self._scene_cache.lights.linked is not None
-        return self._scene_cache.warnings() + self._backends.warnings(settings, linked) + ([trouble] if trouble else [])
+        found = self._scene_cache.warnings() + self._backends.warnings(settings, linked)
+        return found + _ignored_lobes(settings, self._scene_cache.meshes) + ([trouble] if trouble else [])
 
     def _statistics(self, frame: Frame, prepared: PreparedScene, timer: _StageTimer) -> dict[str, float]:
         return timer.seconds | {
@@ -324,6 +325,20 @@ def jobs_of(frame: Frame) -> list[str]:
     if any(source.receivers >= 0 or source.blockers >= 0 for source in sources):
         jobs.append("linked lights")
     return jobs
+
+
+def _ignored_lobes(settings: RenderSettings, meshes: list[MeshState]) -> list[str]:
+    """Materials of which the shading model shows only a part."""
+    if settings.shading_model != "paper":
+        return []
+    more = dict.fromkeys(m.name for mesh in meshes for m in mesh.materials if m.has_more_lobes)
+    if not more:
+        return []
+    names = ", ".join(list(more)[:5]) + (", ..." if len(more) > 5 else "")
+    return [
+        f"the shading model Cook-Torrance shows a diffuse and a glossy lobe alone: coats, glass, sheen and what else "
+        f"the materials {names} have is left out. Choose Principled"
+    ]
 
 
 def _ignored_settings(settings: RenderSettings) -> list[str]:

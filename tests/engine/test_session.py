@@ -448,3 +448,12 @@ def test_an_adjustment_changes_what_is_seen_and_keeps_its_detail(session, make_f
     frame.objects[0].adjustment.mask = np.ones(3, np.float32)
     with pytest.raises(AssetError, match="mask of its adjustments"):
         session.render(frame)
+
+
+def test_lobes_that_the_papers_shading_leaves_out_are_named(session, make_frame):
+    frame = with_meshes(make_frame(0.1), b_materials=[Material("Lacquer", coat=1.0), Material("Plain")])
+    frame.settings.shading_model = "paper"
+    (text,) = [text for text in session.render(frame).warnings if "Cook-Torrance" in text]
+    assert "Lacquer" in text and "Plain" not in text
+    frame.meshes[1].materials = [Material("Plain")]
+    assert not any("Cook-Torrance" in text for text in session.render(frame).warnings)
