@@ -124,7 +124,7 @@ class Materials:
             return Material(material.name, **values, **(_switched(bsdfs[0], label) if bsdfs else {}))
         parts = []
         for part, (weights, channels) in zip(surface.parts, found.parts, strict=True):
-            weight, name = weights["weight"], part.bsdf.leaves[0][1] if part.bsdf.leaves else material.name
+            weight, name = weights["weight"], ", ".join((material.name, *(leaf[1] for leaf in part.bsdf.leaves[:1])))
             texture = None if weight.texture is None else self._texture(weight.texture, label(weight.texture.layer))
             scattering = Material(name, **self._fields(tree, channels, label), **_switched(part.bsdf, label))
             inverted = part.inverted and not isinstance(weight.texture, BakedRef)
