@@ -41,6 +41,12 @@ def note(level: str, text: str, logged: bool = True) -> None:
     history.append(Message(time.time(), level, text))
 
 
+def withdraw(level: str, text: str) -> None:
+    """Take back a message that holds no longer."""
+    for message in [m for m in history if m[1:] == (level, text)]:
+        history.remove(message)
+
+
 def named_in(text: str, known: Container[str]) -> str:
     """The first name in quotation marks that is `known`, else ""."""
     return next((name for name in re.findall(r'"([^"]+)"', text) if name in known), "")

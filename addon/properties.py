@@ -176,6 +176,12 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         max=1024,
         default=16,
     )
+    use_viewport_motion_blur: BoolProperty(
+        name="Motion Blur in Viewports",
+        description="Blur what keyframes move in rendered viewports, too, once nothing changes any more. Movement by "
+        "constraints, drivers, armatures or simulations is blurred in final frames alone",
+        default=True,
+    )
     use_viewport_denoise: BoolProperty(
         name="Denoise Preview",
         description="Take the noise out of the coarse pictures that the viewport shows while something moves, with the "

@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 
 import bpy
 
+from .instances import Keys
+
 T = TypeVar("T")
 
 #: Types of datablocks on which the shading of surfaces and of the world depends.
@@ -31,6 +33,8 @@ class ExportCache:
         self._known: dict[tuple[Hashable, ...], tuple[frozenset[int], Any]] = {}
         self._used: set[tuple[Hashable, ...]] = set()
         self._frame, self._moving = 0, False
+        #: Of the last frame.
+        self.keys = Keys()
 
     def begin(self, frame: int) -> None:
         """An export at a frame of the scene begins; pictures that move are other ones in each."""

@@ -17,7 +17,7 @@ from ..view_layer_passes import enabled, not_rendered
 from .camera import export_camera, picture_of
 from .export_cache import ExportCache, uid
 from .images import begin_export, end_export
-from .instances import UNRENDERED, Unrendered, Visible, uncancelled, visible
+from .instances import UNRENDERED, Key, Keys, Unrendered, Visible, uncancelled, visible
 from .light_links import LightLinks
 from .lights import export_light
 from .materials import Materials
@@ -45,7 +45,7 @@ def export_frame(
     cancelled: Callable[[], bool] | None = None,
     wanted: Wanted | None = None,
 ) -> Frame:
-    """Describe the frame that `depsgraph` was evaluated for, without its blur: see `render_engine.blur`.
+    """Describe the frame that `depsgraph` was evaluated for, without its blur: see `blur_steps`.
 
     Parameters
     ----------
@@ -84,6 +84,7 @@ def export_frame(
     passes = passes or tuple(p.name for p in enabled(scene, depsgraph.view_layer))
     objects, links = DrgsObjects(depsgraph, key_of, warn, cache), LightLinks(depsgraph, warn)
     meshes = Meshes(depsgraph, materials, warn, cache, links, wanted, with_uv_map="UV" in passes)
+    shining: list[Key] = []
     others = Limited(depsgraph.view_layer.drgs, f'View layer "{depsgraph.view_layer.name}"', warn).others
     for item in uncancelled(visible(depsgraph), cancelled):
         if is_visible is not None and not is_visible(item.object):
@@ -94,6 +95,7 @@ def export_frame(
         if item.object.type == "LIGHT":
             light = export_light(item, warn)
             if light is not None:
+                shining.append(item.key)
                 light = replace(light, **links.numbers_of(item))
                 lights.append(light if others == "SEEN" else replace(light, camera=False))
         elif item.object.type in UNRENDERED:
@@ -130,6 +132,7 @@ def export_frame(
     cache.end(end_export())
     if wanted is not None:
         wanted.end()
+    cache.keys = Keys(objects.keys, meshes.keys(), shining)
     if frame_set is not None and own_camera:
         add_moments(frame, depsgraph, frame_set, objects.keys, meshes.keys(), cancelled)
     return frame

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import bpy
@@ -21,6 +21,15 @@ UNRENDERED = {"CURVES": "hair", "POINTCLOUD": "point cloud", "VOLUME": "volume"}
 
 #: Identifies an instance, at any time: its object, what makes it, its number there.
 Key = tuple[int, int, tuple[int, ...]]
+
+
+@dataclass(slots=True)
+class Keys:
+    """Which instance each part of an exported frame is: its objects, each place of its meshes, its lights in front."""
+
+    objects: list[Key] = field(default_factory=list)
+    meshes: list[list[Key]] = field(default_factory=list)
+    lights: list[Key] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)

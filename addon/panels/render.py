@@ -6,7 +6,8 @@ import bpy
 from bl_ui.utils import PresetPanel
 
 from .. import bakes, presets
-from .text_layout import bar_text
+from ..viewport import views
+from .text_layout import bar_text, wrapped
 
 
 class _RenderPanel:
@@ -90,9 +91,12 @@ class DRGS_PT_blur(_RenderPanel, bpy.types.Panel):
         column.active = render.use_motion_blur
         column.prop(render, "motion_blur_position", text="Position")
         column.prop(render, "motion_blur_shutter")
+        column.prop(context.scene.drgs, "use_viewport_motion_blur", text="In Viewports")
         if camera is not None and camera.type == "CAMERA":
             layout.prop(camera.data.dof, "use_dof", text="Depth of Field")
         layout.prop(context.scene.drgs, "blur_steps")
+        for text in views.not_blurred():
+            wrapped(layout, context, text, "INFO")
 
 
 class DRGS_PT_film(_RenderPanel, bpy.types.Panel):

@@ -161,7 +161,7 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
                 yield engine_link.render(sample_frame(step, len(steps), done), report, self._stopped)
                 done += 1
 
-        passes = averaged(parts(), len(steps), frame.passes)
+        passes = averaged(parts(), frame.passes)
         engine_link.statistics = passes.statistics
         return passes
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,7 +18,10 @@ from ..bakes.requests import Wanted
 from ..export import export_frame
 from ..export.camera import NO_CAMERA
 from ..export.export_cache import ExportCache
+from ..export.instances import Keys
 
+#: Numbers of changes, no two of them the same.
+_versions: Iterator[int] = itertools.count(1)
 #: Scene, view layer, and the local view of a viewport ("" for none).
 Key = tuple[str, str, str]
 
@@ -38,10 +42,22 @@ class Exported:
     error: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """Which instances an exported frame is made of, and the number of the scene's last change.
+
+    Both may be others without another frame.
+    """
+
+    keys: Keys
+    version: int
+
+
 @dataclass(slots=True)
 class _Scene:
     cache: ExportCache = field(default_factory=ExportCache)
     exported: Exported | None = None
+    version: int = field(default_factory=lambda: next(_versions))
     current: bool = False
 
 
@@ -63,6 +79,12 @@ def exported(
         made = _export(depsgraph, scene.cache, is_visible, key)
         scene.exported, scene.current = reuse_equal(made, scene.exported), True
     return scene.exported
+
+
+def parts(depsgraph: bpy.types.Depsgraph, local: str = "") -> Parts:
+    """Of what the frame consists that `exported` gave last."""
+    scene = _scenes.setdefault((depsgraph.scene.name_full, depsgraph.view_layer.name, local), _Scene())
+    return Parts(scene.cache.keys, scene.version)
 
 
 def _export(
@@ -104,7 +126,7 @@ def changed(depsgraph: bpy.types.Depsgraph) -> None:
     for key, scene in _scenes.items():
         if key[:2] == names:
             scene.cache.note(depsgraph)
-            scene.current = False
+            scene.current, scene.version = False, next(_versions)
 
 
 def renew() -> None:

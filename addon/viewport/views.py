@@ -21,7 +21,7 @@ from ...drgs_blender.core.phases import STARTING, is_counted, is_preparing
 from .. import bakes, engine_link, messages, preferences
 from ..export.camera import check_lens
 from ..export.view import view_camera
-from . import draw, scenes
+from . import blurred, draw, scenes
 from .worker import Picture, Request, Worker
 
 #: Seconds between two looks for news, while something is rendered and while nothing is.
@@ -48,6 +48,7 @@ class ViewportState:
     arriving, arrived : the next picture, and its strips that are on the graphics card
     since : time at which the first picture of this request was drawn
     warned : warnings of the engine that are messages already
+    blur : how the picture is blurred, since the scene changed or the settings of that
     """
 
     requested: tuple[object, ...] = ()
@@ -57,6 +58,7 @@ class ViewportState:
     arrived: list[draw.Strip] = field(default_factory=list)
     since: float = 0.0
     warned: set[str] = field(default_factory=set)
+    blur: blurred.Blur = field(default_factory=blurred.Blur)
 
 
 def name_of(region: bpy.types.Region) -> str:
@@ -96,7 +98,12 @@ def update(
         return ""
     viewport = _viewports.setdefault(name, ViewportState())
     options = _options(depsgraph.scene, name, composited)
-    requested = exported, _values(camera), (options, depthless)
+    if composited:
+        viewport.blur.withdraw()
+        viewport.blur = blurred.Blur()
+    else:
+        viewport.blur = blurred.of(context, depsgraph, through, viewport.blur, _local(space))
+    requested = exported, _values(camera), (options, depthless, viewport.blur.key)
     if viewport.requested and viewport.requested[0] is exported and viewport.requested[1:] == requested[1:]:
         return ""
     try:
@@ -107,7 +114,7 @@ def update(
     frame = replace(exported.frame, camera=camera, **options)
     if composited:
         frame = _alone(frame, depthless)
-    worker.submit(name, Request(frame, client, exported.assets))
+    worker.submit(name, Request(frame, client, exported.assets, viewport.blur.parts(frame)))
     _start()
     return ""
 
@@ -188,6 +195,11 @@ def preparation() -> tuple[str, float]:
     return next((each for each in found if is_preparing(each[0])), ("", 0.0))
 
 
+def not_blurred() -> list[str]:
+    """What viewports show sharp that F12 blurs, in words."""
+    return sorted({text for viewport in _viewports.values() for text in viewport.blur.told})
+
+
 def forget() -> None:
     """Drop all viewport states, so that nothing of the last file is shown in the next."""
     for name in list(_viewports):
@@ -211,7 +223,12 @@ def _export(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D) -> sce
     def is_visible(obj: bpy.types.Object) -> bool:
         return obj.type == "LIGHT" or obj.original.local_view_get(space)  # lights shine in every view
 
-    return scenes.exported(depsgraph, f"{space.as_pointer():x}", is_visible)
+    return scenes.exported(depsgraph, _local(space), is_visible)
+
+
+def _local(space: bpy.types.SpaceView3D) -> str:
+    """Name of a viewport's local view, "" without one."""
+    return "" if space.local_view is None else f"{space.as_pointer():x}"
 
 
 def _options(scene: bpy.types.Scene, name: str, composited: bool) -> dict[str, Any]:
@@ -271,7 +288,7 @@ def _poll() -> float | None:
     live = dict(_live())
     for name in set(_viewports) - set(live):
         worker.drop(name)
-        del _viewports[name]
+        _viewports.pop(name).blur.withdraw()
     arriving = {name for name, viewport in _viewports.items() if viewport.arriving is not None}
     # Each is read once: they go on counting.
     news, baked = worker.news, (bakes.manager.news, bakes.manager.status()[0])

@@ -10,16 +10,20 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 from ...drgs_blender.core.errors import Cancelled, DrgsError
 from ...drgs_blender.core.frame import Frame
 from ...drgs_blender.core.phases import is_counted
+from ...drgs_blender.ipc.blur import Mean
 from ...drgs_blender.ipc.client import EngineClient, Passes
 
 log = logging.getLogger("drgs")
+
+#: Side of the pixels beyond which a picture is refined before it is blurred.
+_SHARP_UNTIL = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,11 +33,13 @@ class Request:
     Attributes
     ----------
     assets : path of every asset in the frame, with the file's time and size, by which changes are found
+    parts : frames of whose pictures the mean is the blurred one; the frame's own picture is sharp and comes first
     """
 
     frame: Frame
     client: EngineClient
     assets: tuple[tuple[str, tuple[int, int]], ...] = ()
+    parts: Sequence[Frame] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +63,8 @@ class _View:
     error: str = ""
     phase: str = ""
     part: float = 0.0
+    pixel: float = 0.0  # side of the pixels of the last picture, 0 before there is one
+    mean: Mean | None = None  # of the parts of a blurred one
 
 
 class Worker:
@@ -80,6 +88,7 @@ class Worker:
             elif view.begun:
                 view.submitted = time.perf_counter()
             view.request, view.begun, view.fraction, view.error = request, False, 0.0, ""
+            view.pixel, view.mean = 0.0, None
             if self._thread is None:
                 self._ending = False
                 self._thread = threading.Thread(target=self._run, name="drgs-viewport", daemon=True)
@@ -158,13 +167,8 @@ class Worker:
                 view.begun = True
             try:
                 self._load(view, request)
-                passes = request.client.view(
-                    view.name,
-                    request.frame,
-                    not first,
-                    partial(self._note_phase, view),
-                    self._stop_begin(view) if first else self._stop_refining(view, request),
-                )
+                stop = self._stop_begin(view) if first else self._stop_refining(view, request)
+                passes = self._next_picture(view, request, first, stop)
             except Cancelled:
                 with self._changed:
                     view.begun = view.begun and not first
@@ -183,6 +187,26 @@ class Worker:
                 if view.request is request:
                     view.fraction = fraction
             self.news += 1
+
+    def _next_picture(self, view: _View, request: Request, first: bool, stop: Callable[[], bool]) -> Passes:
+        """The first picture of a request, or one with finer pixels, more samples or more of its parts."""
+        note = partial(self._note_phase, view)
+        if first or not request.parts or view.pixel > _SHARP_UNTIL:
+            passes = request.client.view(view.name, request.frame, not first, note, stop)
+            with self._changed:
+                if view.request is request:
+                    view.pixel = passes.statistics.get("view.pixel", 1.0)
+            if request.parts:
+                passes.statistics["view.fraction"] = 0.0
+            return passes
+        mean = view.mean or Mean()  # `submit` takes that of another request away
+        mean.add(request.client.render(request.parts[mean.count], note, stop))
+        with self._changed:
+            if view.request is request:
+                view.mean = mean
+        passes = mean.passes(request.frame.passes)
+        passes.statistics["view.fraction"] = mean.count / len(request.parts)
+        return passes
 
     def _next(self) -> _View | None:
         """The view to work on; called with the lock held."""

@@ -85,7 +85,7 @@ class Picture:
                 yield engine.render(part, report, lambda: time.monotonic() > latest)
 
         try:
-            passes = blur.averaged(rendered(), count, self.frame.passes) if self._shot.count else next(rendered())
+            passes = blur.averaged(rendered(), self.frame.passes) if self._shot.count else next(rendered())
         except Cancelled as end:
             problem, remedy = f"took longer than {timeout:g} s", "Raise --timeout, or use fewer samples"
             raise EngineError(f"frame {self._shot.number}", problem, remedy) from end

@@ -55,6 +55,7 @@ def sample_frame(frame: Frame, count: int, index: int) -> Frame:
         settings=sample_settings(frame.settings, count, index),
         previous=None,
         next=None,
+        history="",
     )
 
 
@@ -71,29 +72,55 @@ def sample_settings(settings: RenderSettings, count: int, index: int) -> RenderS
     )
 
 
-def averaged(parts: Iterable[Passes], count: int, names: tuple[str, ...]) -> Passes:
-    """The passes `names` of the sharp picture and `count` that are averaged; seconds and samples are added up.
+class Mean:
+    """The mean of pictures as they come.
 
     Light is averaged with the surfaces' colour, of which the mean is then taken out.
+
+    Attributes
+    ----------
+    count : int
+        Pictures so far, without the sharp one.
     """
-    sums: dict[str, Array] = {}
-    kept: dict[str, Array] = {}
-    statistics: dict[str, float] = {}
-    warnings: list[str] = []
-    for part in parts:
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._sums: dict[str, Array] = {}
+        self._kept: dict[str, Array] = {}
+        self._statistics: dict[str, float] = {}
+        self._warnings: list[str] = []
+
+    def add(self, part: Passes) -> None:
+        """Take one picture in, or the one that stays sharp."""
+        self.count += any(name not in SHARP for name in part)
         for name, values in part.items():
             if name in SHARP:
-                kept[name] = values
-            else:
-                if name in COLOURS:
-                    values = values * part[COLOURS[name]]
-                sums[name] = values.astype(np.float64) if name not in sums else sums[name] + values
-        warnings += [text for text in part.warnings if text not in warnings]
+                self._kept[name] = values
+                continue
+            if name in COLOURS:
+                values = values * part[COLOURS[name]]
+            sums = self._sums
+            sums[name] = values.astype(np.float64) if name not in sums else sums[name] + values
+        self._warnings += [text for text in part.warnings if text not in self._warnings]
+        known = self._statistics
         for name, value in part.statistics.items():
             added = name.startswith("seconds.") or name == "samples"
-            statistics[name] = statistics.get(name, 0.0) + value if added else value
-    # The pictures' noise is independent.
-    means = {name: total / (count**2 if name == "Variance" else count) for name, total in sums.items()}
-    means |= {name: without_colour(means[name], means[colour]) for name, colour in COLOURS.items() if name in means}
-    made = kept | {name: mean.astype(np.float32) for name, mean in means.items()}
-    return Passes({name: made[name] for name in names if name in made}, warnings, statistics)
+            known[name] = known.get(name, 0.0) + value if added else value
+
+    def passes(self, names: tuple[str, ...]) -> Passes:
+        """The passes `names` of all so far; seconds and samples are added up."""
+        # The pictures' noise is independent.
+        n = self.count
+        means = {name: total / (n**2 if name == "Variance" else n) for name, total in self._sums.items()}
+        means |= {name: without_colour(means[name], means[colour]) for name, colour in COLOURS.items() if name in means}
+        made = self._kept | {name: mean.astype(np.float32) for name, mean in means.items()}
+        found = {name: made[name] for name in names if name in made}
+        return Passes(found, list(self._warnings), dict(self._statistics))
+
+
+def averaged(parts: Iterable[Passes], names: tuple[str, ...]) -> Passes:
+    """The passes `names` of the sharp picture and those that are averaged, see `Mean`."""
+    mean = Mean()
+    for part in parts:
+        mean.add(part)
+    return mean.passes(names)

@@ -168,8 +168,8 @@ def test_mean_of_blurred_pictures_recombines(scene: Scene) -> None:
         made = {name: rng.random((4, 5, 3)).astype(np.float32) for name in asked}
         made["Combined"] = made["DiffDir"] * made["DiffCol"] + made["GlossInd"] * made["GlossCol"]
         parts.append(Passes(made, [], {}))
-    mean = averaged(parts, 3, (*with_colours(names), "Depth"))
+    mean = averaged(parts, (*with_colours(names), "Depth"))
     assert "Depth" not in mean and np.allclose(mean["Variance"], sum(p["Variance"] for p in parts) / 9)
     total = mean["DiffDir"] * mean["DiffCol"] + mean["GlossInd"] * mean["GlossCol"]
     np.testing.assert_allclose(total, mean["Combined"], rtol=1e-5)
-    assert tuple(averaged(parts, 3, names)) == names and set(COLOURS) == {"DiffDir", "DiffInd", "GlossDir", "GlossInd"}
+    assert tuple(averaged(parts, names)) == names and set(COLOURS) == {"DiffDir", "DiffInd", "GlossDir", "GlossInd"}
