@@ -5,6 +5,7 @@ Plain data, so that it may be written from the render thread and drawn from the 
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import re
 import time
@@ -43,8 +44,9 @@ def note(level: str, text: str, logged: bool = True) -> None:
 
 def withdraw(level: str, text: str) -> None:
     """Take back a message that holds no longer."""
-    for message in [m for m in history if m[1:] == (level, text)]:
-        history.remove(message)
+    for message in [m for m in list(history) if m[1:] == (level, text)]:
+        with contextlib.suppress(ValueError):  # another thread was quicker
+            history.remove(message)
 
 
 def named_in(text: str, known: Container[str]) -> str:

@@ -69,6 +69,8 @@ class Manager:
     store : Store
     failed : dict of str to str
         Why something could not be baked, by its key. It is tried again with the next render, or when it changes.
+    told : dict of str to set of str
+        Warnings of that, by the label of the request.
     news : int
         Grows with everything that was baked or has failed.
     """
@@ -76,6 +78,7 @@ class Manager:
     def __init__(self) -> None:
         self.store = Store()
         self.failed: dict[str, str] = {}
+        self.told: dict[str, set[str]] = {}
         self.news = 0
         self._wanted: dict[Hashable, list[str]] = {}
         self._waiting: dict[str, _Job] = {}
@@ -160,6 +163,7 @@ class Manager:
         with self._changed:
             self._ends = False
             self.failed.clear()
+            self.told.clear()
             self.store.forget()
 
     # --- with the lock held -----------------------------------------------------------------------------------------
@@ -197,8 +201,9 @@ class Manager:
             self._sort_out(at_once=False)
             new = [r for r in requests if not self._is_open(r.key) and r.key not in self.failed]
         for request in {request.key: request for request in new}.values():
-            folder = Path(tempfile.mkdtemp(prefix="drgs-bake-"))
+            folder: Path | None = None
             try:
+                folder = Path(tempfile.mkdtemp(prefix="drgs-bake-"))
                 job = write(request, folder) | {"key": request.key, "folder": str(folder)}
             except (OSError, RuntimeError, DrgsError) as error:
                 _clear(folder)
@@ -264,8 +269,9 @@ class Manager:
             return self._running
 
 
-def _clear(folder: Path) -> None:
-    shutil.rmtree(folder, ignore_errors=True)
+def _clear(folder: Path | None) -> None:
+    if folder is not None:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 manager = Manager()

@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.core.errors import AssetError
-from .. import preferences
+from .. import messages, preferences
 from ..property_limits import Limited
 from . import node_trees
 from .manager import Manager, Request, manager
@@ -48,9 +48,17 @@ class Wanted:
     def find(self, request: Request) -> Baked | None:
         """The result of a request; where it is not there, it is wanted from now on, unless it has `failed`."""
         found = self._manager.find(request.key)
-        if found is None and not self.failed(request):
+        if found is not None:
+            for text in self._manager.told.pop(request.label, ()):
+                messages.withdraw("WARNING", text)
+        elif not self.failed(request):
             self.requests.append(request)
         return found
+
+    def tell(self, request: Request, text: str, warn: Callable[[str], None]) -> None:
+        """Warn that a request could not be baked; where it is baked later, the message is withdrawn."""
+        self._manager.told.setdefault(request.label, set()).add(text)
+        warn(text)
 
     def again(self, requests: Iterable[Request]) -> None:
         """Want what an earlier export has wanted already."""

@@ -92,6 +92,7 @@ class Store:
                 _remove(part)
                 raise
             _prune(folder)
+            self.trouble = ""
         except OSError as error:
             self.trouble = f"Baked textures cannot be kept in {folder} ({error.strerror or error}): made at each start"
 

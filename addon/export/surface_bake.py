@@ -130,8 +130,8 @@ class SurfaceBakes:
         if baked is not None:
             return self._value(made.key, name, baked), True
         if failure := self._wanted.failed(made):
-            note(f'Material "{material.name}" on "{self._obj.name}": its {_words(name)} cannot be baked ({failure}); '
-                 "it is approximated")  # fmt: skip
+            about = f'Material "{material.name}" on "{self._obj.name}": its {_words(name)}'
+            self._wanted.tell(made, f"{about} cannot be baked ({failure}); it is approximated", note)
             return value, False
         self.requests.append(made)
         return value, True

@@ -119,7 +119,7 @@ def _read(world: bpy.types.World, camera: bool, warn: Warn, wanted: Wanted | Non
             )
         failure = wanted.failed(made)
         if failure:
-            warn(f'World "{world.name}" cannot be baked ({failure}); it is approximated')
+            wanted.tell(made, f'World "{world.name}" cannot be baked ({failure}); it is approximated', warn)
     if made is None or failure:
         for text in approximations:
             warn(text)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 import time
 
 import bpy
+import disks
 import numpy as np
 import pytest
 from mathutils import Vector
@@ -418,3 +421,62 @@ def test_objects_under_a_baked_world_are_lit_as_by_cycles(scene, make, tmp_path)
         pictures.append(read_exr(scene.render.filepath, 64, 48)[..., :3])
     assert not [m for m in part("addon.messages").history if m.level == "WARNING" and "World" in m.text]
     assert psnr(pictures[1], pictures[0]) > 45
+
+
+@pytest.mark.slow
+def test_a_blender_that_is_killed_is_named_once_and_the_next_try_bakes(scene, bake, folder, monkeypatch):
+    """The message of it leaves, too."""
+    gradient(scene, "")
+    bakes, messages = part("addon.bakes"), part("addon.messages")
+    process = part("addon.bakes.blender_process").BlenderProcess
+    do = process.do
+
+    def killed(self, job, cancelled):
+        os.kill(self.pid, signal.SIGKILL)
+        do(self, job, cancelled)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(process, "do", killed)
+        frame, warnings = bake()
+    assert len(warnings) >= 1 and warnings[0].startswith('World "World" cannot be baked (Blender ended')
+    assert frame.world.environment is None and len(frame.passes) > 0
+    for text in warnings:
+        messages.note("WARNING", text)
+    bakes._retry()
+    frame, warnings = bake()
+    assert frame.world.environment is not None and not warnings
+    assert not any("cannot be baked" in message.text for message in messages.history)
+    messages.history.clear()
+
+
+@pytest.mark.slow
+def test_a_full_disk_is_named_and_what_was_baked_is_used(scene, bake, jobs, folder):
+    """Once there is room again, the next result is kept, and nothing is said any more."""
+    gradient(scene, "")
+    if sys.platform != "linux" or not disks.mount(folder, "size=16k"):
+        pytest.skip("no small disk can be mounted")
+    try:
+        frame, warnings = bake()
+        assert frame.world.environment is not None and len(jobs) == 1
+        assert len(warnings) == 1 and str(folder) in warnings[0] and "space" in warnings[0]
+        assert not list(folder.iterdir()), "no part of it is left"
+        disks.mount(folder, "size=64m")
+        noise(scene, "")
+        frame, warnings = bake()
+        assert frame.world.environment is not None and not warnings and len(list(folder.iterdir())) == 1
+    finally:
+        disks.unmount(folder)
+
+
+@pytest.mark.slow
+def test_a_full_disk_for_what_a_bake_needs_is_named(scene, bake, monkeypatch):
+    """Of temporary files, too; the rest is rendered, and the next try bakes."""
+    gradient(scene, "")
+    with monkeypatch.context() as patch:
+        patch.setattr(part("addon.bakes.manager").tempfile, "tempdir", "/dev/full/nowhere")
+        frame, warnings = bake()
+    assert warnings[0].startswith('World "World" cannot be baked (the files for it cannot be written')
+    assert frame.world.environment is None
+    part("addon.bakes")._retry()
+    frame, warnings = bake()
+    assert frame.world.environment is not None and not warnings
