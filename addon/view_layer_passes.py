@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..drgs_blender.core.passes import PASSES, TEMPORAL, Pass
+from ..drgs_blender.core.passes import AOV_COLOUR, AOV_VALUE, LIGHT_GROUP, PASSES, TEMPORAL, Pass, pass_of
 from .properties import switch_of
 
 #: Names that Blender 5.0 spelled out; compositor nodes and its EXR files know only these.
@@ -38,18 +38,35 @@ def not_rendered(view_layer: bpy.types.ViewLayer) -> list[str]:
     """Names of passes that are switched on in a view layer, for other engines, and that DR-GS does not make."""
     owners = [view_layer, *filter(None, (getattr(view_layer, name, None) for name in ("cycles", "eevee")))]
     found = [text for name, text in _NOT_RENDERED.items() if any(getattr(owner, name, False) for owner in owners)]
-    found += [f'Shader AOV "{aov.name}"' for aov in view_layer.aovs]
-    return found + [f'Light Group "{group.name}"' for group in view_layer.lightgroups]
+    taken = {blender_name(p) for p in PASSES}
+    return found + [
+        f'Shader AOV "{aov.name}" (the name is taken; choose another)'
+        for aov in view_layer.aovs
+        if not _is_usable(aov, taken)
+    ]
+
+
+def _is_usable(aov: bpy.types.AOV, taken: set[str]) -> bool:
+    """Whether a shader AOV has a name of its own, unlike those of other passes (`taken`)."""
+    return aov.is_valid and aov.name not in taken and not aov.name.startswith(LIGHT_GROUP)
+
+
+def named(view_layer: bpy.types.ViewLayer) -> list[Pass]:
+    """The passes that a view layer names itself: shader AOVs and light groups."""
+    taken = {blender_name(p) for p in PASSES}
+    starts = {"COLOR": AOV_COLOUR, "VALUE": AOV_VALUE}
+    names = [starts[aov.type] + aov.name for aov in view_layer.aovs if _is_usable(aov, taken)]
+    return [p for name in names if (p := pass_of(name)) is not None]
 
 
 def label(render_pass: Pass) -> str:
     """Full name, for the interface."""
-    return _FULL_NAMES.get(render_pass.name, render_pass.name)
+    return _FULL_NAMES.get(render_pass.name, render_pass.layer)
 
 
 def blender_name(render_pass: Pass) -> str:
     """Name of a pass in this Blender."""
-    return label(render_pass) if bpy.app.version >= (5, 0, 0) else render_pass.name
+    return label(render_pass) if bpy.app.version >= (5, 0, 0) else render_pass.layer
 
 
 def enabled(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer) -> list[Pass]:
@@ -62,4 +79,4 @@ def enabled(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer) -> list[Pas
         if p.name == "Combined"
         or p.name in needed
         or (getattr(view_layer, p.blender, False) if p.blender else getattr(extra, switch_of(p)))
-    ]
+    ] + named(view_layer)

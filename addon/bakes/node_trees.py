@@ -253,6 +253,8 @@ def follow_channel(channel: str, leaves: Leaves | None = None) -> Follow:
         node = socket.node
         if node.type == "OUTPUT_MATERIAL":
             return socket.name == "Surface"
+        if node.type == "OUTPUT_AOV":
+            return channel == f"aov {socket.name}"
         if not is_shader(node):
             return True
         names = shader_inputs(node, channel, leaves)

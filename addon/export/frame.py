@@ -10,6 +10,7 @@ import bpy
 
 from ...drgs_blender.core.errors import UsageError
 from ...drgs_blender.core.frame import Camera, Frame, Mist
+from ...drgs_blender.core.passes import AOVS, pass_of
 from .. import assets, compositing, preferences
 from ..bakes.requests import Wanted
 from ..property_limits import Limited
@@ -77,12 +78,14 @@ def export_frame(
     layer = depsgraph.view_layer_eval
     # As in Cycles, a view layer may replace all materials and, in later Blenders, the world.
     world = getattr(layer, "world_override", None) or scene.world
-    materials, unrendered, lights = Materials(warn, layer.material_override), Unrendered(), []
+    unrendered, lights = Unrendered(), []
     cache = ExportCache() if cache is None else cache
     cache.begin(scene.frame_current)
     begin_export(scene.frame_current)
     passes = passes or tuple(p.name for p in enabled(scene, depsgraph.view_layer))
-    objects, links = DrgsObjects(depsgraph, key_of, warn, cache), LightLinks(depsgraph, warn)
+    aovs = [p for name in passes if name.startswith(AOVS) and (p := pass_of(name))]
+    materials = Materials(warn, layer.material_override, aovs)
+    objects, links = DrgsObjects(depsgraph, key_of, warn, cache, aovs), LightLinks(depsgraph, warn)
     meshes = Meshes(depsgraph, materials, warn, cache, links, wanted, with_uv_map="UV" in passes)
     shining: list[Key] = []
     others = Limited(depsgraph.view_layer.drgs, f'View layer "{depsgraph.view_layer.name}"', warn).others

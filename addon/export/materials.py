@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import bpy
 import numpy as np
 
-from ...drgs_blender.core.frame import TEXTURED, Image, Material, Part, SurfaceDetail, Texture
+from ...drgs_blender.core.frame import TEXTURED, Image, Material, Part, ShaderAOV, SurfaceDetail, Texture
+from ...drgs_blender.core.passes import Pass
 from ..bakes.node_trees import COLOURS, Leaves
+from .aov_nodes import aov_values
 from .bsdfs import Bsdf, Surface
 from .layers import AttributeRef, LayerRef
 from .node_math import rgb
@@ -51,10 +53,16 @@ DEFAULT = ExportedMaterial(DEFAULT_MATERIAL)
 
 
 class Materials:
-    """All materials of one export, and the images they use. `override` takes the place of every one."""
+    """All materials of one export, and the images they use.
 
-    def __init__(self, warn: Warn, override: bpy.types.Material | None = None) -> None:
-        self._warn, self.override = warn, override
+    Attributes
+    ----------
+    override : takes the place of every one
+    aovs : passes of the shader AOVs that are asked for
+    """
+
+    def __init__(self, warn: Warn, override: bpy.types.Material | None = None, aovs: Sequence[Pass] = ()) -> None:
+        self._warn, self.override, self.aovs = warn, override, tuple(aovs)
         self._known: dict[tuple[int, int], ExportedMaterial] = {}
         self.images: dict[str, Image] = {}
 
@@ -86,8 +94,10 @@ class Materials:
         return exported
 
     def _build(self, tree: SurfaceWalker, bakes: SurfaceBakes | None, approximations: list[str]) -> ExportedMaterial:
-        surface = tree.surface()
+        surface, aovs = tree.surface(), aov_values(tree, self.aovs)
         if surface is None:
+            if aovs:
+                tree.report(f"lets all light pass; its AOV Outputs ({', '.join(sorted(aovs))}) are not rendered")
             self._say(approximations)
             return ExportedMaterial(None)
         found = _Paints(surface)
@@ -98,9 +108,16 @@ class Materials:
             if bakes is not None and value.approximations and found.are_apart:
                 values[name], solved = bakes.channel(tree.material, name, value, self._warn, leaves)
             (done if solved else left).update(value.approximations)
+        given: dict[str, SocketValue] = {}
+        for name, (ref, value) in aovs.items():
+            given[name], solved = value, False
+            if bakes is not None and value.approximations:
+                given[name], solved = bakes.channel(tree.material, f"aov {ref.socket.name}", value, self._warn, aov=ref)
+            (done if solved else left).update(value.approximations)
         self._say([text for text in approximations if text in left or text not in done])
         textures = [values[name].texture for values, name, _ in found.all() if values[name].texture]
-        textures += [detail.value.texture for detail in surface.details if detail.value.texture]
+        others = *given.values(), *(detail.value for detail in surface.details)
+        textures += [value.texture for value in others if value.texture]
         wanted = [t.layer for t in textures] + [d.tangents for d in surface.details if d.kind == "tangent"]
         wanted += [part.bsdf.tangent for part in surface.parts if part.bsdf.tangent is not None]
         uv_map = next((layer.name for layer in wanted if layer.source == "uv"), None)
@@ -109,7 +126,11 @@ class Materials:
         def label(layer: LayerRef) -> str:
             return layer.label if layer in layers else ""
 
-        return ExportedMaterial(self._described(tree, surface, found, label), uv_map, layers, bool(done))
+        described = self._described(tree, surface, found, label)
+        described.aovs = [self._aov(tree, name, value, label) for name, value in given.items()]
+        if described.aovs and described.clear:
+            tree.report("its AOVs count by its alpha where it lets light pass; Cycles counts them whole")
+        return ExportedMaterial(described, uv_map, layers, bool(done))
 
     def _described(self, tree: SurfaceWalker, surface: Surface, found: _Paints, label: Label) -> Material:
         """The material as frames hold it."""
@@ -147,6 +168,10 @@ class Materials:
     def _say(self, texts: list[str]) -> None:
         for text in texts:
             self._warn(text)
+
+    def _aov(self, tree: SurfaceWalker, name: str, value: SocketValue, label: Label) -> ShaderAOV:
+        texture = None if value.texture is None else self._texture(value.texture, label(value.texture.layer))
+        return ShaderAOV(name, finite(tree, name, value.colour), texture)
 
     def _detail(self, tree: SurfaceWalker, detail: DetailRef, label: Label) -> SurfaceDetail:
         texture, numbers = detail.value.texture, (*detail.value.colour, detail.strength, detail.distance)
@@ -218,6 +243,15 @@ def _mean_of(parts: list[Part]) -> dict[str, Any]:
     base = weights @ np.array([material.base_colour for material in materials])
     numbers = {n: float(weights @ [getattr(m, n) for m in materials]) for n in ("roughness", "metallic")}
     return {"base_colour": rgb(base), **numbers}
+
+
+def finite(tree: SurfaceWalker, name: str, colour: np.ndarray) -> tuple[float, float, float]:
+    """A colour for a shader AOV; black where a number is not finite."""
+    r, g, b = map(float, colour)
+    if not np.isfinite(colour).all():
+        tree.report(f"its {name} is not finite; it is 0. Check its drivers")
+        return 0.0, 0.0, 0.0
+    return r, g, b
 
 
 def _finite(tree: SurfaceWalker, name: str, value: SocketValue, default: Any) -> tuple[float, float, float]:

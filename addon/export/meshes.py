@@ -84,6 +84,7 @@ class Meshes:
             *(m.as_pointer() if m else 0 for m in slots),
             *(getattr(rays, name) for name in rays.__slots__),
             self._with_uv_map,
+            self._materials.aovs,
             *sent.values(),
         )
         shape = self._shapes.get(key)

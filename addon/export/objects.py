@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,14 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.core.asset import MATERIAL_CHANNELS, Asset
-from ...drgs_blender.core.frame import Adjustment, ObjectState
+from ...drgs_blender.core.frame import Adjustment, ObjectState, ShaderAOV
+from ...drgs_blender.core.passes import Pass
 from .. import assets, cache_playback, mesh_arrays, point_caches
+from .aov_nodes import aov_values
 from .export_cache import ExportCache, uid
 from .instances import Key, Visible
+from .materials import finite
+from .surface_nodes import SurfaceWalker
 from .topology_check import check_modifiers, check_topology
 
 Warn = Callable[[str], None]
@@ -25,8 +29,15 @@ KeyOf = Callable[[Path], str]
 class DrgsObjects:
     """Collects the DR-GS objects of one export."""
 
-    def __init__(self, depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn, cache: ExportCache) -> None:
-        self._depsgraph, self._key_of, self._warn, self._cache = depsgraph, key_of, warn, cache
+    def __init__(
+        self,
+        depsgraph: bpy.types.Depsgraph,
+        key_of: KeyOf,
+        warn: Warn,
+        cache: ExportCache,
+        aovs: Sequence[Pass] = (),
+    ) -> None:
+        self._depsgraph, self._key_of, self._warn, self._cache, self._aovs = depsgraph, key_of, warn, cache, aovs
         self.states: list[ObjectState] = []
         self.keys: list[Key] = []
 
@@ -57,9 +68,17 @@ class DrgsObjects:
                 material_pass_index=0 if material is None else material.pass_index,
                 visibility=item.visibility,
                 captured_colours=obj.drgs.captured_colours,
+                aovs=_aovs(material, obj, self._aovs, self._warn) if material is not None and self._aovs else [],
             )
         )
         self.keys.append(item.key)
+
+
+def _aovs(material: bpy.types.Material, obj: bpy.types.Object, aovs: Sequence[Pass], warn: Warn) -> list[ShaderAOV]:
+    """What an object gives to shader AOVs; on surfels that is the same everywhere."""
+    tree = SurfaceWalker(material, obj.data, warn)
+    values = {name: tree.flat(ref.node, value) for name, (ref, value) in aov_values(tree, aovs).items()}
+    return [ShaderAOV(name, finite(tree, name, colour)) for name, colour in values.items()]
 
 
 def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn) -> ObjectState:

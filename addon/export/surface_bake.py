@@ -19,7 +19,7 @@ from ..bakes.requests import Wanted, request
 from ..bakes.store import Baked
 from .layers import LayerRef
 from .socket_value import SocketValue
-from .sockets import surface_of
+from .sockets import SocketRef, surface_of
 
 Array = np.ndarray
 Warn = Callable[[str], None]
@@ -109,6 +109,7 @@ class SurfaceBakes:
         value: SocketValue,
         note: Warn,
         leaves: node_trees.Leaves | None = None,
+        aov: SocketRef | None = None,
     ) -> tuple[SocketValue, bool]:
         """A channel of a material, and whether its approximations are no matter any more.
 
@@ -117,15 +118,19 @@ class SurfaceBakes:
         value : as it is approximated
         note : called with the reason where it cannot be baked
         leaves : the only shaders that count; None: all do
+        aov : input of an AOV Output node, for the channel of its name
         """
         follow = node_trees.follow_channel(name, leaves)
-        surface = surface_of(material.node_tree)
-        if surface is None:
+        output = aov or surface_of(material.node_tree)
+        if output is None or output.groups:  # what is within a group has no place of its own
             return value, False
-        found = node_trees.trees(material.node_tree, surface.node, follow)
+        found = node_trees.trees(material.node_tree, output.node, follow)
         if _never(found):
             return value, False
-        made = self._request(material, name, found, follow, leaves)
+        more: dict[str, Any] = {} if aov is None else {"output": output.node.name}
+        if leaves is not None:
+            more["leaves"] = [list(leaf) for leaf in leaves]
+        made = self._request(material, name, found, follow, more)
         baked = self._wanted.find(made)
         if baked is not None:
             return self._value(made.key, name, baked), True
@@ -146,7 +151,7 @@ class SurfaceBakes:
         name: str,
         found: list[node_trees.Tree],
         follow: node_trees.Follow,
-        leaves: node_trees.Leaves | None,
+        more: dict[str, Any],
     ) -> Request:
         arrays, mesh, obj = self._read(), self._mesh, self._obj
         numbers = [i for i, slot in enumerate(self._slots) if slot is not None and slot == material]
@@ -179,9 +184,8 @@ class SurfaceBakes:
             "active_uv_map": rendered,
             "attributes": [spec for spec, _ in attributes],
             "active_colour": colours[max(colours.render_color_index, 0)].name if len(colours) else "",
+            **more,
         }
-        if leaves is not None:
-            about["leaves"] = [list(leaf) for leaf in leaves]
 
         def write(folder: Path) -> None:
             with open(folder / "mesh.npz", "wb") as file:
@@ -218,8 +222,8 @@ class SurfaceBakes:
         return self._arrays
 
     def _value(self, key: str, name: str, baked: Baked) -> SocketValue:
-        colour = name in node_trees.COLOURS
-        image = Image(f"baked {key}", baked["pixels"], "srgb" if colour and name != "emission" else "linear")
+        colour, encoded = name in node_trees.COLOURS or name == "aov Color", name in node_trees.COLOURS - {"emission"}
+        image = Image(f"baked {key}", baked["pixels"], "srgb" if encoded else "linear")
         layer = LayerRef("uv") if len(baked["uvs"]) == 0 else BakedLayer(baked["uvs"])
         channel = "rgb" if colour else "r"
         return SocketValue(np.full(3, float(baked["factor"])), BakedRef(image, image.name, channel, layer))

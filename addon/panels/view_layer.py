@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import bpy
 
@@ -36,4 +36,42 @@ class DRGS_PT_passes(bpy.types.Panel):
             column.prop(owner, name, text=text)
 
 
-CLASSES = (DRGS_PT_passes,)
+class DRGS_PT_aovs(bpy.types.Panel):
+    bl_label = "Shader AOV"
+    bl_space_type = "PROPERTIES"
+    bl_region_type = "WINDOW"
+    bl_context = "view_layer"
+    bl_parent_id = "DRGS_PT_passes"
+    bl_options: ClassVar = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        view_layer, row = context.view_layer, self.layout.row()
+        given = view_layer, "aovs", view_layer, "active_aov_index"
+        row.column().template_list("VIEWLAYER_UL_aov", "aovs", *given, rows=3)
+        column = row.column(align=True)
+        column.operator("scene.view_layer_add_aov", icon="ADD", text="")
+        column.operator("scene.view_layer_remove_aov", icon="REMOVE", text="")
+        if view_layer.active_aov and not view_layer.active_aov.is_valid:
+            self.layout.label(text="Another render pass has this name", icon="ERROR")
+
+
+class DRGS_PT_light_groups(bpy.types.Panel):
+    bl_label = "Light Groups"
+    bl_space_type = "PROPERTIES"
+    bl_region_type = "WINDOW"
+    bl_context = "view_layer"
+    bl_parent_id = "DRGS_PT_passes"
+    bl_options: ClassVar = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        view_layer, row = context.view_layer, self.layout.row()
+        given = view_layer, "lightgroups", view_layer, "active_lightgroup_index"
+        row.column().template_list("UI_UL_list", "lightgroups", *given, rows=3)
+        column = row.column(align=True)
+        column.operator("scene.view_layer_add_lightgroup", icon="ADD", text="")
+        column.operator("scene.view_layer_remove_lightgroup", icon="REMOVE", text="")
+        column.separator()
+        column.menu("VIEWLAYER_MT_lightgroup_sync", icon="DOWNARROW_HLT", text="")
+
+
+CLASSES = (DRGS_PT_passes, DRGS_PT_aovs, DRGS_PT_light_groups)

@@ -21,7 +21,7 @@ from ..core import cryptomatte
 from ..core.asset.container import digest_asset
 from ..core.errors import AssetError
 from ..core.frame import Frame
-from ..core.passes import BY_NAME
+from ..core.passes import pass_of
 from ..core.version import __version__
 from ..ipc.codec import encode_frame
 from ..render.denoise.noisy_frames import camera_metadata
@@ -63,7 +63,8 @@ def is_complete(path: Path, frame: Frame, settings: str) -> bool:
     """Whether `path` is a frame that decodes, has the right size and passes, and was made with these settings."""
     stored = read_complete(path)
     x0, y0, x1, y1 = frame.camera.window
-    expected = {name: (y1 - y0, x1 - x0, len(BY_NAME[name].channels)) for name in frame.passes}
+    kinds = (kind for name in frame.passes if (kind := pass_of(name)))
+    expected = {kind.name: (y1 - y0, x1 - x0, len(kind.channels)) for kind in kinds}
     return (
         stored is not None
         and stored[1].get(SETTINGS) == settings

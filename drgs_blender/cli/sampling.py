@@ -9,7 +9,7 @@ from typing import Any, get_args, get_type_hints
 
 from ..core.errors import UsageError
 from ..core.frame import Camera, RenderSettings
-from ..core.passes import BY_NAME, PASSES, TEMPORAL
+from ..core.passes import BY_NAME, PASSES, TEMPORAL, pass_of
 
 #: The largest float32, which the renderer computes with.
 LARGEST = 3.4028234663852886e38
@@ -178,7 +178,7 @@ def check_size(camera: Camera, passes: Sequence[str]) -> None:
     x0, y0, x1, y1 = camera.window
     pixels = (x1 - x0) * (y1 - y0)
     if pixels * len(passes) > MOST_PIXEL_PASSES:
-        size = 4 * pixels * sum(len(BY_NAME[name].channels) for name in passes) / 2**30
+        size = 4 * pixels * sum(len(kind.channels) for name in passes if (kind := pass_of(name))) / 2**30
         problem = f"of {x1 - x0} x {y1 - y0} pixels with {len(passes)} passes would need {size:.0f} GiB and more"
         raise UsageError("a picture", problem, "Render fewer pixels or fewer passes at a time")
 

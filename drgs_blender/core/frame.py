@@ -155,6 +155,8 @@ class ObjectState:
     captured_colours : bool
         Whether the camera sees it unlit, in the view-dependent colours of its capture, instead of its materials. Only
         surfels have them, see ``Surfels.sh``.
+    aovs : list of ShaderAOV
+        Without textures.
     """
 
     name: str
@@ -172,6 +174,7 @@ class ObjectState:
     tear: float = 0.0
     grain: float = 0.0
     captured_colours: bool = False
+    aovs: list[ShaderAOV] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -261,6 +264,24 @@ _PLAIN_DIELECTRIC = {"ior": 1.5, "specular_level": 0.5, "transmission": 0.0, "di
 
 
 @dataclass(slots=True)
+class ShaderAOV:
+    """What a material gives to a shader AOV: a colour, or a number as a colour's first channel.
+
+    Attributes
+    ----------
+    name : str
+        Of its pass, see `passes.pass_of`.
+    colour : tuple of float
+        Linear Rec.709, times the texture; any finite numbers.
+    texture : Texture, optional
+    """
+
+    name: str
+    colour: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    texture: Texture | None = None
+
+
+@dataclass(slots=True)
 class Material:
     """Parameters of Blender's Principled BSDF for an ordinary surface. Numbers multiply their textures.
 
@@ -319,6 +340,8 @@ class Material:
     parts : list of Part
         Mix and Add Shader: if there are any, the surface scatters their weighted sum, and of the material itself only
         name, `alpha`, `emission`, `details` and `pass_index` count.
+    aovs : list of ShaderAOV
+        At most one per pass; others are 0.
     """
 
     name: str
@@ -355,6 +378,7 @@ class Material:
     kind: Literal["principled", "diffuse", "glossy", "glass", "refraction", "translucent", "sheen"] = "principled"
     multiscatter: bool = False
     parts: list[Part] = field(default_factory=list)
+    aovs: list[ShaderAOV] = field(default_factory=list)
 
     @property
     def clear(self) -> bool:
@@ -374,7 +398,7 @@ class Material:
         """Textures of the material and its parts."""
         names = ("base_colour", "roughness", "metallic", "emission", "alpha")
         found = [getattr(self, f"{name}_texture") for name in names]
-        found += [*self.textures.values(), *(detail.texture for detail in self.details)]
+        found += [*self.textures.values(), *(part.texture for part in (*self.details, *self.aovs))]
         for part in self.parts:
             found += [part.weight_texture, *part.material.all_textures()]
         return [texture for texture in found if texture is not None]

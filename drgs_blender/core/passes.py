@@ -39,6 +39,16 @@ class Pass:
     exact: bool = False
     colour: str = ""
 
+    @property
+    def layer(self) -> str:
+        """Layer in EXR files, and name in Blender where that has no other: of a shader AOV its own name."""
+        return self.name.removeprefix(AOV_COLOUR).removeprefix(AOV_VALUE)
+
+
+#: Beginnings of the names of passes that a scene names: shader AOVs of either type, and the light of a light group.
+AOVS = AOV_COLOUR, AOV_VALUE = "AOV colour ", "AOV value "
+LIGHT_GROUP = "Combined_"
+
 
 def _cryptomatte(of: str, index: int) -> Pass:
     name, about = f"Crypto{of.title()}{index:02}", f"Cryptomatte of {of}s: which a pixel shows, and how much of each"
@@ -91,6 +101,20 @@ TEMPORAL: tuple[str, ...] = (
 
 #: name -> Pass
 BY_NAME: dict[str, Pass] = {p.name: p for p in PASSES}
+
+
+def pass_of(name: str) -> Pass | None:
+    """The pass of a name in a frame: a row of the table, a shader AOV or a light group; None for others."""
+    named = {
+        AOV_COLOUR: ("RGBA", "COLOR", "Colour that materials give to AOV Output nodes, and coverage"),
+        AOV_VALUE: ("X", "VALUE", "Number that materials give to AOV Output nodes"),
+        LIGHT_GROUP: ("RGB", "COLOR", "Light of one light group, not denoised"),
+    }
+    for start, (channels, kind, about) in named.items():
+        if name.startswith(start) and len(name) > len(start):
+            return Pass(name, channels, kind, "", about)
+    return BY_NAME.get(name)
+
 
 #: Light pass -> colour pass of its surfaces. As in Cycles, (direct + indirect) colour, of both lobes, + Emit + Env
 #: is Combined.

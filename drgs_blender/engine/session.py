@@ -19,7 +19,7 @@ from ..compute.threads import use_threads
 from ..core.asset.model import Asset, PosedSurfels
 from ..core.errors import Cancelled, UsageError
 from ..core.frame import Frame, Light, MeshState, ObjectState, RenderSettings
-from ..core.passes import COLOURS
+from ..core.passes import AOVS, COLOURS
 from ..ipc.change_detection import reuse_equal
 from ..ipc.protocol import Passes
 from ..render.backend import CPU, RenderBackend
@@ -317,7 +317,7 @@ def jobs_of(frame: Frame) -> list[str]:
         jobs.append("motion")
     if any(name.startswith("Crypto") for name in frame.passes):
         jobs.append("mattes")
-    if {*CHANNELS, *COLOURS}.intersection(frame.passes):
+    if {*CHANNELS, *COLOURS}.intersection(frame.passes) or any(name.startswith(AOVS) for name in frame.passes):
         jobs.append("surface passes")
     if frame.camera.panorama:
         jobs.append("panorama")

@@ -105,7 +105,7 @@ def _named_samples(frame: dict[str, Any]) -> dict[str, Any]:
 
 
 def _with_new_fields(frame: dict[str, Any]) -> dict[str, Any]:
-    """Formats 2 to 3 and 3 to 4: fields that came later have their defaults."""
+    """Formats 2 to 4: fields that came later have their defaults."""
     found: dict[str, Any] = completed(Frame, frame)
     return found
 

@@ -15,7 +15,7 @@ from ..compute.threads import use_threads
 from ..core.cryptomatte import KINDS
 from ..core.errors import Cancelled, UsageError
 from ..core.frame import Frame
-from ..core.passes import BY_NAME
+from ..core.passes import BY_NAME, pass_of
 from .backend import CPU, RenderBackend
 from .camera import camera_parameters
 from .denoise.oidn import denoise_oidn, require
@@ -301,7 +301,7 @@ def check_frame(frame: Frame) -> None:
     """Raise UsageError on what the stages below would misunderstand."""
     settings = frame.settings
     for name in frame.passes:
-        if name not in BY_NAME:
+        if pass_of(name) is None:
             raise UsageError(f"pass {name!r}", "does not exist", f"Choose from {', '.join(BY_NAME)}")
     if settings.camera_sees not in ("surfels", "mesh"):
         raise UsageError("Camera Sees", f"is {settings.camera_sees!r}", "Choose surfels or mesh")

@@ -42,6 +42,21 @@ def test_all_passes_and_metadata_come_back_bit_for_bit(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["f_0001.exr"]
 
 
+def test_passes_that_a_scene_names_are_layers_of_their_own_names(tmp_path: Path) -> None:
+    rng, path = np.random.default_rng(2), tmp_path / "f.exr"
+    widths = {"AOV colour tone": 4, "AOV value wetness": 1, "AOV value Depth": 1, "Combined_key.light": 3}
+    passes = some_passes((4, 5), ("Combined", "Depth"))
+    passes |= {name: rng.normal(size=(4, 5, width)).astype(np.float32) for name, width in widths.items()}
+    write_frame(path, passes, {})
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        assert {"tone.A", "wetness.X", "Depth.Z", "Depth.X", "Combined_key.light.R"} <= set(file.channels())
+    again, _ = read_frame(path)
+    assert set(again) == set(passes) and all(np.array_equal(again[name], passes[name]) for name in passes)
+    for wrong in ("AOV value Roughness", "AOV value ", "wetness"):
+        with pytest.raises(UsageError):
+            write_frame(path, some_passes((4, 5), ("Roughness",)) | {wrong: passes["AOV value wetness"]}, {})
+
+
 def test_half_floats_only_for_colour(tmp_path: Path) -> None:
     passes = some_passes(names=("Combined", "Depth"))
     passes["Combined"][0, 0] = 1e9

@@ -33,7 +33,8 @@ _IMPLICIT = ("TEX_NOISE", "TEX_VORONOI", "TEX_WAVE", "TEX_MAGIC", "TEX_CHECKER",
 def bake(job: dict[str, Any]) -> None:
     """Write ``pixels`` (h, w, 4), row 0 at the top, their ``factor``, and ``uvs`` (loops, 2), empty for the mesh's own.
 
-    Colours are bytes, encoded as sRGB, numbers are bytes, emission is float32. With ``leaves`` no other shaders count.
+    Colours are bytes, encoded as sRGB, numbers are bytes, emission and shader AOVs are float32. With ``leaves`` no other
+    shaders count.
     """
     channel, size = job["channel"], job["size"]
     leaves = tuple(map(tuple, job["leaves"])) if "leaves" in job else None
@@ -48,6 +49,8 @@ def bake(job: dict[str, Any]) -> None:
         _unwrap(obj)
     for tree in found:
         _generated(tree)
+    if channel.startswith("aov "):
+        _shine_alone(material.node_tree, material.node_tree.nodes[job["output"]].inputs[channel.removeprefix("aov ")])
     kinds = {node.type for tree in found for node in tree.nodes}
 
     def weight(counts: Callable[[bpy.types.Node], bool]) -> np.ndarray:
@@ -60,7 +63,7 @@ def bake(job: dict[str, Any]) -> None:
     elif channel in ("base_colour", "emission", "weight"):
         if "BSDF_TRANSPARENT" in kinds:
             whole = weight(lambda node: node.type != "BSDF_TRANSPARENT")
-    elif channel != "alpha" and kinds.intersection(node_trees.UNSCATTERED):
+    elif channel not in ("alpha", "aov Color", "aov Value") and kinds.intersection(node_trees.UNSCATTERED):
         whole = weight(lambda node: node.type not in node_trees.UNSCATTERED)
     if whole is not None:
         pixels = np.divide(pixels, whole, out=np.zeros_like(pixels), where=whole > 1e-4)
@@ -72,10 +75,11 @@ def bake(job: dict[str, Any]) -> None:
 def _encoded(channel: str, pixels: np.ndarray) -> tuple[np.ndarray, float]:
     """(h, w, 4) of a channel, as `bake` writes it, and what it is to be multiplied with."""
     values = np.nan_to_num(pixels, posinf=0.0, neginf=0.0)
-    values = values % 1.0 if channel == "anisotropy_rotation" else np.maximum(values, 0)
+    if not channel.startswith("aov "):
+        values = values % 1.0 if channel == "anisotropy_rotation" else np.maximum(values, 0)
     whole = np.ones((*values.shape[:2], 4), np.float32)
     whole[..., :3] = values
-    if channel == "emission":
+    if channel == "emission" or channel.startswith("aov "):
         return whole, 1.0
     factor = 1.0 if channel in _UNIT else max(1.0, float(values.max(initial=0.0)))
     unit = np.minimum(values / factor, 1)
@@ -227,6 +231,15 @@ def _baked(scene: bpy.types.Scene, obj: bpy.types.Object, found: list[node_trees
     for step in undo:
         step()
     return np.ascontiguousarray(pixels[::-1, :, :3])
+
+
+def _shine_alone(tree: bpy.types.NodeTree, socket: bpy.types.NodeSocket) -> None:
+    """Let the material shine with what feeds a socket."""
+    emission = tree.nodes.new("ShaderNodeEmission")
+    if socket.is_linked:
+        tree.links.new(socket.links[0].from_socket, emission.inputs["Color"])
+    output = tree.get_output_node("CYCLES") or tree.nodes.new("ShaderNodeOutputMaterial")
+    tree.links.new(emission.outputs[0], output.inputs["Surface"])
 
 
 def _shine(tree: bpy.types.NodeTree, node: bpy.types.Node, what: tuple[str, ...] | float) -> Any:

@@ -25,8 +25,8 @@ def load(job: dict[str, Any], kind: str) -> bpy.types.ID:
 def evaluated(
     owner: bpy.types.ID, job: dict[str, Any], follow: node_trees.Follow = lambda socket: True
 ) -> list[node_trees.Tree]:
-    """The trees behind the output of a datablock, with the values and loose images of the job."""
-    output = output_of(owner)
+    """The trees behind an output of a datablock, that of the job or Cycles', with the values and loose images."""
+    output = owner.node_tree.nodes[job["output"]] if "output" in job else output_of(owner)
     found = node_trees.trees(owner.node_tree, output, follow)
     owner.animation_data_clear()
     node_trees.apply(found, job["trees"])

@@ -26,7 +26,7 @@ import OpenEXR
 from ...compute.threads import get_num_threads
 from ...core.cryptomatte import METADATA
 from ...core.errors import AssetError, UsageError, WriteError
-from ...core.passes import BY_NAME
+from ...core.passes import AOV_COLOUR, AOV_VALUE, BY_NAME, LIGHT_GROUP, Pass, pass_of
 
 Array = np.ndarray
 
@@ -93,7 +93,8 @@ def read_frame(path: str | Path) -> tuple[dict[str, Array], dict[str, str]]:
     Returns
     -------
     passes : dict of str to array
-        Pass name -> (h, w, channels) float32, row 0 at the top; unknown layers are left out.
+        Pass name -> (h, w, channels) float32, row 0 at the top; unknown layers are left out. A layer of a colour or
+        of a number that no pass of the table has is a shader AOV, or a light group.
     metadata : dict of str to str
         As given to `write_frame`.
 
@@ -117,11 +118,26 @@ def read_frame(path: str | Path) -> tuple[dict[str, Array], dict[str, str]]:
     if checksum != _checksum(channels, metadata):
         raise AssetError(str(path), "is damaged: its checksum does not fit", "Render this frame again")
     passes: dict[str, Array] = {}
-    for name, kind in BY_NAME.items():
-        names = [_channel_name(name, c) for c in kind.channels]
+    for kind in (*BY_NAME.values(), *_named(channels)):
+        names = [_channel_name(kind, c) for c in kind.channels]
         if all(n in channels for n in names):
-            passes[name] = np.stack([channels[n].astype(np.float32) for n in names], axis=-1)
+            passes[kind.name] = np.stack([channels[n].astype(np.float32) for n in names], axis=-1)
     return passes, metadata
+
+
+def _named(channels: dict[str, Array]) -> list[Pass]:
+    """Passes that a scene named, by the channels of a file."""
+    known = {_channel_name(kind, c) for kind in BY_NAME.values() for c in kind.channels}
+    letters: dict[str, set[str]] = {}
+    for name in sorted(channels.keys() - known):
+        layer, _, letter = name.rpartition(".")
+        letters.setdefault(layer, set()).add(letter)
+    found = []
+    for layer, own in letters.items():
+        start = {"RGBA": AOV_COLOUR, "X": AOV_VALUE, "RGB": ""}.get("".join(c for c in "RGBAX" if c in own))
+        if start is not None and (start or layer.startswith(LIGHT_GROUP)) and (kind := pass_of(start + layer)):
+            found.append(kind)
+    return found
 
 
 def read_checksum(path: str | Path) -> str:
@@ -141,8 +157,8 @@ def read_checksum(path: str | Path) -> str:
     return checksum
 
 
-def _channel_name(name: str, channel: str) -> str:
-    return channel if name == "Combined" else f"{name}.{channel}"
+def _channel_name(kind: Pass, channel: str) -> str:
+    return channel if kind.name == "Combined" else f"{kind.layer}.{channel}"
 
 
 def _channels(path: Path, passes: dict[str, Array], half: bool) -> dict[str, Array]:
@@ -150,7 +166,7 @@ def _channels(path: Path, passes: dict[str, Array], half: bool) -> dict[str, Arr
     size = None
     channels: dict[str, Array] = {}
     for name, values in passes.items():
-        kind = BY_NAME.get(name)
+        kind = pass_of(name)
         if kind is None:
             raise UsageError(f"pass {name!r}", "does not exist", f"Choose from {', '.join(BY_NAME)}")
         if values.ndim != 3 or values.shape[2] != len(kind.channels) or values.shape[:2] != (size or values.shape[:2]):
@@ -160,7 +176,9 @@ def _channels(path: Path, passes: dict[str, Array], half: bool) -> dict[str, Arr
             channel = np.ascontiguousarray(values[:, :, i], dtype=np.float32)
             if half and kind.kind == "COLOR" and not kind.exact:
                 channel = np.clip(channel, -_LARGEST_HALF, _LARGEST_HALF).astype(np.float16)
-            channels[_channel_name(name, letter)] = channel
+            if _channel_name(kind, letter) in channels:
+                raise UsageError(f"pass {name!r}", f"is named as another layer, {kind.layer}", "Give it another name")
+            channels[_channel_name(kind, letter)] = channel
     if size is None or 0 in size:
         raise UsageError(str(path), "would hold no pixels", "Ask for at least one pass and a region with pixels")
     return channels

@@ -1,10 +1,11 @@
-"""Passes of seen surfaces that pictures rarely ask for: colours of the lobes, Mist, UV and material index.
+"""Passes of seen surfaces that pictures rarely ask for: colours of the lobes, Mist, UV, material index, shader AOVs.
 
 They are those of Cycles. All but the material index, which is that of the nearest sample, are means over a pixel's
 samples premultiplied by coverage: in a pixel half covered, UV is half of what the surface has, with a third channel
 that says so, and Mist is 1 where nothing is. Diffuse and glossy colour are the directional albedos of the lobes,
 for a viewer as flat to the surface as the camera: colour passes, by which light passes are divided
-(`core.passes.COLOURS`); those of objects that are shown as captured, which emit alone, are 0.
+(`core.passes.COLOURS`); those of objects that are shown as captured, which emit alone, are 0. Shader AOVs are looked
+up where the ray meets the surface; colours are cut at 0, and have as alpha the coverage of surfaces that give one.
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ import numpy as np
 from ...compute.jit import njit
 from ...compute.threads import ELEMENTS, ROWS, over_range
 from ...core.frame import Frame
-from ...core.passes import COLOURS
+from ...core.passes import AOV_VALUE, AOVS, COLOURS, pass_of
 from ..camera import POSITION
 from ..gbuffer.gbuffer import GBuffer
 from ..integrator import brdf
 from ..sampling import ONE, ZERO, F
+from ..scene.shader_aovs import aov_at
 from ..scene.trace_scene import TraceScene
 from ..shading_points import CATCHER, UNLIT
 
@@ -42,10 +44,12 @@ class SurfaceFilm:
     def __init__(self, scene: TraceScene, frame: Frame, parameters: Array) -> None:
         x0, y0, x1, y1 = frame.camera.window
         wanted = {*frame.passes, *(COLOURS[name] for name in frame.passes if name in COLOURS)}
+        self._aovs = [name for name in frame.passes if name.startswith(AOVS)]
+        widths = CHANNELS | {name: len(kind.channels) for name in self._aovs if (kind := pass_of(name))}
         self._scene, self._frame, self._parameters, self._origin = scene, frame, parameters, (x0, y0)
         self.pixels = {
             name: np.zeros((y1 - y0, x1 - x0, channels), np.float32)
-            for name, channels in CHANNELS.items()
+            for name, channels in widths.items()
             if name in wanted
         }
         self._uvs = scene.mesh_materials.uv_maps() if "UV" in self.pixels else None
@@ -64,6 +68,7 @@ class SurfaceFilm:
             values["UV"] = self._places(buffer, self._uvs)
         if "Mist" in self.pixels:
             values["Mist"] = 1 - self._mist(buffer)
+        values |= {name: self._aov(buffer, name) for name in self._aovs}
         for name in self.pixels.keys() & values.keys():
             over_range(_mean, y1 - y0, rows, values[name], self.pixels[name][y0 - top : y1 - top], fewest=ROWS)
         if "IndexMA" in self.pixels:
@@ -96,6 +101,21 @@ class SurfaceFilm:
             weights = np.stack([1 - u - v, u, v], axis=1)[:, :, None]
             out[meshes] = (weights * corners).sum(axis=1)
         return out
+
+    def _aov(self, buffer: GBuffer, name: str) -> Array:
+        """(n, 1 or 4) float32 of a shader AOV at each point."""
+        scene, values = self._scene, np.zeros((len(buffer.face), 4), np.float32)
+        source = scene.source[buffer.object_index]
+        for i, item in enumerate(self._frame.objects):
+            own = [aov.colour for aov in item.aovs if aov.name == name]
+            if own:
+                values[source == i] = *own[0], 1.0
+        face = buffer.face - scene.vertex_faces
+        meshes = np.flatnonzero((face >= 0) & (source >= len(self._frame.objects)))
+        values[meshes] = aov_at(name, scene.mesh_materials, face[meshes], buffer.barycentric[meshes])
+        if name.startswith(AOV_VALUE):
+            return values[:, :1]
+        return np.maximum(values, 0)
 
     def _mist(self, buffer: GBuffer) -> Array:
         """(n, 1) float32 mist of each point in [0, 1]."""

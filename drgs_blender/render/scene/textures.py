@@ -40,6 +40,7 @@ from .detailed_normal import (
     TANGENTS,
     TEXTURE,
 )
+from .shader_aovs import aov_tables
 from .texture_lookup import (
     BRIGHTEST,
     BYTE,
@@ -138,6 +139,8 @@ class MaterialTable:
         Whether anything has a normal or a bump map.
     emissive : bool
         Whether anything emits light.
+    aovs : dict of str to (tuple of array)
+        Of `shader_aovs.aov_tables`.
     warnings : list of str
         Problems and their substitutes, in words.
     """
@@ -173,6 +176,7 @@ class MaterialTable:
             self._steps += [self._step(detail, material.name, i) for detail in material.details]
             slots[i, STEPS] = len(self._steps) - slots[i, FIRST_STEP]
             slots[i, FRAME] = frames[i] if len(frames) else 0
+        self.aovs = aov_tables(materials, self._add_texture, self.warnings)
         self.detailed = bool(self._steps)
         self.arrays = (
             constants,
