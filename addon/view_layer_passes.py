@@ -56,6 +56,7 @@ def named(view_layer: bpy.types.ViewLayer) -> list[Pass]:
     taken = {blender_name(p) for p in PASSES}
     starts = {"COLOR": AOV_COLOUR, "VALUE": AOV_VALUE}
     names = [starts[aov.type] + aov.name for aov in view_layer.aovs if _is_usable(aov, taken)]
+    names += [LIGHT_GROUP + group.name for group in view_layer.lightgroups]
     return [p for name in names if (p := pass_of(name)) is not None]
 
 

@@ -116,12 +116,13 @@ def export_frame(
     if wanted is not None:
         wanted.again(sky.requests)
     seen = others == "SEEN" and not scene.render.film_transparent
-    lights += [replace(sun, camera=sun.camera and seen) for sun in sky.suns]
+    group = "" if world is None else world.lightgroup
+    lights += [replace(sun, camera=sun.camera and seen, light_group=group) for sun in sky.suns]
     frame = Frame(
         noise_index=scene.frame_current if settings.use_animated_seed else 0,
         camera=camera,
         objects=objects.states,
-        world=sky.world,
+        world=replace(sky.world, light_group=group),
         background=sky.background,
         settings=settings.to_settings(scene.render.film_transparent, preferences.read("threads", 0), warn),
         passes=passes,

@@ -48,6 +48,7 @@ def export_light(item: Visible, warn: Warn) -> Light | None:
         diffuse=rays.diffuse,
         glossy=rays.glossy,
         cast_shadow=light.use_shadow,
+        light_group=obj.lightgroup,
         **_SHAPES[kind](light),
     )
 

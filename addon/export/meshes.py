@@ -85,6 +85,7 @@ class Meshes:
             *(getattr(rays, name) for name in rays.__slots__),
             self._with_uv_map,
             self._materials.aovs,
+            obj.lightgroup,
             *sent.values(),
         )
         shape = self._shapes.get(key)
@@ -173,6 +174,7 @@ class Meshes:
             materials=[material.material or DEFAULT_MATERIAL for material in exported],
             visibility=item.visibility,
             layers=self._layers(item.object.name, mesh, (corners, polygons, arrays.corner_vertices), exported),
+            light_group=item.object.lightgroup,
             **self._links.numbers_of(item),
         )
 

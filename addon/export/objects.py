@@ -68,6 +68,7 @@ class DrgsObjects:
                 material_pass_index=0 if material is None else material.pass_index,
                 visibility=item.visibility,
                 captured_colours=obj.drgs.captured_colours,
+                light_group=obj.lightgroup,
                 aovs=_aovs(material, obj, self._aovs, self._warn) if material is not None and self._aovs else [],
             )
         )

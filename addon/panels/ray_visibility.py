@@ -1,4 +1,4 @@
-"""Object and light properties: which rays meet an object, and what of a light Blender's own panel leaves out."""
+"""Object, light and world properties: ray visibility, light groups, what of a light Blender's own panel leaves out."""
 
 from __future__ import annotations
 
@@ -26,6 +26,30 @@ class DRGS_PT_rays(bpy.types.Panel):
         if obj.type != "LIGHT":
             column.prop(obj, "visible_shadow", text="Shadow")
             column.prop(obj, "is_shadow_catcher")
+        _light_group(layout, obj, context.view_layer)
+
+
+class DRGS_PT_world_group(bpy.types.Panel):
+    bl_label = "Light Group"
+    bl_space_type = "PROPERTIES"
+    bl_region_type = "WINDOW"
+    bl_context = "world"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - read by Blender
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return context.engine == "DRGS" and context.world is not None
+
+    def draw(self, context: bpy.types.Context) -> None:
+        self.layout.use_property_split = True
+        _light_group(self.layout, context.world, context.view_layer)
+
+
+def _light_group(
+    layout: bpy.types.UILayout, owner: bpy.types.Object | bpy.types.World, view_layer: bpy.types.ViewLayer
+) -> None:
+    given = owner, "lightgroup", view_layer, "lightgroups"
+    layout.prop_search(*given, text="Light Group", results_are_suggestions=True)
 
 
 class DRGS_PT_beam(bpy.types.Panel):
@@ -48,4 +72,4 @@ class DRGS_PT_beam(bpy.types.Panel):
             layout.prop(light, "spread")
 
 
-CLASSES = (DRGS_PT_rays, DRGS_PT_beam)
+CLASSES = (DRGS_PT_rays, DRGS_PT_world_group, DRGS_PT_beam)

@@ -157,6 +157,8 @@ class ObjectState:
         surfels have them, see ``Surfels.sh``.
     aovs : list of ShaderAOV
         Without textures.
+    light_group : str
+        To which belongs what it emits; "": none.
     """
 
     name: str
@@ -175,6 +177,7 @@ class ObjectState:
     grain: float = 0.0
     captured_colours: bool = False
     aovs: list[ShaderAOV] = field(default_factory=list)
+    light_group: str = ""
 
 
 @dataclass(slots=True)
@@ -473,6 +476,8 @@ class MeshState:
         What the pass UV shows, one per face corner; None: 0.
     receivers, blockers : int
         Light linking of what it emits, see `Visibility`.
+    light_group : str
+        To which belongs what it emits; "": none.
     """
 
     name: str
@@ -489,6 +494,7 @@ class MeshState:
     uv_map: Array | None = None
     receivers: int = -1
     blockers: int = -1
+    light_group: str = ""
 
 
 @dataclass(slots=True)
@@ -529,6 +535,8 @@ class Light:
         Whether objects between light and surface block it.
     receivers, blockers : int
         Light linking: on what it shines, and what throws its shadow, see `Visibility`.
+    light_group : str
+        To which it belongs; "": none.
     """
 
     name: str
@@ -552,6 +560,7 @@ class Light:
     cast_shadow: bool = True
     receivers: int = -1
     blockers: int = -1
+    light_group: str = ""
 
 
 @dataclass(slots=True)
@@ -560,13 +569,14 @@ class World:
 
     ``environment`` is (h, w, 3) float32 lat-long in Blender's mapping (see asset.Environment) or None for a constant
     colour. ``rotation`` is what a Mapping node does to the vector: Rotation Z of t degrees is rotation about +Z by
-    +t. ``colour`` is linear Rec.709.
+    +t. ``colour`` is linear Rec.709. ``light_group`` is the light group to which it belongs, "" none.
     """
 
     environment: Array | None = None
     rotation: Array = field(default_factory=lambda: np.eye(3))
     colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
     strength: float = 1.0
+    light_group: str = ""
 
 
 @dataclass(slots=True)

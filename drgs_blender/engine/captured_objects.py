@@ -115,6 +115,7 @@ def glowing_mesh(state: ObjectState, traced: TraceObject, glow: Glow) -> MeshSta
         uvs=uvs,
         materials=[surface],
         visibility=replace(seen, camera=False, holdout=False, shadow_catcher=False),
+        light_group=state.light_group,
     )
 
 

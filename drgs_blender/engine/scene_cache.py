@@ -14,7 +14,7 @@ from ..compute.warp.posed_surfels import DevicePosedSurfels, joined
 from ..core.asset.container import read_asset
 from ..core.asset.model import Asset, PosedSurfels, Surfels
 from ..core.errors import AssetError, UsageError
-from ..core.frame import Frame, Image, Light, MeshState, MotionStep, ObjectState, RenderSettings, World
+from ..core.frame import Frame, Image, MeshState, MotionStep, ObjectState, RenderSettings, World
 from ..deform.gpu.mesh_driven import Deformer
 from ..deform.mesh_driven import MeshDriven
 from ..ipc.change_detection import reuse_equal
@@ -22,6 +22,7 @@ from ..render.backend import CPU, RenderBackend
 from ..render.camera import camera_parameters
 from ..render.film.motion_vectors import SceneState
 from ..render.lights.environment import EnvironmentLight
+from ..render.lights.light_groups import group, groups_of
 from ..render.lights.light_links import link
 from ..render.lights.light_sampler import Lights
 from ..render.lights.mesh_lights import Emitters
@@ -351,15 +352,19 @@ class SceneCache:
         self._background = kept
         return self.background
 
-    def lights_of(self, lights: list[Light]) -> Lights:
+    def lights_of(self, frame: Frame) -> Lights:
         """Blender's lights and surfaces that emit, and what they send to the middle of the scene."""
+        lights = frame.lights
         self._emitters = Emitters(self.scene, self._emitters)
         boxes = [self.scene.bvh.bounds()] if len(self.scene.faces) or self.tree is None else []
         boxes += [self.tree.bounds()] if self.tree is not None else []
         low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
         sphere = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
         self.lights = Lights(lights, *sphere, self._emitters)
-        link(self.lights, lights, [*(item.state for item in self.objects), *self.meshes], self.scene, sphere)
+        glowing = [item.glowing for item in self.objects if item.glowing is not None]
+        shapes: list[ObjectState | MeshState] = [*(item.state for item in self.objects), *self.meshes, *glowing]
+        link(self.lights, lights, shapes, self.scene, sphere)
+        group(self.lights, lights, shapes, frame.world.light_group, groups_of(frame.passes))
         return self.lights
 
 

@@ -26,6 +26,7 @@ from ..render.backend import CPU, RenderBackend
 from ..render.film.surface_film import CHANNELS
 from ..render.gpu.select_backend import Backends
 from ..render.integrator.adaptive import part_count
+from ..render.lights.light_groups import groups_of
 from ..render.pipeline import Progress, render
 from ..render.prepared_scene import PreparedScene
 from ..render.scene.trace_scene import TraceObject
@@ -276,7 +277,7 @@ class Session:
             progress("Deforming", 0.0)
         posed = self._scene_cache.pose(frame, backend)
         timer("deform")
-        environment, lights = self._scene_cache.environment_of(frame.world), self._scene_cache.lights_of(frame.lights)
+        environment, lights = self._scene_cache.environment_of(frame.world), self._scene_cache.lights_of(frame)
         background = self._scene_cache.background_of(frame.background)
         timer("light")
         cache = self._scene_cache
@@ -287,7 +288,8 @@ class Session:
 
     def _warnings(self, settings: RenderSettings) -> list[str]:
         trouble = cache_folder().trouble
-        linked = self._scene_cache.lights.linked is not None
+        lights = self._scene_cache.lights
+        linked = lights.linked is not None or lights.grouped is not None
         found = self._scene_cache.warnings() + self._backends.warnings(settings, linked)
         return found + _ignored_lobes(settings, self._scene_cache.meshes) + ([trouble] if trouble else [])
 
@@ -324,6 +326,8 @@ def jobs_of(frame: Frame) -> list[str]:
     sources: list[Light | MeshState] = [*frame.lights, *frame.meshes]
     if any(source.receivers >= 0 or source.blockers >= 0 for source in sources):
         jobs.append("linked lights")
+    if groups_of(frame.passes):
+        jobs.append("light groups")
     return jobs
 
 

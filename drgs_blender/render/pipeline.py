@@ -22,6 +22,7 @@ from .denoise.oidn import denoise_oidn, require
 from .denoise.svgf_temporal import History, NoisyPicture
 from .film.cryptomatte import CryptoFilm
 from .film.film import COMPONENTS, Film
+from .film.light_group_film import LightGroupFilm
 from .film.motion_vectors import MotionFilm, SceneState, vector_pass
 from .film.surface_film import SurfaceFilm
 from .gbuffer.gbuffer import GBuffer
@@ -107,7 +108,7 @@ def render(
         for kind, name in KINDS.items()
         if any(wanted.startswith(name) for wanted in frame.passes)
     ]
-    surfaces = SurfaceFilm(scene, frame, parameters)
+    surfaces, groups = SurfaceFilm(scene, frame, parameters), LightGroupFilm(scene, lights, frame, parameters)
     if settings.denoise != "svgf":
         history = None
     left, top, right, bottom = camera.window
@@ -130,8 +131,9 @@ def render(
         for matte in mattes:
             matte.add(buffer)
         surfaces.add(buffer)
+        groups.add(buffer, radiance)
         if lights is not None and lights.seen:
-            film.pixels.emission[y0 - top : y1 - top] += visible_lights(lights, parameters, left, buffer)
+            film.pixels.emission[y0 - top : y1 - top] += visible_lights(lights.tables, parameters, left, buffer)
         for motion in moving:
             if motion is not None:
                 motion.add(buffer, scene)
@@ -151,6 +153,7 @@ def render(
     before, after = motions[:2]
     made = {name: values for matte in mattes for name, values in matte.passes().items()}
     made |= surfaces.passes()
+    made |= groups.passes(film.seen_environment())
     made |= film.passes(
         tuple(name for name in frame.passes if name not in made),
         made,
@@ -243,6 +246,9 @@ def _spread(some: Radiance, rows: Array, points: ShadingPoints) -> Radiance:
     if some.unshadowed is not None:
         out.unshadowed = np.zeros(len(points), np.float32)
         out.unshadowed[rows] = some.unshadowed
+    if some.groups is not None:
+        out.groups = np.zeros((len(points), *some.groups.shape[1:]), np.float32)
+        out.groups[rows] = some.groups
     return out
 
 
@@ -286,6 +292,9 @@ class Batches:
             )
             out.components[first:last], out.variance[first:last] = found.components, found.variance
             out.moments[first:last] = found.moments
+            if found.groups is not None:
+                out.groups = np.zeros((n, *found.groups.shape[1:]), np.float32) if out.groups is None else out.groups
+                out.groups[first:last] = found.groups
             if found.unshadowed is not None:
                 out.unshadowed = np.zeros(n, np.float32) if out.unshadowed is None else out.unshadowed
                 out.unshadowed[first:last] = found.unshadowed

@@ -22,6 +22,7 @@ from ..core.frame import Frame, RenderSettings
 from .backend import CPU, RenderBackend
 from .camera import camera_parameters
 from .film.film import Film
+from .film.light_group_film import LightGroupFilm
 from .film.surface_film import SurfaceFilm
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.visible_lights import visible_lights
@@ -251,6 +252,7 @@ class Progressive:
         camera, lights = self.frame.camera, prepared.lights
         film = Film(camera, self.frame.settings, self._parameters)
         surfaces = SurfaceFilm(prepared.scene, self.frame, self._parameters)
+        groups = LightGroupFilm(prepared.scene, lights, self.frame, self._parameters)
         for strip in self._strips:
             buffer = self._samples(strip)
             check()
@@ -260,10 +262,11 @@ class Progressive:
                 radiance.components[buffer.points.flags & UNLIT != 0] = 0.0
             film.add(buffer, radiance, prepared.scene.pass_index, prepared.seen)
             surfaces.add(buffer)
+            groups.add(buffer, radiance)
             if lights is not None and lights.seen:
                 rows = slice(strip.rows[0] - camera.window[1], strip.rows[1] - camera.window[1])
-                film.pixels.emission[rows] += visible_lights(lights, self._parameters, camera.window[0], buffer)
-        made = surfaces.passes()
+                film.pixels.emission[rows] += visible_lights(lights.tables, self._parameters, camera.window[0], buffer)
+        made = surfaces.passes() | groups.passes(film.seen_environment())
         names = tuple(name for name in self.frame.passes if name not in made)
         made |= film.passes(names, made, denoised(film, self.frame, check, self._backend))
         return {name: made[name] for name in self.frame.passes}

@@ -138,12 +138,15 @@ class Radiance:
     moments : (n, 5) float32 array
         Moments for ``variance`` (`integrator.variance`): number of samples, then sum and sum of squares of their
         luminance, diffuse and glossy; may be empty.
+    groups : (n, g, 3) float32 array, optional
+        The part of the sum of each light group that is asked for, and of all light that belongs to none.
     """
 
     components: Array
     variance: Array
     unshadowed: Array | None = None
     moments: Array = field(default_factory=lambda: np.zeros((0, 5), np.float32))
+    groups: Array | None = None
 
     @classmethod
     def dark(cls, n: int) -> Radiance:

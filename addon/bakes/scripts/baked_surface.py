@@ -33,8 +33,8 @@ _IMPLICIT = ("TEX_NOISE", "TEX_VORONOI", "TEX_WAVE", "TEX_MAGIC", "TEX_CHECKER",
 def bake(job: dict[str, Any]) -> None:
     """Write ``pixels`` (h, w, 4), row 0 at the top, their ``factor``, and ``uvs`` (loops, 2), empty for the mesh's own.
 
-    Colours are bytes, encoded as sRGB, numbers are bytes, emission and shader AOVs are float32. With ``leaves`` no other
-    shaders count.
+    Colours are bytes, encoded as sRGB, numbers are bytes, emission and shader AOVs are float32. With ``leaves`` no
+    other shaders count.
     """
     channel, size = job["channel"], job["size"]
     leaves = tuple(map(tuple, job["leaves"])) if "leaves" in job else None

@@ -196,7 +196,7 @@ class Film:
             if name in names
         }
         shadow = self._shadow()
-        made["Env"] = self.environment - self.veiled * shadow[..., None] if shadow.any() else self.environment
+        made["Env"] = self.seen_environment()
         made["Emit"] = seen.emission
         made |= {"Position": seen.position, "Normal": seen.normal, "Albedo": seen.albedo, "Variance": seen.variance}
         made["Vector"] = np.zeros((*seen.coverage.shape, 4), np.float32) if vector is None else vector
@@ -214,6 +214,11 @@ class Film:
         if "Noisy Image" in names:
             made["Noisy Image"] = self._beauty(seen.components, made["Env"], shadow)
         return {name: made[name] for name in names}
+
+    def seen_environment(self) -> Array:
+        """(h, w, 3) float32: light straight from the world, the pass Env."""
+        shadow = self._shadow()
+        return self.environment - self.veiled * shadow[..., None] if shadow.any() else self.environment
 
     def _shadow(self) -> Array:
         """(h, w) float32 in [0, 1]: how dense the shadows on catchers are."""

@@ -70,7 +70,7 @@ class SurfaceFilm:
             values["Mist"] = 1 - self._mist(buffer)
         values |= {name: self._aov(buffer, name) for name in self._aovs}
         for name in self.pixels.keys() & values.keys():
-            over_range(_mean, y1 - y0, rows, values[name], self.pixels[name][y0 - top : y1 - top], fewest=ROWS)
+            over_range(mean_of_points, y1 - y0, rows, values[name], self.pixels[name][y0 - top : y1 - top], fewest=ROWS)
         if "IndexMA" in self.pixels:
             out = self.pixels["IndexMA"][y0 - top : y1 - top, :, 0]
             over_range(_nearest, y1 - y0, rows, self._material_index(buffer), out, fewest=ROWS)
@@ -163,8 +163,17 @@ def _lobe_colours(first, last, points, shading_model, tables, diffuse, glossy): 
 
 
 @njit
-def _mean(y0, y1, points, values, out):  # type: ignore[no-untyped-def]
-    """Add the values of points to their pixels, by weight."""
+def mean_of_points(y0, y1, points, values, out):  # type: ignore[no-untyped-def]
+    """Add the values of points to their pixels, by weight.
+
+    Parameters
+    ----------
+    y0, y1 : int64
+        Rows.
+    points : PointRows
+    values : (n, k) float32 array
+    out : (h, w, k) float32 array
+    """
     for y in range(y0, y1):
         for i in range(points.start[y], points.start[y + 1]):
             if points.flags[i] & CATCHER:

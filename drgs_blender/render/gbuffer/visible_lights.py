@@ -13,7 +13,7 @@ import numpy as np
 from ...compute.jit import njit
 from ...compute.threads import over_range
 from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
-from ..lights.light_sampler import Lights, lights_along, suns_along
+from ..lights.light_sampler import LightTables, lights_along, suns_along
 from ..lights.light_shapes import CAMERA
 from ..sampling import ONE, ZERO, F
 from ..shading_points import CATCHER
@@ -24,12 +24,12 @@ Array = np.ndarray
 _FAR = F(np.inf)
 
 
-def visible_lights(lights: Lights, parameters: Array, x0: int, buffer: GBuffer) -> Array:
+def visible_lights(lights: LightTables, parameters: Array, x0: int, buffer: GBuffer) -> Array:
     """Radiance of lights straight to the camera, mean over each pixel's samples.
 
     Parameters
     ----------
-    lights : Lights
+    lights : LightTables
     parameters : array
         `camera.camera_parameters`.
     x0 : int
@@ -43,7 +43,7 @@ def visible_lights(lights: Lights, parameters: Array, x0: int, buffer: GBuffer) 
     """
     out = np.zeros((*buffer.alpha.shape[:2], 3), np.float32)
     points = buffer.point_rows(x0, int(parameters[WIDTH]))
-    over_range(_look, len(out), parameters, points, buffer.alpha, lights.tables, out)
+    over_range(_look, len(out), parameters, points, buffer.alpha, lights, out)
     return out
 
 

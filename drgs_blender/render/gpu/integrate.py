@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...compute.warp.kernels import Launcher, ScratchArray, WarpKernel
-from ..integrator import direct, indirect, integrate, sample_allocation, wavefront
+from ..integrator import direct, group_sums, integrate, sample_allocation, wavefront
 from ..integrator.records import Sampler, Scene, Settings
 from ..lights.environment import EnvironmentLight
 from ..lights.light_sampler import Lights
@@ -37,7 +37,7 @@ _BATCH = wavefront.Batch._make([
 _SCRATCH = integrate.Scratch._make([
     _BATCH,
     _BATCH,
-    ScratchArray("float32", (1, indirect.FOUND)),
+    ScratchArray("float32", (1, group_sums.FOUND)),
     ScratchArray("float32", (1, direct.KINDS * direct.KIND)),
     ScratchArray("float32", (1, sample_allocation.POINT_STATE)),
     ScratchArray("uint32", (1,)),

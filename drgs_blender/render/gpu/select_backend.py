@@ -36,7 +36,7 @@ class Backends:
         return self._known.get(device, CPU)
 
     def warnings(self, settings: RenderSettings, linked: bool = False) -> list[str]:
-        """Warnings: which requested device was not used, and why; whether lights are `linked` (`light_links`)."""
+        """Warnings: which requested device was not used, and why; whether lights are `linked`, or in groups."""
         device = settings.device
         backend = self._found(device)
         why = self._missing.get(device) or backend.failed
@@ -45,7 +45,7 @@ class Backends:
         if backend is not CPU and settings.rays_see == "surfels":
             return ["Rays See: Surfels is not supported on a graphics card; rendered on the CPU"]
         if backend is not CPU and linked:
-            return ["Light linking is not supported on a graphics card; light is traced on the CPU"]
+            return ["Light linking and light groups are not supported on a graphics card; light is traced on the CPU"]
         return []
 
 

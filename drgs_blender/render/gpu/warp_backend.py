@@ -52,7 +52,9 @@ class WarpRenderBackend(RenderBackend):
 
     def integrate(self, *arguments: Any, surfels: SurfelBVH | None = None) -> Radiance:
         on_cpu = super().integrate
-        if surfels is not None or any(getattr(given, "linked", None) for given in arguments):
+        if surfels is not None or any(
+            getattr(given, "linked", None) or getattr(given, "grouped", None) for given in arguments
+        ):
             return on_cpu(*arguments, surfels=surfels)
         return self.with_fallback(lambda: integrate(*arguments, kernel=self._kernel), lambda: on_cpu(*arguments))
 

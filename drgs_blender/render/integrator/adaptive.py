@@ -88,12 +88,17 @@ class Sampling:
         self.light, self.drawn = np.zeros((count, 4, 3), np.float32), np.zeros(count, np.int32)
         self._variance, self._unshadowed = np.zeros((count, 2), np.float32), np.zeros(count, np.float32)
         self._counted, self._caught = np.zeros(count, np.float32), False
+        self._groups: Array | None = None
 
     def add(self, chosen: Array, found: Radiance) -> None:
         """Take the light of this part for `chosen` of the points that need it; each comes once."""
         self.light[chosen] += found.components
         self.drawn[chosen] += 1
         self._counted[chosen] += found.moments[:, 0] if len(found.moments) else np.inf
+        if found.groups is not None:
+            if self._groups is None:
+                self._groups = np.zeros((len(self.drawn), *found.groups.shape[1:]), np.float32)
+            self._groups[chosen] += found.groups
         if found.unshadowed is not None:
             self._unshadowed[chosen] += found.unshadowed
             self._caught = True
@@ -129,4 +134,5 @@ class Sampling:
             self.light * scale[:, None, None],
             self._variance * (scale**2)[:, None],
             self._unshadowed * scale if self._caught else None,
+            groups=None if self._groups is None else self._groups * scale[:, None, None],
         )

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...compute.jit import njit
 from ..lights.environment import envmap_radiance
+from ..lights.light_groups import group_of_environment, group_of_hit, group_of_sample
 from ..lights.light_links import emits_to, lights_of
 from ..lights.light_sampler import emission_along, lights_along
 from ..lights.light_shapes import DIFFUSE, GLOSSY
@@ -17,6 +18,7 @@ from ..sampling import ONE, ZERO, F, luminance
 from ..scene import ray_masks
 from . import mis
 from . import wavefront as w
+from .group_sums import KIND, KINDS, credit_lamps_of_point, credit_point, deliver_groups, finish_groups
 from .indirect import CARRIED, INDIRECT, trace_paths
 from .intersect import FAR, light_radiance, meet, passed, put_hit
 from .sample_allocation import COSINE, ENVIRONMENT, GGX, LIGHTS
@@ -25,7 +27,7 @@ from .sample_allocation import COSINE, ENVIRONMENT, GGX, LIGHTS
 BATCH = 512
 #: Columns of a block's sums, once each for what samples of environment and lights find, indirect light, and light of
 #: lights and surfaces that rays met: diffuse and glossy light, then sum and sum of squares of the luminance of each.
-KINDS, KIND, MOMENTS = 3, 10, 6
+MOMENTS = 6
 
 
 @njit
@@ -62,7 +64,7 @@ def _reflect(sums, rays, slot, kind, diffuse, glossy):  # type: ignore[no-untype
 
 
 @njit
-def deliver(count, found, limit, sums):  # type: ignore[no-untyped-def]
+def deliver(count, found, limit, lights, sums):  # type: ignore[no-untyped-def]
     """Add the light of finished paths, times BRDF and cosine at their shading points, to these points' sums.
 
     Parameters
@@ -74,6 +76,7 @@ def deliver(count, found, limit, sums):  # type: ignore[no-untyped-def]
         `sums`. INDIRECT: radiance from `indirect.trace_paths`, linear Rec.709.
     limit : float32
         `clamp_indirect`, scaled to one sample: highest mean of its three channels; 0 for none.
+    lights : LightTables, LinkedTables or GroupedTables
     sums : (points, KINDS * KIND) float32 array
         Added to, as light of kind 1 (indirect).
     """
@@ -88,6 +91,7 @@ def deliver(count, found, limit, sums):  # type: ignore[no-untyped-def]
             k = limit / mean if mean > limit else ONE
         r, g, b = r * k, g * k, b * k
         _add(sums, h, 1, fr * r, fg * g, fb * b, hr * r, hg * g, hb * b)
+        deliver_groups(lights, found, path, sums, h, ((fr + hr) * k, (fg + hg) * k, (fb + hb) * k))
 
 
 @njit
@@ -110,9 +114,17 @@ def _see_lights(rays, slot, reach, hit, taking_part, scene, sums):  # type: igno
     gr, gg, gb = dr, dg, db
     if scene.traits.lights_differ:
         gr, gg, gb = lights_along(position, direction, reach, others, share, GLOSSY, lights)
+    if dr + dg + db + gr + gg + gb > ZERO:
+        seen = position, direction, reach, others, share, DIFFUSE
+        credit_lamps_of_point(scene.lights, lights, sums, rays, slot, seen, False)
+        seen = position, direction, reach, others, share, GLOSSY
+        credit_lamps_of_point(scene.lights, lights, sums, rays, slot, seen, True)
     if scene.traits.emissive and emits_to(scene.lights, s[i + w.POINT_SET], hit, scene.geometry):
         r, g, b, density, glossy = emission_along(position, direction, hit, scene.geometry, lights)
         weight, glossy = ONE / (others + share * density), ONE / (others + share * glossy)
+        parts = (weight * r, weight * g, weight * b), (glossy * r, glossy * g, glossy * b)
+        group = group_of_hit(scene.lights, hit, scene.geometry)
+        credit_point(scene.lights, sums, rays, slot, 2, group, parts[0], parts[1])
         dr, dg, db = dr + weight * r, dg + weight * g, db + weight * b
         gr, gg, gb = gr + glossy * r, gg + glossy * g, gb + glossy * b
     if dr + dg + db + gr + gg + gb > ZERO:
@@ -129,7 +141,7 @@ def _trace_lights(rays, count, scene, settings, sums):  # type: ignore[no-untype
         w.soften(rays, count)
     mask = np.int32(ray_masks.SHADOW << settings.shift)
     for slot in range(count):
-        i, _ = w.at(slot)
+        i, c = w.at(slot)
         others, glossy_others = s[i + w.WC] * s[i + w.PC], s[i + w.WG] * s[i + w.PG]
         if not scene.traits.lobes_apart:
             others = glossy_others = others + glossy_others
@@ -137,19 +149,22 @@ def _trace_lights(rays, count, scene, settings, sums):  # type: ignore[no-untype
         dr, dg, db, gr, gg, gb = light_radiance(rays, slot, others, glossy_others, s[i + w.WL], receiver, scene, mask)
         if dr + dg + db + gr + gg + gb > ZERO:
             _reflect(sums, rays, slot, 0, (dr, dg, db), (gr, gg, gb))
+            group = group_of_sample(scene.lights, receiver, np.int64(rays.ints[c + w.CELL]))
+            credit_point(scene.lights, sums, rays, slot, 0, group, (dr, dg, db), (gr, gg, gb))
 
 
 @njit
-def _see_envmap(rays, count, envmap, sums):  # type: ignore[no-untyped-def]
+def _see_envmap(rays, count, scene, sums):  # type: ignore[no-untyped-def]
     """Add what the environment sends along the slots' rays; LIVE is the share that gets through."""
     s = rays.floats
     for slot in range(count):
         i, _ = w.at(slot)
         through = s[i + w.LIVE]
         if through > ZERO:
-            r, g, b = envmap_radiance(s[i + w.MU], s[i + w.MV], envmap)
+            r, g, b = envmap_radiance(s[i + w.MU], s[i + w.MV], scene.envmap)
             light = r * through, g * through, b * through
             _reflect(sums, rays, slot, 0, light, light)
+            credit_point(scene.lights, sums, rays, slot, 0, group_of_environment(scene.lights), light, light)
 
 
 @njit
@@ -170,7 +185,7 @@ def _trace_envmap(rays, count, scene, settings, sums):  # type: ignore[no-untype
         i, _ = w.at(slot)
         if s[i + w.LIVE] > ZERO:
             s[i + w.LIVE] = passed(scene, rays, slot, FAR, mask)
-    _see_envmap(rays, count, scene.envmap, sums)
+    _see_envmap(rays, count, scene, sums)
 
 
 @njit
@@ -238,7 +253,7 @@ def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: igno
         rest = (ONE - through) * (ONE + s[i + w.WE] * s[i + w.PE] / max(others, F(1e-30)))
         if begun == BATCH:
             trace_paths(paths, begun, scene, settings, found)
-            deliver(begun, found, settings.clamp, sums)
+            deliver(begun, found, settings.clamp, scene.lights, sums)
             begun = np.int64(0)
         put_hit(tracer, paths, begun, (position, direction), hit, ints[c + w.KEY], begun)
         found[begun, CARRIED], found[begun, CARRIED + 1], found[begun, CARRIED + 2] = (
@@ -250,16 +265,17 @@ def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: igno
         found[begun, CARRIED + 6] = F(ints[c + w.OWNER])
         begun += 1
     if scene.traits.environment:
-        _see_envmap(rays, count, envmap, sums)
+        _see_envmap(rays, count, scene, sums)
     return begun
 
 
 @njit
-def finish(sums, h, total, components, moments, i):  # type: ignore[no-untyped-def]
+def finish(lights, sums, h, total, components, moments, i):  # type: ignore[no-untyped-def]
     """Write out the light of a point, and for either lobe sum and sum of squares of its samples' luminance.
 
     Parameters
     ----------
+    lights : LightTables, LinkedTables or GroupedTables
     sums : (points, KINDS * KIND) float32 array
         Of the block.
     h : int64
@@ -285,3 +301,4 @@ def finish(sums, h, total, components, moments, i):  # type: ignore[no-untyped-d
             square += sums[h, kind * KIND + m + 1]
         moments[i, 1 + 2 * lobe], moments[i, 2 + 2 * lobe] = mean, square
     moments[i, 0] = F(total)
+    finish_groups(lights, sums, h, moments, i)

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...compute.jit import njit
 from ..lights.environment import envmap_pdf, envmap_radiance, map_at
+from ..lights.light_groups import group_of_environment, group_of_hit, group_of_sample
 from ..lights.light_links import emits_to, lights_of, set_of
 from ..lights.light_sampler import emission_along, lights_along
 from ..lights.light_shapes import DIFFUSE, GLOSSY
@@ -21,6 +22,7 @@ from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
 from . import brdf, mis
 from . import wavefront as w
+from .group_sums import clear_groups, credit_lamps_of_path, credit_path
 from .intersect import FAR, light_radiance, meet, passed, put_hit, surface_of
 
 Array = np.ndarray
@@ -29,9 +31,8 @@ Array = np.ndarray
 _OFFSET_POINT, _OFFSET_SCENE = F(1e-5), F(2e-6)
 #: Russian roulette starts after this many bounces.
 _SURE_BOUNCES = 3
-#: Columns of `found`: indirect light, then the caller's.
+#: Columns of `found`: indirect light, then the caller's; `FOUND` in all, before those of groups.
 INDIRECT, CARRIED = 0, 3
-FOUND = 10
 
 
 @njit
@@ -107,6 +108,8 @@ def _towards_envmap(rays, count, scene, shift, found):  # type: ignore[no-untype
             found[owner, INDIRECT] += red * through
             found[owner, INDIRECT + 1] += green * through
             found[owner, INDIRECT + 2] += blue * through
+            group = group_of_environment(scene.lights)
+            credit_path(scene.lights, found, owner, group, red * through, green * through, blue * through)
 
 
 @njit
@@ -121,9 +124,14 @@ def _towards_lights(rays, count, scene, shift, found):  # type: ignore[no-untype
         )
         if dr + dg + db + gr + gg + gb > ZERO:
             owner = np.int64(ints[c + w.OWNER])
-            found[owner, INDIRECT] += s[i + w.TR] * (s[i + w.QR] * dr + s[i + w.SR] * gr)
-            found[owner, INDIRECT + 1] += s[i + w.TG] * (s[i + w.QG] * dg + s[i + w.SG] * gg)
-            found[owner, INDIRECT + 2] += s[i + w.TB] * (s[i + w.QB] * db + s[i + w.SB] * gb)
+            red = s[i + w.TR] * (s[i + w.QR] * dr + s[i + w.SR] * gr)
+            green = s[i + w.TG] * (s[i + w.QG] * dg + s[i + w.SG] * gg)
+            blue = s[i + w.TB] * (s[i + w.QB] * db + s[i + w.SB] * gb)
+            found[owner, INDIRECT] += red
+            found[owner, INDIRECT + 1] += green
+            found[owner, INDIRECT + 2] += blue
+            group = group_of_sample(scene.lights, s[i + w.PATH_SET], np.int64(ints[c + w.CELL]))
+            credit_path(scene.lights, found, owner, group, red, green, blue)
 
 
 @njit
@@ -155,12 +163,17 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
             found[owner, INDIRECT] += fr * red
             found[owner, INDIRECT + 1] += fg * green
             found[owner, INDIRECT + 2] += fb * blue
+            if red + green + blue > ZERO:
+                seen = position, direction, reach, s[i + w.PG], ONE, seen_by
+                credit_lamps_of_path(scene.lights, lights, found, owner, s[i + w.PATH_SET], (fr, fg, fb), seen)
         if emissive and emits_to(scene.lights, s[i + w.PATH_SET], hit, scene.geometry):
             red, green, blue, own, glossy = emission_along(position, direction, hit, scene.geometry, lights)
             weight = ONE / (s[i + w.PG] + (own if diffuse else glossy))
             found[owner, INDIRECT] += fr * red * weight
             found[owner, INDIRECT + 1] += fg * green * weight
             found[owner, INDIRECT + 2] += fb * blue * weight
+            group = group_of_hit(scene.lights, hit, scene.geometry)
+            credit_path(scene.lights, found, owner, group, fr * red * weight, fg * green * weight, fb * blue * weight)
         if through > ZERO:
             u, v = map_at(*direction, envmap)
             red, green, blue = envmap_radiance(u, v, envmap)
@@ -168,6 +181,8 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
             found[owner, INDIRECT] += fr * red * weight
             found[owner, INDIRECT + 1] += fg * green * weight
             found[owner, INDIRECT + 2] += fb * blue * weight
+            group = group_of_environment(scene.lights)
+            credit_path(scene.lights, found, owner, group, fr * red * weight, fg * green * weight, fb * blue * weight)
         if through < ONE and not last:
             weight = (ONE - through) / s[i + w.PG]
             fr, fg, fb = fr * weight, fg * weight, fb * weight
@@ -207,6 +222,7 @@ def trace_paths(rays, count, scene, settings, found):  # type: ignore[no-untyped
         owner = np.int64(ints[c + w.OWNER])
         for k in range(CARRIED):
             found[owner, k] = ZERO
+        clear_groups(lights, found, owner)
     for bounce in range(settings.bounces):
         _surfaces(rays, count, scene, settings)
         w.lobe_shares(rays, count, shading_model)

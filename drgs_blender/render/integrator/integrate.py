@@ -28,7 +28,8 @@ from ..surfels.surfel_tracer import tracer_of
 from . import brdf
 from . import wavefront as w
 from .direct import BATCH, KIND, KINDS, deliver, finish, trace_batch
-from .indirect import FOUND, trace_paths
+from .group_sums import FOUND, MOMENTS, group_columns
+from .indirect import trace_paths
 from .intersect import meshes_alone
 from .records import Sampler, Scene, Settings, Traits
 from .sample_allocation import ALPHA, COUNTS, POINT_STATE, put_sample, write_point_states
@@ -50,7 +51,12 @@ class ShadingKernel:
 
     def tables(self, scene: TraceScene, environment: EnvironmentLight, lights: Lights) -> tuple[Any, Any, Any, Any]:
         """(tracer, geometry, environment, lights) as `shade` takes them; until the scene's next update."""
-        return meshes_alone(scene.tracer), scene.geometry, environment.envmap, lights.linked or lights.tables
+        return (
+            meshes_alone(scene.tracer),
+            scene.geometry,
+            environment.envmap,
+            lights.grouped or lights.linked or lights.tables,
+        )
 
     def shade(
         self, points: PointArrays, scene: Scene, settings: Settings, sampler: Sampler, out: tuple[Array, Array]
@@ -143,11 +149,17 @@ def integrate(
     def run(some: ShadingPoints, shift: int, found: Radiance) -> None:
         kernel.shade(some.arrays, given, how._replace(shift=shift), sampler, (found.components, found.moments))
 
+    groups = 0 if lights.grouped is None else lights.grouped.number
+    out.moments = np.zeros((n, MOMENTS + 3 * groups), np.float32)
     run(points, 0, out)
+    if groups:
+        out.groups = out.moments[:, MOMENTS:].reshape(n, groups, 3).copy()
+        out.moments = np.ascontiguousarray(out.moments[:, :MOMENTS])
     out.variance = variances(points.pixel, out.moments)
     caught = np.flatnonzero(points.flags & CATCHER)
     if len(caught):
         alone = Radiance.dark(len(caught))
+        alone.moments = np.zeros((len(caught), MOMENTS + 3 * groups), np.float32)
         run(points[caught], ray_masks.WITHOUT, alone)
         out.unshadowed = np.zeros(n, np.float32)
         # Not a matrix product: BLAS rounds a row by how many rows there are.
@@ -188,7 +200,7 @@ class Scratch(NamedTuple):
     found : (BATCH, FOUND) float32 array
         Light of the paths, see `indirect`.
     sums : (block, KINDS * KIND) float32 array
-        Light of the block's points, see `direct`.
+        Light of the block's points, see `direct`; wider where lights have groups, as is `found`.
     state : (block, POINT_STATE) float32 array
         State shared by their samples, see `sample_allocation`.
     row : (block,) uint32 array
@@ -268,18 +280,19 @@ def shade_points(thread, stride, scratch, points, scene, settings, sampler, out)
             if count > 0:
                 begun = trace_batch(strategy, count, begun, scratch, scene, settings)
         trace_paths(scratch.paths, begun, scene, settings, scratch.found)
-        deliver(begun, scratch.found, settings.clamp, sums)
+        deliver(begun, scratch.found, settings.clamp, scene.lights, sums)
         for i in range(start, end):
-            finish(sums, i - start, total[i - start], components, moments, i)
+            finish(scene.lights, sums, i - start, total[i - start], components, moments, i)
 
 
 @njit
-def _scratch() -> Any:
+def _scratch(lights: Any) -> Any:
+    groups = group_columns(lights)
     return Scratch(
         w.batch(BATCH),
         w.batch(BATCH),
-        np.zeros((BATCH, FOUND), np.float32),
-        np.empty((_BLOCK, KINDS * KIND), np.float32),
+        np.zeros((BATCH, FOUND + groups), np.float32),
+        np.empty((_BLOCK, KINDS * KIND + KINDS * groups), np.float32),
         np.zeros((_BLOCK, POINT_STATE), np.float32),
         np.zeros(_BLOCK, np.uint32),
         np.empty(_BLOCK, np.int64),
@@ -289,6 +302,6 @@ def _scratch() -> Any:
 @njit
 def _kernel(first, last, stride, points, scene, settings, sampler, out):  # type: ignore[no-untyped-def]
     # Every n-th block: none has all the costly ones.
-    scratch = _scratch()
+    scratch = _scratch(scene.lights)
     for thread in range(first, last):
         shade_points(thread, stride, scratch, points, scene, settings, sampler, out)

@@ -6,7 +6,7 @@ rays of lights with shadow linking have masks of their own (`scene.ray_masks`); 
 samples alone, since a ray by another strategy meets other objects.
 
 Kernels have a version of their own for `LinkedTables`. With `LightTables` the functions here do nothing, and are gone
-from the machine code.
+from the machine code. Tables with groups (`light_groups`) hold either.
 """
 
 from __future__ import annotations
@@ -99,14 +99,18 @@ def link(
     masks: list[Array] = []
     spans: list[list[int]] = []
     emitters: list[int] = []
+    orders: list[Array] = []
     for value in values or [0]:
-        chosen = [light for light in given if light.receivers < 0 or value >> light.receivers & 1]
+        which = [i for i, light in enumerate(given) if light.receivers < 0 or value >> light.receivers & 1]
+        chosen = [given[i] for i in which]
         own = Lights(chosen, *sphere, Emitters(scene, receivers=value))
         lights.parts.append(own)
         spans.append([sum(len(t) for t in tables), 0, sum(len(p) for p in picks), 0])
         tables.append(own.table)
         picks.append(own.pick)
         masks.append(np.zeros(len(own.table), np.int32))
+        orders.append(np.full(len(own.table), -1))
+        orders[-1][: len(own.order)] = np.array(which, np.int64)[own.order]
         for row, index in enumerate(own.order):
             light = chosen[int(index)]
             masks[-1][row] = ray_masks.blocker_mask(light.blockers) if light.cast_shadow else 0
@@ -118,6 +122,7 @@ def link(
             emission_blockers[i] = ray_masks.blocker_mask(shape.blockers)
             for k, value in enumerate(values):
                 emission[i] |= int(shape.receivers < 0 or value >> shape.receivers & 1) << k
+    lights.linked_order = np.concatenate(orders)
     lights.linked = LinkedTables(
         plain(np.concatenate(tables)), plain(np.concatenate(picks)), np.array(spans, np.int64),
         np.array(emitters, np.int64), np.concatenate(masks), np.array(receiver, np.int64), emission, emission_blockers,
@@ -126,6 +131,11 @@ def link(
 
 def _is_linked(lights: Any) -> bool:
     return getattr(lights, "instance_class", None) is LinkedTables
+
+
+def _has_tables(lights: Any) -> bool:
+    """Whether a Numba type is one that holds `LightTables` or `LinkedTables` as ``tables``, as those with groups do."""
+    return "tables" in getattr(lights, "fields", ())
 
 
 def lights_of(lights, receiver):  # type: ignore[no-untyped-def]
@@ -146,6 +156,8 @@ def lights_of(lights, receiver):  # type: ignore[no-untyped-def]
 
 @overload(lights_of)
 def _lights_of(lights, receiver):  # type: ignore[no-untyped-def]
+    if _has_tables(lights):
+        return lambda lights, receiver: lights_of(lights.tables, receiver)
     if not _is_linked(lights):
         return lambda lights, receiver: lights
 
@@ -177,6 +189,8 @@ def blockers_of(lights, receiver, index):  # type: ignore[no-untyped-def]
 
 @overload(blockers_of)
 def _blockers_of(lights, receiver, index):  # type: ignore[no-untyped-def]
+    if _has_tables(lights):
+        return lambda lights, receiver, index: blockers_of(lights.tables, receiver, index)
     if not _is_linked(lights):
         return lambda lights, receiver, index: np.int32(0)
 
@@ -212,6 +226,8 @@ def emits_to(lights, receiver, hit, geometry):  # type: ignore[no-untyped-def]
 
 @overload(emits_to)
 def _emits_to(lights, receiver, hit, geometry):  # type: ignore[no-untyped-def]
+    if _has_tables(lights):
+        return lambda lights, receiver, hit, geometry: emits_to(lights.tables, receiver, hit, geometry)
     if not _is_linked(lights):
         return lambda lights, receiver, hit, geometry: True
 
@@ -246,6 +262,8 @@ def set_of(lights, face, owner, geometry):  # type: ignore[no-untyped-def]
 
 @overload(set_of)
 def _set_of(lights, face, owner, geometry):  # type: ignore[no-untyped-def]
+    if _has_tables(lights):
+        return lambda lights, face, owner, geometry: set_of(lights.tables, face, owner, geometry)
     if not _is_linked(lights):
         return lambda lights, face, owner, geometry: np.float32(0.0)
 

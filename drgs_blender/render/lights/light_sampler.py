@@ -105,6 +105,10 @@ class Lights:
         Lights that are left out, and why.
     linked : LinkedTables, optional
         What each set of objects gets, where lights are linked (`light_links`); then kernels take it for ``tables``.
+    linked_order : (rows,) int array
+        Which of `lights` each row of ``linked`` is; -1 for a black one.
+    grouped : GroupedTables, optional
+        With the groups, where a frame asks for the light of groups (`light_groups`); then kernels take it.
     parts : list of Lights
         Those of the sets, which keep its memory.
     """
@@ -118,6 +122,8 @@ class Lights:
     ) -> None:
         self.emitters = emitters or _NO_EMITTERS
         self.linked: Any = None
+        self.linked_order: Array = np.empty(0, np.int64)
+        self.grouped: Any = None
         self.parts: list[Lights] = []
         rows: list[Array] = []
         kept: list[int] = []
@@ -366,7 +372,19 @@ def emission_along(origin, direction, hit, geometry, lights):  # type: ignore[no
 
 
 @njit
-def _add_light(i, origin, direction, tmax, others, share, seen_by, lights):  # type: ignore[no-untyped-def]
+def light_along(i, origin, direction, tmax, others, share, seen_by, lights):  # type: ignore[no-untyped-def]
+    """`lights_along` of the light in one row of the table.
+
+    Parameters
+    ----------
+    i : int64
+    origin, direction, tmax, others, share, seen_by, lights : tuple, float32, int64 or LightTables
+        As of `lights_along`.
+
+    Returns
+    -------
+    r, g, b : float32
+    """
     table = lights.table
     flags = np.int64(table[i, FLAGS])
     # What nothing shadows is left to ``sample_light``: only the camera looks at it along rays.
@@ -422,7 +440,7 @@ def lights_along(origin, direction, tmax, others, share, seen_by, lights):  # ty
             continue
         if pick[node, SECOND] == ZERO:
             for i in range(np.int64(pick[node, FIRST]), np.int64(pick[node, PAST])):
-                r, g, b = _add_light(i, origin, direction, tmax, others, share, seen_by, lights)
+                r, g, b = light_along(i, origin, direction, tmax, others, share, seen_by, lights)
                 red, green, blue = red + r, green + g, blue + b
         node += 1
     r, g, b = suns_along(origin, direction, tmax, others, share, seen_by, lights)
@@ -445,7 +463,7 @@ def suns_along(origin, direction, tmax, others, share, seen_by, lights):  # type
     pick = lights.pick
     red, green, blue = ZERO, ZERO, ZERO
     for i in range(np.int64(pick[0, SUNS]), np.int64(pick[0, END])):
-        r, g, b = _add_light(i, origin, direction, tmax, others, share, seen_by, lights)
+        r, g, b = light_along(i, origin, direction, tmax, others, share, seen_by, lights)
         red, green, blue = red + r, green + g, blue + b
     return red, green, blue
 
