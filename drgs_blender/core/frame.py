@@ -401,7 +401,8 @@ class Material:
         """Textures of the material and its parts."""
         names = ("base_colour", "roughness", "metallic", "emission", "alpha")
         found = [getattr(self, f"{name}_texture") for name in names]
-        found += [*self.textures.values(), *(part.texture for part in (*self.details, *self.aovs))]
+        found += [*self.textures.values(), *(detail.texture for detail in self.details)]
+        found += [aov.texture for aov in self.aovs]
         for part in self.parts:
             found += [part.weight_texture, *part.material.all_textures()]
         return [texture for texture in found if texture is not None]
