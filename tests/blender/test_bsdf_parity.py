@@ -16,7 +16,9 @@ ROOT = Path(__file__).resolve().parents[2]
 pytestmark = [
     pytest.mark.blender_api,
     pytest.mark.slow,
-    pytest.mark.skipif(not (ROOT / "drgs_blender/render/bsdf").is_dir(), reason="the engine has no such lobes"),
+    pytest.mark.skipif(
+        not (ROOT / "drgs_blender/render/scene/material_rows.py").exists(), reason="the engine has no such lobes"
+    ),
 ]
 RED, GREEN, BLUE = (0.6, 0.1, 0.05), (0.3, 0.7, 0.3), (0.15, 0.25, 0.6)
 
