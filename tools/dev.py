@@ -66,7 +66,7 @@ SUITES = {
     "engine": suites.Suite("engine", ("tests/unit", "tests/engine"), spread=True),
     "farm": suites.Suite("farm", ("tests/farm",)),
     "blender": suites.Suite(f"Blender {BLENDER}", ("tests/blender",)),
-    FLOOR: suites.Suite(f"Blender {BLENDER_FLOOR}", ("tests/blender",)),
+    FLOOR: suites.Suite(f"Blender {BLENDER_FLOOR}", ("tests/blender",), leaves="judged"),
     LTS: suites.Suite(f"Blender {BLENDER_LTS}", ("tests/blender",)),
     suites.WINDOW: suites.Suite("a window", ("tests/ui",), times=suites.WINDOW_TIMES),
 }

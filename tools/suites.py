@@ -51,12 +51,15 @@ class Suite:
         Whether its files are spread over processes (Blender takes too long to start for that).
     times : int
         How many times longer than others it may take.
+    leaves : str
+        Mark of tests that it leaves to others, unless it is asked for by name.
     """
 
     title: str
     folders: tuple[str, ...]
     spread: bool = False
     times: int = 1
+    leaves: str = ""
 
 
 @dataclass
@@ -200,6 +203,8 @@ def suite_jobs(name: str, suite: Suite, plan: Plan, python: Path, root: Path, fo
         report = folder / f"{own}.xml"
         command = [str(python), "-m", "pytest", "-q", f"--part={part}", f"--lane={lane}", f"--junitxml={report}"]
         command += ["-o", f"cache_dir=.pytest_cache/{own}", "-o", f"faulthandler_timeout={STUCK_SECONDS}"]
+        if suite.leaves and not plan.named and not any("::" in file for file in files):
+            command += ["-m", f"not {suite.leaves}"]
         environment = {}
         if lane == "shared" and suite.spread:
             command += ["-n", str(workers()), "--dist", "loadfile"]

@@ -162,6 +162,7 @@ def furnish(scene) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.judged
 def test_see_through_things_look_as_in_cycles(scene, export):
     furnish(scene)
     parity.set_up(scene, 96, samples=512, bounces=2, subpixels=64)

@@ -397,6 +397,7 @@ def test_what_differs_with_the_view_is_named_and_not_baked(scene, bake, export, 
 
 
 @pytest.mark.slow
+@pytest.mark.judged
 @pytest.mark.parametrize("make", [noise, clear_sky])
 def test_objects_under_a_baked_world_are_lit_as_by_cycles(scene, make, tmp_path):
     """A diffuse and a glossy ball, and the background between them, by F12."""

@@ -10,6 +10,7 @@ from test_composed import CUBE, SIDES, painted
 
 pytestmark = pytest.mark.blender_api
 
+JUDGED = pytest.mark.judged
 WIDTH, HEIGHT = 64, 48
 blur = part("drgs_blender.ipc.blur")
 
@@ -35,7 +36,7 @@ def alpha(scene, engine="DRGS") -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("position", ["START", "CENTER", "END"])
+@pytest.mark.parametrize("position", [*(pytest.param(p, marks=JUDGED) for p in ("START", "END")), "CENTER"])
 def test_motion_blur_is_that_of_cycles(white, ball, position):
     """A ball flies half a metre a frame, its mesh bends meanwhile; the shutter is open for one frame."""
     for number, x in ((0, -0.5), (2, 0.5)):
@@ -66,8 +67,14 @@ def test_motion_blur_is_that_of_cycles(white, ball, position):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape", [{}, {"aperture_blades": 5, "aperture_rotation": 0.4}, {"aperture_ratio": 2.0}])
-@pytest.mark.parametrize("kind", ["PERSP", "ORTHO"])
+@pytest.mark.parametrize(
+    ("kind", "shape"),
+    [
+        ("PERSP", {"aperture_blades": 5, "aperture_rotation": 0.4}),
+        pytest.param("PERSP", {"aperture_ratio": 2.0}, marks=JUDGED),
+        pytest.param("ORTHO", {}, marks=JUDGED),
+    ],
+)
 def test_depth_of_field_is_that_of_cycles(white, ball, kind, shape):
     """The ball is sharp, a cube before it is not: edges of both are as soft as in Cycles."""
     ball.scale = (0.5, 0.5, 0.5)

