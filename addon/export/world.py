@@ -120,9 +120,11 @@ def _read(world: bpy.types.World, camera: bool, warn: Warn, wanted: Wanted | Non
         failure = wanted.failed(made)
         if failure:
             wanted.tell(made, f'World "{world.name}" cannot be baked ({failure}); it is approximated', warn)
-    if made is None or failure:
-        for text in approximations:
+    for text in approximations if made is None or failure else ():
+        if made is None or wanted is None:
             warn(text)
+        else:
+            wanted.tell(made, text, warn)
     return ExportedWorld(_readable(world, light, warn), requests=[made] if made is not None and not failure else [])
 
 
