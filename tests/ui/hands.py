@@ -130,6 +130,19 @@ def key(name: str, window: bpy.types.Window | None = None, **held: bool) -> Doin
     yield 0.2
 
 
+def stop_job(runs: Callable[[], bool]) -> Doing:
+    """Click the cross beside the progress in the status bar, which has no operator to be found by.
+
+    It ends a job as Esc does, which Blender does not hear among simulated events.
+    """
+    width = windows()[0].width
+    for x in range(round(0.5 * width), round(0.7 * width), 12):
+        yield from click((x, 11))
+        if not runs():
+            return
+    yield 1.0
+
+
 def write(text: str, window: bpy.types.Window | None = None) -> Doing:
     """Type letters, then Return."""
     window = window or windows()[0]
