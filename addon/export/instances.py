@@ -95,6 +95,16 @@ def _visibility(
     return Visibility(**rays, holdout=holdout, shadow_catcher=any(o.is_shadow_catcher for o in both))
 
 
+def terminator_offset(obj: bpy.types.Object, warn: Warn = lambda text: None) -> float:
+    """Shadow Terminator Geometry Offset of an object, which before Blender 5.0 was Cycles' own; 0.1 without Cycles."""
+    owners = obj, getattr(obj, "cycles", None)
+    for owner in owners:
+        if getattr(owner, "shadow_terminator_shading_offset", 0.0) or getattr(owner, "shadow_terminator_offset", 0.0):
+            warn(f'"{obj.name}": its Shadow Terminator Shading Offset is not rendered; its Geometry Offset is')
+    names = (getattr(owner, "shadow_terminator_geometry_offset", None) for owner in owners)
+    return float(next((value for value in names if value is not None), 0.1))
+
+
 class Unrendered:
     """Counts what is visible and cannot be rendered."""
 

@@ -14,7 +14,7 @@ from ...drgs_blender.core.frame import Image, Layer, MeshState
 from .. import mesh_arrays
 from ..bakes.requests import Wanted
 from .export_cache import ExportCache, uid
-from .instances import Key, Visible
+from .instances import Key, Visible, terminator_offset
 from .light_links import LightLinks
 from .materials import DEFAULT_MATERIAL, ExportedMaterial, Materials
 from .surface_bake import SurfaceBakes
@@ -86,6 +86,7 @@ class Meshes:
             self._with_uv_map,
             self._materials.aovs,
             obj.lightgroup,
+            terminator_offset(obj),
             *sent.values(),
         )
         shape = self._shapes.get(key)
@@ -175,6 +176,7 @@ class Meshes:
             visibility=item.visibility,
             layers=self._layers(item.object.name, mesh, (corners, polygons, arrays.corner_vertices), exported),
             light_group=item.object.lightgroup,
+            terminator_offset=terminator_offset(item.object, self._warn),
             **self._links.numbers_of(item),
         )
 

@@ -16,7 +16,7 @@ from ...drgs_blender.core.passes import Pass
 from .. import assets, cache_playback, mesh_arrays, point_caches
 from .aov_nodes import aov_values
 from .export_cache import ExportCache, uid
-from .instances import Key, Visible
+from .instances import Key, Visible, terminator_offset
 from .materials import finite
 from .surface_nodes import SurfaceWalker
 from .topology_check import check_modifiers, check_topology
@@ -69,6 +69,7 @@ class DrgsObjects:
                 visibility=item.visibility,
                 captured_colours=obj.drgs.captured_colours,
                 light_group=obj.lightgroup,
+                terminator_offset=terminator_offset(obj, self._warn),
                 aovs=_aovs(material, obj, self._aovs, self._warn) if material is not None and self._aovs else [],
             )
         )

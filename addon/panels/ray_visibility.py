@@ -26,6 +26,10 @@ class DRGS_PT_rays(bpy.types.Panel):
         if obj.type != "LIGHT":
             column.prop(obj, "visible_shadow", text="Shadow")
             column.prop(obj, "is_shadow_catcher")
+            name = "shadow_terminator_geometry_offset"
+            owner = obj if hasattr(obj, name) else getattr(obj, "cycles", None)  # the latter before Blender 5.0
+            if owner is not None and hasattr(owner, name):
+                column.prop(owner, name, text="Terminator Offset")
         _light_group(layout, obj, context.view_layer)
 
 

@@ -149,7 +149,10 @@ class _Reader:
             module, _, name = word.partition(":")
             found = _lookup(module, name)
             if self.at < len(self.tokens) and self.tokens[self.at] == "(":
-                return types.BaseTuple.from_types(tuple(self.group()), found)
+                parts = tuple(self.group())
+                if len(parts) != len(found._fields):
+                    raise LookupError(f"{word} has {len(found._fields)} fields by now, not {len(parts)}")
+                return types.BaseTuple.from_types(parts, found)
             return types.Dispatcher(found)
         return _scalar(word)
 

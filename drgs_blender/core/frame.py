@@ -159,6 +159,8 @@ class ObjectState:
         Without textures.
     light_group : str
         To which belongs what it emits; "": none.
+    terminator_offset : float
+        Blender's Shadow Terminator Geometry Offset, in [0, 1]; 0: off.
     """
 
     name: str
@@ -178,6 +180,7 @@ class ObjectState:
     captured_colours: bool = False
     aovs: list[ShaderAOV] = field(default_factory=list)
     light_group: str = ""
+    terminator_offset: float = 0.0
 
 
 @dataclass(slots=True)
@@ -479,6 +482,8 @@ class MeshState:
         Light linking of what it emits, see `Visibility`.
     light_group : str
         To which belongs what it emits; "": none.
+    terminator_offset : float
+        Blender's Shadow Terminator Geometry Offset, in [0, 1]; 0: off.
     """
 
     name: str
@@ -496,6 +501,7 @@ class MeshState:
     receivers: int = -1
     blockers: int = -1
     light_group: str = ""
+    terminator_offset: float = 0.0
 
 
 @dataclass(slots=True)

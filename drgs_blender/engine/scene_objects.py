@@ -170,6 +170,7 @@ def traced_object(state: ObjectState, asset: Asset, seen_only: bool = False) -> 
         visibility=state.visibility,
         seen_only=seen_only,
         torn=torn if torn is not None and torn.any() else None,
+        terminator_offset=state.terminator_offset,
     )
 
 

@@ -33,6 +33,7 @@ from .gbuffer.visible_lights import visible_lights
 from .integrator.adaptive import part_count, sample_adaptively
 from .integrator.variance import variances
 from .prepared_scene import PreparedScene
+from .scene.terminator import terminators
 from .shading_points import RECEIVER, UNLIT, Radiance, ShadingPoints
 from .surfels import captured
 from .surfels.raster import SurfelSamples
@@ -204,6 +205,10 @@ class VisibleSurfaces:
     def rows(self, y0: int, y1: int) -> GBuffer:
         """The samples of the rows ``y0 .. y1`` of the full picture."""
         buffer = self._rows(y0, y1)
+        geometry, points = self._scene.geometry, buffer.points
+        if geometry.terminators:
+            tied = buffer.face, buffer.instance, buffer.barycentric, points.geometric_normal
+            points.terminator = terminators(*tied, geometry)
         if self._receiver is not None:
             sets = self._receiver[self._scene.source[buffer.object_index]]
             buffer.points.flags |= (sets << RECEIVER).astype(np.uint8)

@@ -43,6 +43,7 @@ class PointArrays(NamedTuple):
     own: Array
     size: Array
     smooth: Array
+    terminator: Array
 
 
 @dataclass(slots=True)
@@ -78,6 +79,9 @@ class ShadingPoints:
         Metres: mean larger standard deviation of these surfels; as long as ``own``.
     smooth : (n, 3) float32 array
         Unit: shading normal without normal and bump maps, or 0 where it is ``normal``; empty in a scene without such.
+    terminator : (n, 4) float32 array
+        Where shadow rays of grazing light start, see `scene.terminator.terminator_at`; empty where everything has its
+        rays start at ``origin``.
     """
 
     pixel: Array
@@ -94,6 +98,7 @@ class ShadingPoints:
     own: Array = field(default_factory=lambda: np.zeros(0, np.int32))
     size: Array = field(default_factory=lambda: np.zeros(0, np.float32))
     smooth: Array = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    terminator: Array = field(default_factory=lambda: np.zeros((0, 4), np.float32))
 
     def __post_init__(self) -> None:
         self.pixel = np.ascontiguousarray(self.pixel, np.int32)
@@ -105,6 +110,7 @@ class ShadingPoints:
         self.own = np.ascontiguousarray(self.own, np.int32)
         self.size = as_float(self.size, (len(self.own),), "shading point size")
         self.smooth = as_float(self.smooth, (len(self.smooth), 3), "shading point smooth")
+        self.terminator = as_float(self.terminator, (len(self.terminator), 4), "shading point terminator")
 
     def __len__(self) -> int:
         return len(self.pixel)

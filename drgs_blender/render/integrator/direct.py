@@ -139,6 +139,8 @@ def _trace_lights(rays, count, scene, settings, sums):  # type: ignore[no-untype
     w.evaluate(rays, count, settings.shading_model)
     if scene.traits.detailed:
         w.soften(rays, count)
+    if scene.geometry.terminators != 0:
+        w.terminate(rays, count)
     mask = np.int32(ray_masks.SHADOW << settings.shift)
     for slot in range(count):
         i, c = w.at(slot)
@@ -175,6 +177,8 @@ def _trace_envmap(rays, count, scene, settings, sums):  # type: ignore[no-untype
     w.evaluate(rays, count, settings.shading_model)
     if scene.traits.detailed:
         w.soften(rays, count)
+    if scene.geometry.terminators != 0:
+        w.terminate(rays, count)
     if scene.traits.lobes_apart:
         mis.balance_heuristic_per_lobe(rays, count)
     else:

@@ -20,6 +20,7 @@ from ..lights.light_shapes import DIFFUSE, GLOSSY
 from ..lights.product_sampling import product_row
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
+from ..scene.terminator import terminator_at
 from . import brdf, mis
 from . import wavefront as w
 from .group_sums import clear_groups, credit_lamps_of_path, credit_path
@@ -71,6 +72,11 @@ def _surfaces(rays, count, scene, settings):  # type: ignore[no-untyped-def]
         )
         if scene.traits.detailed:
             s[a + w.UX], s[a + w.UY], s[a + w.UZ] = ux, uy, uz
+        if geometry.terminators != 0:
+            face, instance = np.int32(ints[c + w.N0]), np.int32(ints[c + w.N1])
+            s[a + w.HX], s[a + w.HY], s[a + w.HZ], s[a + w.LIMIT] = terminator_at(
+                face, instance, s[a + w.MU], s[a + w.MV], gx, gy, gz, geometry
+            )
         mx, my, mz = brdf.glossy_normal(nx, ny, nz, gx, gy, gz, vx, vy, vz)
         s[a + w.NX], s[a + w.NY], s[a + w.NZ] = nx, ny, nz
         s[a + w.MX], s[a + w.MY], s[a + w.MZ] = mx, my, mz
@@ -151,6 +157,7 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
         mask = np.int32((ray_masks.DIFFUSE if diffuse else ray_masks.GLOSSY) << shift)
         ends = last and not any_lights and not emissive
         if ends:
+            s[i + w.MOVED] = ZERO
             through = passed(scene, rays, slot, FAR, mask)
         else:
             through, reach, hit = meet(scene, rays, slot, mask)
@@ -230,12 +237,16 @@ def trace_paths(rays, count, scene, settings, found):  # type: ignore[no-untyped
             w.fresh_numbers(rays, count, GOLDEN)
             w.environment_directions(rays, count, envmap)
             _evaluate(rays, count, scene, shading_model)
+            if scene.geometry.terminators != 0:
+                w.terminate(rays, count)
             mis.path_weights(rays, count, ONE)
             _towards_envmap(rays, count, scene, shift, found)
         if scene.traits.lights:
             w.fresh_numbers(rays, count, U(0x2C1B3C6D))
             w.light_directions(rays, count, lights, w.PATH_SET)
             _evaluate(rays, count, scene, shading_model)
+            if scene.geometry.terminators != 0:
+                w.terminate(rays, count)
             _towards_lights(rays, count, scene, shift, found)
         w.fresh_numbers(rays, count, U(0x7FEB352D))
         w.brdf_directions(rays, count)

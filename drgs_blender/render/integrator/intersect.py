@@ -8,6 +8,7 @@ environment; where a mesh lies behind them, chance decides which of the two the 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -116,6 +117,36 @@ def ray_of(rays, slot, far, mask):  # type: ignore[no-untyped-def]
 
 
 @njit
+def shadow_ray_of(rays, slot, far, mask):  # type: ignore[no-untyped-def]
+    """`ray_of` towards the same place from where `wavefront.terminate` lets it start.
+
+    Parameters
+    ----------
+    rays, slot, far, mask : Batch, int64, float32 or int32
+        As of `ray_of`; MOVED and H are read, too.
+
+    Returns
+    -------
+    Ray
+    """
+    ray = ray_of(rays, slot, far, mask)
+    s = rays.floats
+    i, _ = w.at(slot)
+    part = s[i + w.MOVED]
+    if not part > ZERO:
+        return ray
+    hx, hy, hz = part * s[i + w.HX], part * s[i + w.HY], part * s[i + w.HZ]
+    (ox, oy, oz), (dx, dy, dz) = ray.origin, ray.direction
+    origin = ox + hx, oy + hy, oz + hz
+    if not far < FAR:
+        return Ray(origin, ray.direction, ZERO, far, mask)
+    dx, dy, dz = far * dx - hx, far * dy - hy, far * dz - hz
+    far = math.sqrt(dx * dx + dy * dy + dz * dz)
+    scale = ONE / max(far, F(1e-30))
+    return Ray(origin, (dx * scale, dy * scale, dz * scale), ZERO, far, mask)
+
+
+@njit
 def _start_of(rays, slot):  # type: ignore[no-untyped-def]
     """The surface that a slot's ray starts on."""
     s, ints = rays
@@ -139,7 +170,7 @@ def passed_meshes(scene, rays, slot, far, mask):  # type: ignore[no-untyped-def]
     float32
         Visibility; 0 or 1 where light passes no mesh.
     """
-    ray = ray_of(rays, slot, far, mask)
+    ray = shadow_ray_of(rays, slot, far, mask)
     hidden = shadowed(scene.tracer, ray)
     if scene.traits.clear:
         if hidden:
@@ -164,7 +195,7 @@ def passed(scene, rays, slot, far, mask):  # type: ignore[no-untyped-def]
         0 behind an opaque mesh, else the transmittance of the surfels, see `surfel_tracer.transmittance`, and of
         meshes that light may pass.
     """
-    tracer, ray = scene.tracer, ray_of(rays, slot, far, mask)
+    tracer, ray = scene.tracer, shadow_ray_of(rays, slot, far, mask)
     if shadowed(tracer, ray):
         return ZERO
     share = ONE

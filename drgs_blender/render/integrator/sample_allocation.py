@@ -115,7 +115,8 @@ def put_sample(scene, rays, slot, points, i, state, h, rate):  # type: ignore[no
     ----------
     scene : Scene
     rays : Batch
-        Written: fields from OX to KD, WC to WL, OWNER, those of `put_start`, and U where there are normal maps.
+        Written: fields from OX to KD, WC to WL, OWNER, those of `put_start`, U where there are normal maps, and H and
+        LIMIT where there are terminator offsets.
     slot : int64
     points : PointArrays
     i : int64
@@ -146,4 +147,7 @@ def put_sample(scene, rays, slot, points, i, state, h, rate):  # type: ignore[no
         if len(points.smooth) > 0:
             smooth = points.smooth
             s[a + w.UX], s[a + w.UY], s[a + w.UZ] = smooth[i, 0], smooth[i, 1], smooth[i, 2]
+    if len(points.terminator) > 0:
+        moved = points.terminator
+        s[a + w.HX], s[a + w.HY], s[a + w.HZ], s[a + w.LIMIT] = moved[i, 0], moved[i, 1], moved[i, 2], moved[i, 3]
     put_start(scene.tracer, rays, slot, points, i)

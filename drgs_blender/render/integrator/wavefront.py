@@ -41,7 +41,9 @@ TR, TG, TB, SHARE, ER, EG, EB = (LANES * i for i in range(36, 43))
 WC, WG, WE, WL, SIZE = (LANES * i for i in range(43, 48))
 # where there are normal or bump maps: the shading normal without them, 0 where it is N
 UX, UY, UZ = (LANES * i for i in range(48, 51))
-PACKET_FLOATS = 51 * LANES
+# where smooth meshes have a terminator offset: see `scene.terminator`, and the part of it that a shadow ray gets
+HX, HY, HZ, LIMIT, MOVED = (LANES * i for i in range(51, 56))
+PACKET_FLOATS = 56 * LANES
 #: Where lights are linked, the set of the surface: of a point's samples, which have no throughput, and of paths.
 POINT_SET, PATH_SET = TR, WL
 # uint32 fields: three random numbers, the key of more, the owner (a point, or a path), a place in a table, the row of
@@ -55,7 +57,7 @@ IN_LANES = (
     "AR", "AG", "AB", "METALLIC", "A2", "KD",
     "LX", "LY", "LZ", "LIVE", "QR", "QG", "QB", "SR", "SG", "SB", "PC", "PG",
     "MU", "MV", "PE", "TR", "TG", "TB", "SHARE", "ER", "EG", "EB", "WC", "WG", "WE", "WL", "SIZE",
-    "UX", "UY", "UZ", "POINT_SET", "PATH_SET",
+    "UX", "UY", "UZ", "HX", "HY", "HZ", "LIMIT", "MOVED", "POINT_SET", "PATH_SET",
     "N0", "N1", "N2", "KEY", "OWNER", "CELL", "ROW", "OWN",
 )  # fmt: skip
 
@@ -67,8 +69,8 @@ class Batch(NamedTuple):
 
     Attributes
     ----------
-    floats : (packets * 51 * LANES,) float32 array
-        Fields from OX to UZ.
+    floats : (packets * 56 * LANES,) float32 array
+        Fields from OX to MOVED.
     ints : (packets * 8 * LANES,) uint32 array
         Fields from N0 to OWN.
     """
@@ -358,8 +360,7 @@ def warm(rays, count, envmap):  # type: ignore[no-untyped-def]
 def evaluate(rays, count, shading_model):  # type: ignore[no-untyped-def]
     """BRDF of both lobes times cosine, pdfs of cosine and GGX sampling, and LIVE: whether any light can pass.
 
-    Light passes only above both the geometric and the shading normal: the shadow terminator of coarse meshes shows
-    their faces, and is not softened.
+    Light passes only above both the geometric and the shading normal; of light samples `terminate` decides anew.
 
     Parameters
     ----------
@@ -426,6 +427,44 @@ def soften(rays, count):  # type: ignore[no-untyped-def]
             g = TWO / (ONE + math.sqrt(ONE + a2 * (ONE - up) / up)) if facing > ZERO else ZERO
             g = g if ux * ux + uy * uy + uz * uz > ZERO else ONE
             s[i + QR], s[i + QG], s[i + QB] = s[i + QR] * g, s[i + QG] * g, s[i + QB] * g
+
+
+@njit
+def terminate(rays, count):  # type: ignore[no-untyped-def]
+    """Light samples of smooth meshes: where their shadow rays start, and whether there is light below the face.
+
+    As in Cycles the diffuse lobe gets light that is above the smooth normal alone, as far as the shadow ray passes; the
+    other strategies draw none of it. See `scene.terminator`.
+
+    Parameters
+    ----------
+    rays : Batch
+        G, N or U, LIMIT and LX, LY, LZ are read, and the results of `evaluate`. Written: MOVED, LIVE, and where light
+        is below the face SR, SG, SB, PC, PG.
+    count : int64
+        Slots.
+    """
+    s = rays.floats
+    for p in range(packets(count)):
+        for i in range(p * PACKET_FLOATS, p * PACKET_FLOATS + LANES):
+            lx, ly, lz, limit = s[i + LX], s[i + LY], s[i + LZ], s[i + LIMIT]
+            ux, uy, uz = s[i + UX], s[i + UY], s[i + UZ]
+            own = ux * ux + uy * uy + uz * uz > ZERO
+            ux, uy, uz = ux if own else s[i + NX], uy if own else s[i + NY], uz if own else s[i + NZ]
+            nl, gl = ux * lx + uy * ly + uz * lz, s[i + GX] * lx + s[i + GY] * ly + s[i + GZ] * lz
+            inverse = ONE / max(limit, _TINY)
+            moved = TWO - (gl + nl) * inverse if nl < limit else ONE - gl * inverse
+            moved = min(max(moved, ZERO), ONE)
+            any_light = limit > ZERO and nl > ZERO
+            s[i + MOVED] = moved if any_light else ZERO
+            below = any_light and gl <= ZERO
+            s[i + SR] = ZERO if below else s[i + SR]
+            s[i + SG] = ZERO if below else s[i + SG]
+            s[i + SB] = ZERO if below else s[i + SB]
+            s[i + PC] = ZERO if below else s[i + PC]
+            s[i + PG] = ZERO if below else s[i + PG]
+            live = (ONE if s[i + QR] + s[i + QG] + s[i + QB] > ZERO else ZERO) if below else s[i + LIVE]
+            s[i + LIVE] = ZERO if limit > ZERO and nl <= ZERO else live
 
 
 @njit

@@ -250,6 +250,7 @@ def _tables(emitters):  # type: ignore[no-untyped-def]
     geometry = Geometry(
         load_int64(e, 9), load_int64(e, 10), load_int64(e, 11), load_int64(e, 12), load_int64(e, 13),
         load_int64(e, 14), load_int64(e, 15), load_int64(e, 16), load_int64(e, 17), load_int64(e, 18),
+        np.int64(0),
     )  # fmt: skip
     return EmitterTables(tree, load_int64(e, 5), load_int64(e, 6), load_int64(e, 7), load_int64(e, 8), geometry)
 

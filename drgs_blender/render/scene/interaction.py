@@ -68,6 +68,8 @@ class Geometry(NamedTuple):
         (p,) int32.
     materials : int
         (11,) int64, ``mesh_materials.MeshMaterials.addresses``.
+    terminators : int
+        (4,) int64, addresses of `terminator`, or 0 where no object has an offset.
     """
 
     shading_faces: int
@@ -80,6 +82,7 @@ class Geometry(NamedTuple):
     instance_normal: int
     instance_object: int
     materials: int
+    terminators: int
 
 
 @njit

@@ -51,6 +51,8 @@ class TraceObject:
         Whether only the camera meets its triangles, light its surfels.
     torn : (m,) bool array, optional
         Faces that no ray meets.
+    terminator_offset : float
+        See `terminator`.
     """
 
     name: str
@@ -64,6 +66,7 @@ class TraceObject:
     visibility: Visibility = field(default_factory=Visibility)
     seen_only: bool = False
     torn: Array | None = None
+    terminator_offset: float = 0.0
 
 
 @dataclass(slots=True)

@@ -21,6 +21,7 @@ from .interaction import Geometry, Tracer
 from .mesh_layers import Placements
 from .mesh_materials import EmissiveMesh, MeshMaterials
 from .ray_masks import object_flags
+from .terminator import TerminatorOffsets
 from .trace_mesh import (
     Part,
     TraceObject,
@@ -123,6 +124,7 @@ class TraceScene:
         self._instance_normal: Array = np.empty((0, 3, 3), np.float32)
         self.instance_object: Array = np.empty(0, np.int32)
         self._first_instance: Array = np.zeros(1, np.int32)
+        self._offsets = TerminatorOffsets()
 
     @property
     def vertices(self) -> Array:
@@ -161,6 +163,7 @@ class TraceScene:
             address_of(self._instance_normal),
             address_of(self.instance_object),
             address_of(tables),
+            self._offsets.at(address_of, self.vertices, self.faces, self.instances),
         )
 
     def world_triangles(self) -> tuple[Array, Array]:
@@ -178,8 +181,7 @@ class TraceScene:
     @property
     def emissive_meshes(self) -> list[EmissiveMesh]:
         """Emissive surfaces, in the order of the scene's faces."""
-        found: list[EmissiveMesh] = []
-        materials = self.mesh_materials
+        found, materials = list[EmissiveMesh](), self.mesh_materials
         if not materials.table.emissive:
             return found
         emissive = np.any(materials.table.arrays[0][:, 5:] > 0.0, axis=1)
@@ -342,6 +344,7 @@ class TraceScene:
         counts = [0] * len(objects) + [len(p.matrices) if p.instanced else 0 for p in where]
         self.source = np.concatenate([np.arange(len(seen)), np.repeat(np.arange(len(seen)), counts)])
         self.object_flags = flags[self.source]
+        self._offsets.take(objects, meshes, self.source)
         self.any_ordinary = any(mesh.visibility.camera and len(p.matrices) > 0 for mesh, p in zip(meshes, where))
 
     def _commit(
