@@ -97,7 +97,7 @@ def _visibility(
 
 def terminator_offset(obj: bpy.types.Object, warn: Warn = lambda text: None) -> float:
     """Shadow Terminator Geometry Offset of an object, which before Blender 5.0 was Cycles' own; 0.1 without Cycles."""
-    owners = obj, getattr(obj, "cycles", None)
+    owners = obj, getattr(obj.original, "cycles", None)  # whose changes alone do not evaluate the object again
     for owner in owners:
         if getattr(owner, "shadow_terminator_shading_offset", 0.0) or getattr(owner, "shadow_terminator_offset", 0.0):
             warn(f'"{obj.name}": its Shadow Terminator Shading Offset is not rendered; its Geometry Offset is')

@@ -42,7 +42,7 @@ class DRGS_PT_world_group(bpy.types.Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return context.engine == "DRGS" and context.world is not None
+        return context.engine == "DRGS" and getattr(context, "world", None) is not None
 
     def draw(self, context: bpy.types.Context) -> None:
         self.layout.use_property_split = True
