@@ -54,6 +54,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[object]]]:
     yield "surface passes", [*own, "surface passes", folder]
     yield "panorama", [*own, "panorama", folder]
     yield "linked lights", [*own, "linked lights", folder]
+    yield "light groups", [*own, "light groups", folder]
     yield "surfel rays", [*relight, "--rays-see", "surfels"]
     for solver in ("mpm", "xpbd", "rigid"):
         yield "simulate", [*drgs, "simulate", asset, "--solver", solver, "--resolution", "12", "--frames", "3",
@@ -151,6 +152,9 @@ def engine(folder: Path, what: str) -> None:
         elif what == "linked lights":
             lit = [Light("lamp", "point", matrix, receivers=0, blockers=0)]
             client.render(replace(frame, lights=lit))
+        elif what == "light groups":
+            lit = [Light("lamp", "point", matrix, light_group="key")]
+            client.render(replace(frame, lights=lit, passes=("Combined", "Combined_key")))
         elif what == "viewport":
             for denoise in ("none", "svgf"):
                 seen = replace(frame, settings=replace(settings, denoise=denoise))

@@ -149,18 +149,6 @@ class SurfaceWalker(MixingWalker):
     def single(self, output: SocketRef, kind: str) -> Surface:
         return Surface((Part(self.bsdf(output, kind)),), details=self.normal_of(output))
 
-    def check_distribution(self, node: bpy.types.Node, roughness: SocketValue, metallic: SocketValue) -> None:
-        """Say how much light rough metals lack where Cycles would give back what is lost between microfacets."""
-        if node.distribution != "MULTI_GGX" or metallic.black:
-            return
-        rough, metal = (
-            float(value.colour[0]) * (1 if value.texture is None else float(self.mean(value.texture)[0]))
-            for value in (roughness, metallic)
-        )
-        lost = float(np.interp(rough, *_LOST)) * metal
-        if lost > _SMALL_LOSS:
-            self.note(node, f"Multiscatter GGX is rendered as GGX; this rough metal is some {lost:.0%} darker by that")
-
     def shader_bsdf_diffuse(self, output: SocketRef) -> Surface:
         return self.single(output, "diffuse")
 
