@@ -18,6 +18,7 @@ from .gbuffer.camera_hits import MeshHits, shade_mesh, trace_camera
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.surfels import tie_to_mesh
 from .integrator.integrate import integrate
+from .integrator.paths import PathKernel
 from .lights.environment import EnvironmentLight
 from .lights.light_sampler import Lights
 from .scene.trace_scene import TraceScene
@@ -29,6 +30,11 @@ from .surfels.surfel_bvh import SurfelBVH
 Array = np.ndarray
 Arrays = tuple[Array, ...]
 T = TypeVar("T")
+
+
+def needs_paths(scene: TraceScene, settings: RenderSettings) -> bool:
+    """Whether surfaces have more lobes than two, so that light is solved by `integrator.paths`."""
+    return scene.mesh_materials.table.rows is not None and settings.shading_model == "principled"
 
 
 class RenderBackend:
@@ -57,8 +63,12 @@ class RenderBackend:
         noise_index: int, lights: Lights | None = None, part: tuple[int, int] = (0, 1), *,
         surfels: SurfelBVH | None = None,
     ) -> Radiance:  # fmt: skip
-        """`integrator.integrate.integrate`."""
-        return integrate(scene, environment, points, settings, noise_index, lights, part, surfels=surfels)
+        """`integrator.integrate.integrate`, with the kernel that the scene's materials need."""
+        rows = scene.mesh_materials.table.rows
+        kernel = PathKernel(rows) if rows is not None and needs_paths(scene, settings) else None
+        return integrate(
+            scene, environment, points, settings, noise_index, lights, part, surfels=surfels, kernel=kernel
+        )
 
     def prepare(self, posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
         """`surfels.splats.prepare`."""

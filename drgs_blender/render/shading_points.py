@@ -82,6 +82,11 @@ class ShadingPoints:
     terminator : (n, 4) float32 array
         Where shadow rays of grazing light start, see `scene.terminator.terminator_at`; empty where everything has its
         rays start at ``origin``.
+    face, instance : (n,) int32 array
+        Face and instance of the mesh, as `interaction.nearest` numbers them; face -1: none. Empty where not known: then
+        all surfaces have two lobes.
+    place : (n, 2) float32 array
+        Barycentric coordinates of the face's second and third corner.
     """
 
     pixel: Array
@@ -99,6 +104,9 @@ class ShadingPoints:
     size: Array = field(default_factory=lambda: np.zeros(0, np.float32))
     smooth: Array = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     terminator: Array = field(default_factory=lambda: np.zeros((0, 4), np.float32))
+    face: Array = field(default_factory=lambda: np.zeros(0, np.int32))
+    instance: Array = field(default_factory=lambda: np.zeros(0, np.int32))
+    place: Array = field(default_factory=lambda: np.zeros((0, 2), np.float32))
 
     def __post_init__(self) -> None:
         self.pixel = np.ascontiguousarray(self.pixel, np.int32)
@@ -111,6 +119,9 @@ class ShadingPoints:
         self.size = as_float(self.size, (len(self.own),), "shading point size")
         self.smooth = as_float(self.smooth, (len(self.smooth), 3), "shading point smooth")
         self.terminator = as_float(self.terminator, (len(self.terminator), 4), "shading point terminator")
+        self.face = np.ascontiguousarray(self.face, np.int32)
+        self.instance = np.ascontiguousarray(self.instance, np.int32)
+        self.place = np.ascontiguousarray(self.place, np.float32)
 
     def __len__(self) -> int:
         return len(self.pixel)
@@ -146,6 +157,8 @@ class Radiance:
         luminance, diffuse and glossy; may be empty.
     groups : (n, g, 3) float32 array, optional
         The part of the sum of each light group that is asked for, and of all light that belongs to none.
+    transmitted : (n, 2, 3) float32 array, optional
+        The part of the two glossy components, direct and indirect, that surfaces let pass; None: no surface does.
     """
 
     components: Array
@@ -153,6 +166,7 @@ class Radiance:
     unshadowed: Array | None = None
     moments: Array = field(default_factory=lambda: np.zeros((0, 5), np.float32))
     groups: Array | None = None
+    transmitted: Array | None = None
 
     @classmethod
     def dark(cls, n: int) -> Radiance:

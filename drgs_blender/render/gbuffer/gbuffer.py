@@ -148,6 +148,7 @@ def compact(
     points.smooth = np.zeros((n if detailed else 0, 3), np.float32)
     emission = np.zeros((n, 3), np.float32)
     tied = face, instance, np.empty((n, 2), np.float32)
+    points.face, points.instance, points.place = tied
     return GBuffer((y0, y0 + len(alpha)), points, position, depth, owner, emission, *tied, alpha)
 
 

@@ -12,7 +12,7 @@ from ...compute.warp.kernels import Launcher
 from ...core.asset.model import PosedSurfels
 from ...core.errors import DeviceError
 from ...core.frame import Camera
-from ..backend import RenderBackend, T
+from ..backend import RenderBackend, T, needs_paths
 from ..denoise.demodulation import Signal
 from ..denoise.svgf_temporal import NoisyPicture
 from ..film.guides import Guides
@@ -52,9 +52,8 @@ class WarpRenderBackend(RenderBackend):
 
     def integrate(self, *arguments: Any, surfels: SurfelBVH | None = None) -> Radiance:
         on_cpu = super().integrate
-        if surfels is not None or any(
-            getattr(given, "linked", None) or getattr(given, "grouped", None) for given in arguments
-        ):
+        others = any(getattr(given, "linked", None) or getattr(given, "grouped", None) for given in arguments)
+        if surfels is not None or others or needs_paths(arguments[0], arguments[3]):
             return on_cpu(*arguments, surfels=surfels)
         return self.with_fallback(lambda: integrate(*arguments, kernel=self._kernel), lambda: on_cpu(*arguments))
 

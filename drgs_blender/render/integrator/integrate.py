@@ -58,6 +58,10 @@ class ShadingKernel:
             lights.grouped or lights.linked or lights.tables,
         )
 
+    def light(self, points: ShadingPoints, scene: Scene, settings: Settings, sampler: Sampler, found: Radiance) -> None:
+        """Write the light of all points to `found`."""
+        self.shade(points.arrays, scene, settings, sampler, (found.components, found.moments))
+
     def shade(
         self, points: PointArrays, scene: Scene, settings: Settings, sampler: Sampler, out: tuple[Array, Array]
     ) -> None:
@@ -147,7 +151,7 @@ def integrate(
     sampler = Sampler._make([seed, sequence, settings.subpixel_count, *part, auto, *map(F, counts), *shares])
 
     def run(some: ShadingPoints, shift: int, found: Radiance) -> None:
-        kernel.shade(some.arrays, given, how._replace(shift=shift), sampler, (found.components, found.moments))
+        kernel.light(some, given, how._replace(shift=shift), sampler, found)
 
     groups = 0 if lights.grouped is None else lights.grouped.number
     out.moments = np.zeros((n, MOMENTS + 3 * groups), np.float32)

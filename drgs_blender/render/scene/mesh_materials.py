@@ -11,7 +11,7 @@ import numpy as np
 from ...core.arrays import Array
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
-from ...core.frame import Image, MeshState
+from ...core.frame import Image, Material, MeshState
 from ..memory import AddressOf, address
 from .mesh_layers import MeshLayers, Placements
 from .textures import MaterialTable
@@ -166,7 +166,7 @@ class MeshMaterials:
                 self.uvs[rows] = as_float(mesh.uvs, (len(part.faces), 3, 2), f"texture coordinates of {mesh.name}")
         self._first = first
         of_mesh = {part.source - first_source: part for part in parts if isinstance(part.item, MeshState)}
-        detailed = [any(material.details for material in mesh.materials) for mesh in meshes]
+        detailed = [any(_has_frame(material) for material in mesh.materials) for mesh in meshes]
         self.layers.update(of_mesh, meshes, detailed, placed)
         self._first_face, self._tables = first_face, self.layers.tables(first_face)
         self.table.take_layers(self._tables[0])
@@ -202,6 +202,12 @@ class MeshMaterials:
                 found[rows, :, :2] = as_float(mesh.uv_map, (rows.stop - rows.start, 3, 2), f"UV map of {mesh.name}")
                 found[rows, :, 2] = 1
         return found
+
+
+def _has_frame(material: Material) -> bool:
+    """Whether shading needs the frame of its mesh: for maps of normals, and for highlights that follow tangents."""
+    anisotropic = material.anisotropy != 0.0 or any(part.material.anisotropy != 0.0 for part in material.parts)
+    return bool(material.details) or anisotropic
 
 
 def _material_index(mesh: MeshState, count: int) -> Array | int:

@@ -40,6 +40,7 @@ from .detailed_normal import (
     TANGENTS,
     TEXTURE,
 )
+from .material_rows import material_rows
 from .shader_aovs import aov_tables
 from .texture_lookup import (
     BRIGHTEST,
@@ -141,6 +142,8 @@ class MaterialTable:
         Whether anything emits light.
     aovs : dict of str to (tuple of array)
         Of `shader_aovs.aov_tables`.
+    rows : MaterialRows or None
+        Materials with more lobes than two; None: there are none.
     warnings : list of str
         Problems and their substitutes, in words.
     """
@@ -177,6 +180,7 @@ class MaterialTable:
             slots[i, STEPS] = len(self._steps) - slots[i, FIRST_STEP]
             slots[i, FRAME] = frames[i] if len(frames) else 0
         self.aovs = aov_tables(materials, self._add_texture, self.warnings)
+        self.rows = material_rows(materials, self._add_texture, layer_row, self.warnings)
         self.detailed = bool(self._steps)
         self.arrays = (
             constants,

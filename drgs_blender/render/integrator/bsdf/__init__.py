@@ -1,0 +1,1 @@
+"""The general BSDF: Blender's Principled BSDF whole and its pure BSDFs, as a list of weighted lobes."""

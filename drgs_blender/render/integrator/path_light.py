@@ -1,0 +1,282 @@
+"""Light at a vertex of a path: the environment and the light sample, and what a ray of the BSDF meets; for `paths`."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...compute.jit import njit
+from ..lights.environment import cell_at, cell_end, direction_in_cell, envmap_pdf, envmap_radiance, first_cell, map_at
+from ..lights.light_links import emits_to, lights_of
+from ..lights.light_sampler import emission_along, lights_along, sample_light
+from ..lights.light_shapes import DIFFUSE, GLOSSY
+from ..lights.product_sampling import block_of, in_cells_order
+from ..sampling import ONE, ZERO, U, mix
+from ..scene import ray_masks
+from . import wavefront as w
+from .bsdf.lobes import evaluate
+from .bsdf.surface_lobes import bump_shadow
+from .indirect import lifted
+from .intersect import FAR, light_radiance, passed
+
+Array = np.ndarray
+
+
+class Scratch(NamedTuple):
+    """Memory of one thread.
+
+    Attributes
+    ----------
+    rays : Batch
+        The ray at hand, in slot 0.
+    lobes, parameters : float32 array
+        See `bsdf`.
+    value : (9,) float32 array
+        BSDF times cosine by class of light.
+    carried : (9,) float32 array
+        BSDF times cosine over pdf at the shading point, by class of light.
+    direct : (9,) float32 array
+        Light that the shading point sends to the viewer, found straight from it.
+    indirect : (3,) float32 array
+        Light that its path brings.
+    """
+
+    rays: w.Batch
+    lobes: Array
+    parameters: Array
+    value: Array
+    carried: Array
+    direct: Array
+    indirect: Array
+
+
+@njit
+def gather(light, glossy, throughput, first, scratch):  # type: ignore[no-untyped-def]
+    """Add light that comes along a direction, times the BSDF there: diffuse lobes get `light`, others `glossy`.
+
+    Parameters
+    ----------
+    light, glossy : tuple of float32
+        Radiance with its MIS weight over its pdf, linear Rec.709.
+    throughput : tuple of float32
+        Of the path, linear Rec.709.
+    first : bool
+        Whether the vertex is the shading point.
+    scratch : Scratch
+    """
+    value, direct, indirect = scratch.value, scratch.direct, scratch.indirect
+    for c in range(3):
+        if first:
+            direct[c] += value[c] * light[c]
+            direct[3 + c] += value[3 + c] * glossy[c]
+            direct[6 + c] += value[6 + c] * glossy[c]
+        else:
+            own = value[c] * light[c] + (value[3 + c] + value[6 + c]) * glossy[c]
+            indirect[c] += throughput[c] * own
+
+
+@njit
+def aim(rays, position, facing, direction, extent):  # type: ignore[no-untyped-def]
+    """Put a ray from a surface into slot 0, lifted off it on the side to which it goes.
+
+    Parameters
+    ----------
+    rays : Batch
+    position, facing, direction : tuple of float32
+        World, m; geometric normal and direction of unit length.
+    extent : float32
+        `Traits.extent`, m.
+    """
+    s, _ = rays
+    gx, gy, gz = facing
+    dx, dy, dz = direction
+    if gx * dx + gy * dy + gz * dz < ZERO:
+        gx, gy, gz = -gx, -gy, -gz
+    s[w.OX], s[w.OY], s[w.OZ] = lifted(position[0], position[1], position[2], gx, gy, gz, extent)
+    s[w.LX], s[w.LY], s[w.LZ] = dx, dy, dz
+    s[w.GX], s[w.GY], s[w.GZ] = gx, gy, gz
+
+
+@njit
+def weigh(scratch, count, view, facing, normals, direction, detailed):  # type: ignore[no-untyped-def]
+    """BSDF times cosine along a direction into `value`; returns the pdf of BSDF sampling.
+
+    Parameters
+    ----------
+    scratch : Scratch
+    count : int64
+        Lobes.
+    view, facing, direction : tuple of float32
+        Unit, world.
+    normals : tuple of tuple
+        Shading normal, and that without normal and bump maps.
+    detailed : bool
+        Whether there are such maps.
+
+    Returns
+    -------
+    float32
+        sr^-1.
+    """
+    value = scratch.value
+    pdf = evaluate(scratch.lobes, count, view, direction, facing, value)
+    if detailed:
+        dx, dy, dz = direction
+        if facing[0] * dx + facing[1] * dy + facing[2] * dz > ZERO:
+            shadow = bump_shadow(normals[0], normals[1], direction)
+            value[0], value[1], value[2] = value[0] * shadow, value[1] * shadow, value[2] * shadow
+    return pdf
+
+
+@njit
+def is_bright(value):  # type: ignore[no-untyped-def]
+    """Whether any light passes.
+
+    Parameters
+    ----------
+    value : (9,) float32 array
+
+    Returns
+    -------
+    bool
+    """
+    total = ZERO
+    for c in range(9):
+        total += value[c]
+    return total > ZERO
+
+
+@njit
+def towards_envmap(numbers, at, row, throughput, first, scratch, count, scene, settings):  # type: ignore[no-untyped-def]
+    """The environment sample.
+
+    Parameters
+    ----------
+    numbers : tuple of uint32
+        Random numbers.
+    at : tuple
+        Position (m), direction to the viewer, geometric normal, shading normal and that without maps, world.
+    row : int32
+        Of the environment's tables.
+    throughput : tuple of float32
+        Of the path, linear Rec.709.
+    first : bool
+        Whether the vertex is the shading point.
+    scratch : Scratch
+    count : int64
+        Lobes.
+    scene : Scene
+    settings : Settings
+    """
+    position, view, facing, normals = at
+    envmap = scene.envmap
+    n0, n1, n2 = numbers
+    block = np.int64(block_of(row, n2, envmap))
+    inside, ratio = in_cells_order(row, block, n2, mix(n2), envmap)
+    cell = first_cell(inside, envmap)
+    while inside > cell_end(cell, envmap):
+        cell += 1
+    _, column, upper, lower, density = cell_at(cell, envmap)
+    dx, dy, dz, u, v = direction_in_cell(column, upper, lower, n0, n1, envmap)
+    pdf = weigh(scratch, count, view, facing, normals, (dx, dy, dz), scene.traits.detailed)
+    own = density * ratio
+    if not (own > ZERO and is_bright(scratch.value)):
+        return
+    r, g, b = envmap_radiance(u, v, envmap)
+    if not r + g + b > ZERO:
+        return
+    aim(scratch.rays, position, facing, (dx, dy, dz), scene.traits.extent)
+    through = passed(scene, scratch.rays, 0, FAR, np.int32(ray_masks.SHADOW << settings.shift))
+    if through > ZERO:
+        k = through / (own + pdf)
+        light = (r * k, g * k, b * k)
+        gather(light, light, throughput, first, scratch)
+
+
+@njit
+def towards_lights(numbers, at, receiver, throughput, first, scratch, count, scene, settings):  # type: ignore[no-untyped-def]
+    """The light sample.
+
+    Parameters
+    ----------
+    numbers : tuple of uint32
+        Random numbers.
+    at : tuple
+        Position (m), direction to the viewer, geometric normal, shading normal and that without maps, world.
+    receiver : float32
+        Set of the surface, see `light_links`.
+    throughput : tuple of float32
+        Of the path, linear Rec.709.
+    first : bool
+        Whether the vertex is the shading point.
+    scratch : Scratch
+    count : int64
+        Lobes.
+    scene : Scene
+    settings : Settings
+    """
+    position, view, facing, normals = at
+    rays = scratch.rays
+    s, ints = rays
+    n0, n1, n2 = numbers
+    own = lights_of(scene.lights, receiver)
+    px, py, pz = position
+    dx, dy, dz, distance, r, g, b, density, light = sample_light(n2, n0, n1, px, py, pz, own)
+    if not (density != ZERO and r + g + b > ZERO):
+        return
+    pdf = weigh(scratch, count, view, facing, normals, (dx, dy, dz), scene.traits.detailed)
+    if not is_bright(scratch.value):
+        return
+    aim(rays, position, facing, (dx, dy, dz), scene.traits.extent)
+    s[w.ER], s[w.EG], s[w.EB], s[w.MU], s[w.MV], s[w.LIVE] = r, g, b, distance, density, ONE
+    ints[w.CELL] = U(max(light, 0))
+    mask = np.int32(ray_masks.SHADOW << settings.shift)
+    dr, dg, db, gr, gg, gb = light_radiance(rays, 0, pdf, pdf, ONE, receiver, scene, mask)
+    if dr + dg + db + gr + gg + gb > ZERO:
+        gather((dr, dg, db), (gr, gg, gb), throughput, first, scratch)
+
+
+@njit
+def light_along(origin, direction, reach, hit, through, densities, receiver, row, diffuse, scene):  # type: ignore[no-untyped-def]
+    """Light along a ray of the BSDF, with MIS weight over pdf; `densities`: that pdf, and 1, or 0 for a delta.
+
+    Parameters
+    ----------
+    origin, direction : tuple of float32
+        Of the ray, world, m.
+    reach : float32
+        Distance up to which lights are seen, m.
+    hit : MixedHit
+    through : float32
+        Share of light from beyond everything.
+    densities : tuple of float32
+    receiver : float32
+        Set of the surface that the ray leaves.
+    row : int32
+        Of the environment's tables.
+    diffuse : bool
+        Whether the ray is of a diffuse lobe.
+    scene : Scene
+
+    Returns
+    -------
+    r, g, b : float32
+        Linear Rec.709.
+    """
+    pdf, share = densities
+    red = green = blue = ZERO
+    own = lights_of(scene.lights, receiver)
+    if scene.traits.lights:
+        seen_by = DIFFUSE if diffuse else GLOSSY
+        red, green, blue = lights_along(origin, direction, reach, pdf, share, seen_by, own)
+    if scene.traits.emissive and emits_to(scene.lights, receiver, hit, scene.geometry):
+        r, g, b, light, glossy = emission_along(origin, direction, hit, scene.geometry, own)
+        k = ONE / (pdf + share * (light if diffuse else glossy))
+        red, green, blue = red + k * r, green + k * g, blue + k * b
+    if through > ZERO and scene.traits.environment:
+        u, v = map_at(direction[0], direction[1], direction[2], scene.envmap)
+        r, g, b = envmap_radiance(u, v, scene.envmap)
+        k = through / (pdf + share * envmap_pdf(u, v, row, scene.envmap))
+        red, green, blue = red + k * r, green + k * g, blue + k * b
+    return red, green, blue

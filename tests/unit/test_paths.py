@@ -1,0 +1,167 @@
+"""Paths through any BSDF: the light that batches find, in any division; glass, sheets, and what stays as it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_surface import mesh_state
+
+from drgs_blender.compute import threads
+from drgs_blender.core.frame import Camera, Frame, Light, Material, Part, RenderSettings, World
+from drgs_blender.engine.session import Session
+
+SQUARE = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+FACES = np.int32([[0, 1, 2], [0, 2, 3]])
+BOX = np.float32([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+SIDES = np.int32([
+    [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
+    [1, 5, 7], [1, 7, 3],
+])  # fmt: skip
+
+
+def at(z: float, scale: float = 1.0) -> np.ndarray:
+    matrix = np.diag([scale, scale, scale, 1.0])
+    matrix[2, 3] = z
+    return matrix
+
+
+def flat(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(m, 3, 3) normals of the faces, at their corners."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    normal = np.cross(b - a, c - a)
+    return np.repeat((normal / np.linalg.norm(normal, axis=1, keepdims=True))[:, None], 3, axis=1).astype(np.float32)
+
+
+def card(material: Material, z: float = 0.0, scale: float = 1.0):
+    return mesh_state(SQUARE, FACES, at(z, scale), name=material.name, materials=[material])
+
+
+def box(material: Material, z: float = 0.0, scale: float = 1.0):
+    normals = flat(BOX, SIDES)
+    return mesh_state(BOX, SIDES, at(z, scale), name=material.name, materials=[material], corner_normals=normals)
+
+
+def seen(meshes, passes=("Combined",), world=1.0, size=12, lights=(), **settings):
+    """From above, orthographic, one metre wide."""
+    camera = Camera(at(5.0), size, size, size, size, size / 2, size / 2, orthographic=True)
+    how = RenderSettings(**{"samples": 64, "bounces": 4, "camera_sees": "mesh"} | settings)
+    given = world if isinstance(world, World) else World(strength=world)
+    return Session().render(Frame(0, camera, [], given, how, passes, list(meshes), list(lights)))
+
+
+def picture(*args, **kwargs) -> np.ndarray:
+    return seen(*args, **kwargs)["Combined"][..., :3].astype(np.float64)
+
+
+SPEC = Material("spec", (0.6, 0.5, 0.4), 0.3, 0.4)
+#: Out of sight and of no effect, but with a row: the paths shade all surfaces.
+FAR = card(Material("far", (0, 0, 0), coat=0.1), -500.0, 1e-3)
+
+
+def sky() -> World:
+    """Bright above and to one side."""
+    rows = np.linspace(2.0, 0.1, 16)[:, None, None] * (1 + np.cos(np.linspace(0, 6, 32)))[None, :, None]
+    return World((rows * [1.0, 0.9, 0.8]).astype(np.float32))
+
+
+@pytest.mark.parametrize("light", (None, Light("l", "area", at(1.5), power=20.0, size_x=0.5)))
+def test_plain_surfaces_get_the_light_that_batches_find(light):
+    meshes, lights = [card(SPEC), box(Material("red", (0.8, 0.2, 0.1)), 0.6, 0.2)], [light] if light else []
+    settings = {"samples": 1024, "size": 6, "bounces": 2, "subpixel_samples": 16}
+    batches = picture(meshes, world=sky(), lights=lights, **settings)
+    paths = picture([*meshes, FAR], world=sky(), lights=lights, **settings)
+    assert paths.mean(axis=(0, 1)) == pytest.approx(batches.mean(axis=(0, 1)), rel=0.01)
+    assert not np.array_equal(paths, batches)
+
+
+def test_threads_and_pieces_of_the_picture_change_no_sample():
+    meshes = [box(Material("glass", roughness=0.3, transmission=1.0), 0.0, 0.4), card(SPEC, -1.0, 3.0)]
+    whole = picture(meshes, world=sky(), samples=16)
+    threads.use_threads(1)
+    np.testing.assert_array_equal(whole, picture(meshes, world=sky(), samples=16, threads=1))
+    np.testing.assert_array_equal(whole, picture(meshes, world=sky(), samples=16, threads=2))
+    camera = Camera(at(5.0), 12, 12, 12, 12, 6, 6, orthographic=True, region=(2, 3, 9, 8))
+    how = RenderSettings(samples=16, bounces=4, camera_sees="mesh")
+    part = Session().render(Frame(0, camera, [], sky(), how, ("Combined",), meshes))["Combined"]
+    np.testing.assert_array_equal(whole[3:8, 2:9], part[..., :3])
+
+
+def test_smooth_glass_in_an_even_world_cannot_be_seen():
+    glass = Material("glass", (1, 1, 1), 0.0, transmission=1.0, ior=1.7)
+    np.testing.assert_allclose(picture([box(glass, 0.0, 0.2)], bounces=60), 1.0, rtol=1e-4)
+
+
+def test_colour_of_glass_is_the_square_of_two_roots():
+    """Without reflection, light passes two faces, each of which takes the root of the colour."""
+    glass = Material("glass", (0.25, 0.5, 1.0), 0.0, transmission=1.0, ior=1.001)
+    found = picture([box(glass, 0.0, 1.0)], size=4)
+    np.testing.assert_allclose(found, np.broadcast_to([0.25, 0.5, 1.0], found.shape), rtol=2e-3)
+
+
+@pytest.mark.parametrize("mirrored", (False, True))
+def test_a_slab_moves_what_is_behind_it_by_snells_law(mirrored):
+    """Seen at an angle; with a mirroring matrix inside stays inside."""
+    glass = Material("glass", (1, 1, 1), 0.0, transmission=1.0, ior=1.5)
+    stripe = Material("stripe", (0, 0, 0), emission=(1, 1, 1))
+    black = Material("black", (0, 0, 0), 1.0, specular_level=0.0)
+    slab = box(glass, 0.0, 1.0)
+    slab.matrices = np.diag([-20.0 if mirrored else 20.0, 20.0, 0.5, 1.0])[None]
+    edge = card(stripe, -0.6)
+    edge.matrices = np.array([[[10.0, 0, 0, 10.0], [0, 10, 0, 0], [0, 0, 1, -0.6], [0, 0, 0, 1]]])
+    ground = card(black, -2.0, 50.0)
+    angle = np.radians(40)
+    turn = np.array(
+        [[np.cos(angle), 0, np.sin(angle), 0], [0, 1, 0, 0], [-np.sin(angle), 0, np.cos(angle), 0], [0, 0, 0, 1]]
+    )
+    camera = Camera(turn @ at(5.0), 200, 2, 100, 100, 100, 1, orthographic=True)
+    how = RenderSettings(samples=64, bounces=0, camera_sees="mesh")
+
+    def edge_at(meshes):
+        shown = Session().render(Frame(0, camera, [], World(strength=0.0), how, ("Combined",), meshes))
+        row = shown["Combined"][0, :, 0]
+        return (row < 0.5 * row.max()).sum() / 100.0
+
+    moved = edge_at([slab, edge, ground]) - edge_at([edge, ground, FAR])
+    inside = np.arcsin(np.sin(angle) / 1.5)
+    # The sideways shift of a ray through a slab of thickness 1.
+    assert abs(moved) == pytest.approx(np.sin(angle - inside) / np.cos(inside), abs=0.02)
+
+
+def test_shadow_rays_end_at_glass_and_light_comes_through_paths():
+    """A light without size cannot be met by chance: glass throws a full shadow, as in Cycles; one with size shines."""
+    glass = card(Material("glass", (1, 1, 1), 0.0, transmission=1.0, thin_walled=True), 1.0, 3.0)
+    glass.visibility = replace(glass.visibility, camera=False)
+    ground = card(Material("ground", (0.5, 0.5, 0.5), 1.0, specular_level=0.0))
+    settings = {"world": 0.0, "samples": 4096, "size": 2, "bounces": 2}
+    point, area = Light("p", "point", at(3.0)), Light("a", "area", at(3.0), power=50.0, size_x=4.0)
+    assert picture([glass, ground], lights=[point], **settings).max() == 0
+    open_air = picture([ground], lights=[area], **settings).mean()
+    assert 0.8 * open_air < picture([glass, ground], lights=[area], **settings).mean() < open_air
+
+
+def test_translucent_card_is_lit_from_behind():
+    leaf = Material("leaf", (0.5, 0.5, 0.5), kind="translucent")
+    below = World(np.concatenate([np.zeros((8, 16, 3)), np.ones((8, 16, 3))]).astype(np.float32))
+    assert picture([card(leaf)], world=below, samples=256).mean() == pytest.approx(0.5, rel=0.02)
+
+
+def test_parts_add_up_by_weight():
+    even = {"world": 1.0, "samples": 256, "size": 4}
+    one, other = (Material(f"m{c}", (c, c, c), kind="diffuse") for c in (0.2, 0.8))
+    mixed = Material("mixed", parts=[Part(one, (0.25,) * 3), Part(other, (0.5, 0.75, 0.75))])
+    found = picture([card(mixed)], **even).mean(axis=(0, 1))
+    np.testing.assert_allclose(found, [0.45, 0.65, 0.65], rtol=0.02)
+
+
+def test_other_looks_leave_the_paper_and_plain_scenes_alone():
+    plain, coated = card(SPEC), card(replace(SPEC, coat=1.0))
+    paper = {"shading_model": "paper", "world": sky()}
+    np.testing.assert_array_equal(picture([plain], **paper), picture([coated], **paper))
+
+
+def test_clamp_limits_what_paths_bring():
+    glass = box(Material("glass", roughness=0.1, transmission=1.0), 0.0, 0.4)
+    free, cut = (picture([glass], world=sky(), clamp_indirect=c).mean() for c in (0.0, 0.3))
+    assert cut < free
