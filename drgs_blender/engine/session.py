@@ -22,7 +22,7 @@ from ..core.frame import Frame, Light, MeshState, ObjectState, RenderSettings
 from ..core.passes import AOVS, COLOURS
 from ..ipc.change_detection import reuse_equal
 from ..ipc.protocol import Passes
-from ..render.backend import CPU, RenderBackend
+from ..render.backend import CPU, RenderBackend, needs_paths
 from ..render.film.surface_film import CHANNELS
 from ..render.gpu.select_backend import Backends
 from ..render.integrator.adaptive import part_count
@@ -290,7 +290,8 @@ class Session:
         trouble = cache_folder().trouble
         lights = self._scene_cache.lights
         linked = lights.linked is not None or lights.grouped is not None
-        found = self._scene_cache.warnings() + self._backends.warnings(settings, linked)
+        device = self._backends.warnings(settings, linked, needs_paths(self._scene_cache.scene, settings))
+        found = self._scene_cache.warnings() + device
         return found + _ignored_lobes(settings, self._scene_cache.meshes) + ([trouble] if trouble else [])
 
     def _statistics(self, frame: Frame, prepared: PreparedScene, timer: _StageTimer) -> dict[str, float]:

@@ -35,8 +35,17 @@ class Backends:
                 self._missing[device] = str(error)
         return self._known.get(device, CPU)
 
-    def warnings(self, settings: RenderSettings, linked: bool = False) -> list[str]:
-        """Warnings: which requested device was not used, and why; whether lights are `linked`, or in groups."""
+    def warnings(self, settings: RenderSettings, linked: bool = False, by_paths: bool = False) -> list[str]:
+        """Warnings: which requested device was not used, and why.
+
+        Parameters
+        ----------
+        settings : RenderSettings
+        linked : bool
+            Whether lights are linked (`light_links`), or in groups.
+        by_paths : bool
+            Whether surfaces have more lobes than two (`backend.needs_paths`).
+        """
         device = settings.device
         backend = self._found(device)
         why = self._missing.get(device) or backend.failed
@@ -45,7 +54,10 @@ class Backends:
         if backend is not CPU and settings.rays_see == "surfels":
             return ["Rays See: Surfels is not supported on a graphics card; rendered on the CPU"]
         if backend is not CPU and linked:
-            return ["Light linking and light groups are not supported on a graphics card; light is traced on the CPU"]
+            return ["Light linking is not supported on a graphics card; light is traced on the CPU"]
+        if backend is not CPU and by_paths:
+            what = "Coat, sheen, glass and other BSDFs than diffuse and glossy"
+            return [f"{what} are not supported on a graphics card; light is traced on the CPU"]
         return []
 
 
