@@ -16,6 +16,7 @@ from ..formats.axes import UP_AXES, mesh_to_z_up
 from ..formats.files import MeshFile, plain_name
 from ..formats.gltf_nodes import Pose
 from ..formats.mesh import check_extent
+from .mesh_textures import MAX_TEXTURE, mesh_textures
 from .refine import MAX_TRIANGLES, TOLERANCE, refine
 from .surface_detail import MAX_SURFELS, CornerFrames, SurfaceDetail
 from .texture import ALPHA, CUT_OUT, Materials
@@ -30,13 +31,13 @@ def make_asset(
     *,
     up: str | None = None,
     max_triangles: int = MAX_TRIANGLES,
-    tolerance: float = TOLERANCE,
     density: float = 140.0,
     pretrained: Surfels | None = None,
     environment: Environment | str | Path | None = None,
     pose: Pose = "rest",
     scale: float = 1.0,
     max_surfels: int = MAX_SURFELS,
+    max_texture: int = MAX_TEXTURE,
 ) -> Asset:
     """Make an asset from a mesh with textures: glTF, GLB, OBJ, PLY, DAE and whatever else `formats` reads.
 
@@ -48,8 +49,6 @@ def make_asset(
         "z", "y", "-z" or "-y", the up axis of the file; None is what its format says, and Z where it says nothing.
     max_triangles : int
         Budget of the subdivision that gives texture detail its vertices; a finer mesh is left as it is.
-    tolerance : float
-        Error of interpolated materials at which edges are split.
     density : float
         See `deform.attach.attach`.
     pretrained : Surfels, optional
@@ -62,6 +61,8 @@ def make_asset(
         Factor on all lengths.
     max_surfels : int
         Surfels that pieces of faces cut for detail of textures and normal maps may reach.
+    max_texture : int
+        Largest side in pixels of the textures that the mesh keeps; 0: it keeps none.
 
     Returns
     -------
@@ -70,7 +71,9 @@ def make_asset(
     """
     name = "mesh" if isinstance(source, MeshFile) else str(source)
     file = read_mesh_file(source, pose)
-    mesh, report, detail = detailed_mesh(file, name, up=up, max_triangles=max_triangles, tolerance=tolerance)
+    mesh, report, detail = detailed_mesh(
+        file, name, up=up, max_triangles=max_triangles, tolerance=TOLERANCE, max_texture=max_texture
+    )
     scale_mesh(mesh, scale, name)
     surfels, binding, report["surfels"] = attach(
         mesh, pretrained, density=density, detail=detail if detail.any else None, most=max_surfels
@@ -117,6 +120,7 @@ def mesh_with_materials(
     up: str | None = None,
     max_triangles: int = MAX_TRIANGLES,
     tolerance: float = TOLERANCE,
+    max_texture: int = 0,
 ) -> tuple[Mesh, dict[str, Any]]:
     """Weld a mesh file, divide it where its textures need it and sample them at the vertices.
 
@@ -128,11 +132,12 @@ def mesh_with_materials(
         "source_vertices", "source_faces", "not_finite_faces", "degenerate_faces" (removed), "vertices", "faces",
         "rounds" of subdivision, "unresolved_edges" (detail left out by the budget or the finest edge), "notes".
     """
-    return detailed_mesh(file, name, up=up, max_triangles=max_triangles, tolerance=tolerance)[:2]
+    budgets = max_triangles, tolerance, max_texture
+    return detailed_mesh(file, name, up, *budgets)[:2]
 
 
 def detailed_mesh(
-    file: MeshFile, name: str, *, up: str | None, max_triangles: int, tolerance: float
+    file: MeshFile, name: str, up: str | None, max_triangles: int, tolerance: float, max_texture: int
 ) -> tuple[Mesh, dict[str, Any], SurfaceDetail]:
     """As `mesh_with_materials`, with what the file shows between the vertices."""
     turned = up if file.up_axis == "unknown" else None
@@ -153,6 +158,8 @@ def detailed_mesh(
     report["notes"] += [f"{material}: partly transparent, shown as opaque" for material in materials.veiled]
     report["vertices"], report["faces"] = len(net.vertices), len(net.faces)
     mesh = Mesh(net.vertices, net.faces, *channels, _groups(net, file), origin)
+    if max_texture > 0:
+        mesh.textures = mesh_textures(net, file, frames, divided, max_texture, report["notes"])
     if turned not in (None, "z"):
         mesh.source = (mesh.source or SourceVertices.identity(count)).turned(UP_AXES[turned])
     log.info("mesh of %s: %s", name, report)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..core.errors import UsageError
 from ..formats.axes import UP_AXES
 from .output import check_suffix, check_writable, write_and_report
 from .progress import clock
@@ -52,6 +53,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="budget when faces get smaller surfels for textures and normal maps; default 400000",
     )
     parser.add_argument(
+        "--textures",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="keep the file's texture coordinates, images and normals for the mesh; default: yes",
+    )
+    parser.add_argument(
+        "--max-texture",
+        type=int_range(1, 16384),
+        metavar="N",
+        help="largest side in pixels of the images kept, larger ones are reduced; default 4096",
+    )
+    parser.add_argument(
         "--density", type=int_range(1, 100_000), metavar="D", help="surfels along the mesh's diagonal, at least"
     )
 
@@ -63,8 +76,11 @@ def run(args: argparse.Namespace) -> int:
 
     from ..build.make import make_asset
 
-    budgets = ("max_triangles", "max_surfels", "density")
+    if not args.textures and args.max_texture:
+        raise UsageError("--max-texture", "is given, but no textures are to be kept", "Leave it or --no-textures out")
+    budgets = ("max_triangles", "max_surfels", "density", "max_texture")
     given = {name: value for name in budgets if (value := getattr(args, name)) is not None}
+    given |= {} if args.textures else {"max_texture": 0}
     with clock(args, "making the asset"):
         asset = make_asset(args.mesh, up=args.up, environment=args.env, pose=args.pose, scale=args.scale, **given)
     write_and_report(args.out, asset)

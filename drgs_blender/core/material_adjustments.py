@@ -9,6 +9,7 @@ import numpy as np
 
 from .asset.model import MATERIAL_CHANNELS, Asset
 from .frame import Adjustment
+from .texture_adjustments import edited_textures
 
 Array = np.ndarray
 
@@ -26,8 +27,7 @@ def adjusted(materials: Mapping[str, Array], adjustment: Adjustment, mask: Array
     """
     made = {"albedo": recoloured(materials["albedo"], adjustment)}
     for name in ("roughness", "metallic"):
-        gain, offset, low, high = getattr(adjustment, name)
-        made[name] = np.clip(materials[name] * np.float32(gain) + np.float32(offset), low, max(low, high))
+        made[name] = adjusted_number(materials[name], getattr(adjustment, name))
     share = None if mask is None else np.clip(np.nan_to_num(mask), 0, 1).astype(np.float32)
     for name, new in made.items():
         if share is not None:
@@ -35,6 +35,12 @@ def adjusted(materials: Mapping[str, Array], adjustment: Adjustment, mask: Array
             new = old + (share[:, None] if old.ndim == 2 else share) * (new - old)
         made[name] = np.ascontiguousarray(np.clip(new, 0, 1), np.float32)
     return made
+
+
+def adjusted_number(values: Array, change: tuple[float, float, float, float]) -> Array:
+    """Roughness or metallic after gain, offset, lowest and highest value."""
+    gain, offset, low, high = change
+    return np.clip(values * np.float32(gain) + np.float32(offset), low, max(low, high))
 
 
 def recoloured(albedo: Array, adjustment: Adjustment) -> Array:
@@ -64,7 +70,7 @@ def edited_asset(asset: Asset, painted: Mapping[str, Array], adjustment: Adjustm
     """`asset` with other materials: `painted` per vertex (channels that are absent stay), then `adjustment`.
 
     Surfels follow the vertices whose value differs, as in `deform.mesh_driven`; shape, binding and light are kept, and
-    so are captured colours.
+    so are captured colours. Textures are kept as far as `edited_textures` can.
     """
     mesh, surfels = asset.mesh, asset.surfels
     of_mesh: dict[str, Array] = {name: getattr(mesh, name) for name in MATERIAL_CHANNELS} | dict(painted)
@@ -79,6 +85,8 @@ def edited_asset(asset: Asset, painted: Mapping[str, Array], adjustment: Adjustm
     for name in MATERIAL_CHANNELS:
         setattr(new_mesh, name, of_mesh[name])
         setattr(new_surfels, name, of_surfels[name])
+    if mesh.textures is not None:
+        new_mesh.textures, _ = edited_textures(mesh, mesh.textures, painted, adjustment)
     return replace(asset, mesh=new_mesh, surfels=new_surfels)
 
 

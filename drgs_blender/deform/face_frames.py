@@ -78,6 +78,19 @@ class Faces:
         return cls(corners, unit(cross), 0.5 * twice_area, np.nan_to_num(edge.mean(axis=1)), degenerate)
 
 
+def corner_frames(vertices: Array, faces: Array) -> Array:
+    """Frames (m, 3, 3, 3) float64 with columns (t, b, s) at the corners of faces, as Binding.normal defines them.
+
+    Parameters
+    ----------
+    vertices : (n, 3) array
+    faces : (m, 3) array
+    """
+    measured, face = Faces.of(vertices, faces), np.repeat(np.arange(len(faces)), 3)
+    corners = np.tile(np.eye(3), (len(faces), 1))
+    return shading_frames(measured, faces, vertices, face, corners).reshape(-1, 3, 3, 3)
+
+
 def shading_frames(faces: Faces, indices: Array, vertices: Array, face: Array, barycentric: Array) -> Array:
     """Frames (n, 3, 3) with columns (t, b, s) at points of faces, as Binding.normal defines them.
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..compute.warp.posed_surfels import DevicePosedSurfels, joined
 from ..core.asset.container import read_asset
-from ..core.asset.model import Asset, PosedSurfels, Surfels
+from ..core.asset.model import Asset, PosedSurfels
 from ..core.errors import AssetError, UsageError
 from ..core.frame import Frame, Image, MeshState, MotionStep, ObjectState, RenderSettings, World
 from ..deform.gpu.mesh_driven import Deformer
@@ -28,60 +28,38 @@ from ..render.lights.light_sampler import Lights
 from ..render.lights.mesh_lights import Emitters
 from ..render.scene.ray_masks import group_mask
 from ..render.scene.see_through import MOST
-from ..render.scene.trace_scene import TraceObject, TraceScene
+from ..render.scene.trace_scene import TexturedObject, TraceObject, TraceScene
 from ..render.surfels.captured import CapturedObject
 from ..render.surfels.surfel_bvh import SurfelBVH
-from .captured_objects import Glow, captured_faults, captured_object, glow_of, glowing_mesh, shows_captured
+from .captured_objects import captured_faults, captured_object, glowing_mesh, shows_captured
+from .loaded_assets import LoadedAsset
 from .scene_objects import in_asset_order, join, material_faults, moved_vertices, posed_surfels, traced_object
+from .textured_objects import stub, textured_object
 
 #: Surfels a vertex up to which a mesh is taken for as detailed as a coarse picture.
 _SURFELS_A_VERTEX = 16
 
 
 @dataclass(slots=True)
-class _Loaded:
-    """An asset, the state of the file it is mapped from, and its deformation once it was needed."""
-
-    asset: Asset
-    stamp: tuple[int, int, int]
-    driven: MeshDriven | None = None
-    glow: Glow | None = None
-
-    def surfels_of(self, state: ObjectState) -> MeshDriven | Surfels:
-        """The deformation of the asset's surfels, made when an object first needs it; the surfels without a mesh."""
-        if not len(self.asset.mesh.faces):
-            return self.asset.surfels
-        if self.driven is None:
-            asset = self.asset
-            if asset.binding is None:
-                problem = f"the surfels of {state.asset} are not bound to its mesh"
-                raise AssetError(f"object {state.name}", problem, "Bind them, or set Camera Sees to Mesh")
-            self.driven = MeshDriven(asset.mesh, asset.surfels, asset.binding)
-        return self.driven
-
-    def glow_of(self, key: str) -> Glow:
-        """What its faces emit in captured colours, made when an object first needs it."""
-        if self.glow is None:
-            self.glow = glow_of(self.asset, key)
-        return self.glow
-
-
-@dataclass(slots=True)
 class CachedObject:
     """An object as it was in the last frame, and what was made of it.
 
-    One that is shown in captured colours is `captured` for the camera, and for rays `glowing`.
+    One that is shown in captured colours is `captured` for the camera, and for rays `glowing`. One whose textures are
+    met is `textured`, with its `images`; `met` is what stands for it in the scene then.
     """
 
     state: ObjectState
-    loaded: _Loaded
+    loaded: LoadedAsset
     traced: TraceObject
     posed: PosedSurfels | None = None
     hidden_count: int = 0
     faults: list[str] = field(default_factory=list)
-    mode: tuple[bool, bool] = (False, False)
+    mode: tuple[bool, bool, bool] = (False, False, False)
     captured: CapturedObject | None = None
     glowing: MeshState | None = None
+    textured: TexturedObject | None = None
+    images: list[Image] = field(default_factory=list)
+    met: TraceObject | None = None
 
 
 class SceneCache:
@@ -114,7 +92,7 @@ class SceneCache:
     """
 
     def __init__(self) -> None:
-        self._assets: dict[str, _Loaded] = {}
+        self._assets: dict[str, LoadedAsset] = {}
         self.objects: list[CachedObject] = []
         self.meshes: list[MeshState] = []
         self.images: list[Image] = []
@@ -157,7 +135,8 @@ class SceneCache:
         stamp = status.st_ino, status.st_mtime_ns, status.st_size
         known = self._assets.get(key)
         if known is None or known.stamp != stamp:
-            self._assets[key] = _Loaded(read_asset(key), stamp)
+            faults: list[str] = []
+            self._assets[key] = LoadedAsset(read_asset(key, faults=faults), stamp, faults=faults)
         return key
 
     def asset(self, key: str) -> Asset:
@@ -200,11 +179,11 @@ class SceneCache:
             state = in_asset_order(state, loaded.asset)
             known = self.objects[index] if index < len(self.objects) else None
             kept = reuse_equal(state, None if known is None else known.state)
-            mode = met, shown
+            mode = met, shown, loaded.asset.mesh.textures is not None and not shown and not (seen and met)
             if known is not None and known.loaded is loaded and known.state is kept and known.mode == mode:
                 item = known
             else:
-                item = _begun(kept, loaded, mode)
+                item = _begun(kept, loaded, mode, index)
             if (seen or met) and item.posed is None:
                 given = item.state, index, loaded.surfels_of(item.state), item.traced
                 item.posed, item.hidden_count = posed_surfels(*given, self._poser(backend))
@@ -219,13 +198,16 @@ class SceneCache:
             glowing = [item for item in objects if item.glowing is not None]
             glows = {item.state.asset: item.loaded.glow_of(item.state.asset).image for item in glowing}
             others = [*meshes, *(item.glowing for item in glowing if item.glowing is not None)]
-            self.scene.update([item.traced for item in objects], others, [*images, *glows.values()])
+            others += [item.textured for item in objects if item.textured is not None]
+            textures = {image.name: image for item in objects for image in item.images}
+            traced = [item.traced if item.met is None else item.met for item in objects]
+            self.scene.update(traced, others, [*images, *glows.values(), *textures.values()])
             self._current = True
         self.objects, self.meshes, self.images, self._captured_faults = objects, meshes, images, faults
         used = {state.asset for state in frame.objects}
         for key, loaded in self._assets.items():
             if key not in used:
-                loaded.driven = loaded.glow = None
+                loaded.driven = loaded.glow = loaded.textured = None
         along_rays = seen and bool(frame.camera.panorama)
         tree = self._surfel_bvh(objects if met or along_rays else None)
         self.tree, self.seen_tree = tree if met else None, tree if along_rays else None
@@ -290,8 +272,8 @@ class SceneCache:
             None if pose is None else moved_vertices(item.state, item.loaded.asset, pose)
             for pose, item in zip(step.objects, self.objects)
         ]
-        glowing = sum(item.glowing is not None for item in self.objects)
-        vertices, instances = self.scene.at(moved, [*step.meshes, *[None] * glowing])
+        others = sum((item.glowing is not None) + (item.textured is not None) for item in self.objects)
+        vertices, instances = self.scene.at(moved, [*step.meshes, *[None] * others])
         return SceneState(vertices, instances, camera_parameters(step.camera, frame.settings, frame.noise_index))
 
     def warnings(self) -> list[str]:
@@ -368,11 +350,16 @@ class SceneCache:
         return self.lights
 
 
-def _begun(state: ObjectState, loaded: _Loaded, mode: tuple[bool, bool]) -> CachedObject:
+def _begun(state: ObjectState, loaded: LoadedAsset, mode: tuple[bool, bool, bool], index: int) -> CachedObject:
     """An object that is new or has changed, without its surfels."""
-    met, shown = mode
+    met, shown, textured = mode
     item = CachedObject(state, loaded, traced_object(state, loaded.asset, met or shown), mode=mode)
-    item.faults = material_faults(state)
+    item.faults = [*(f"{state.name}: {fault}" for fault in loaded.faults), *material_faults(state)]
+    if textured:
+        given = state, item.traced, loaded.textured_of(state.asset), index
+        item.textured, item.images, faults = textured_object(*given)
+        item.met = stub(item.traced)
+        item.faults += faults
     if shown and len(loaded.asset.mesh.faces):
         item.glowing = glowing_mesh(state, item.traced, loaded.glow_of(state.asset))
     return item

@@ -61,19 +61,22 @@ class Image:
         Texture coordinates = uv_transform @ (u, v, 1), v **up** (Blender's convention).
     wrap : tuple of str
         "repeat", "clamp" or "mirror" along u and v.
+    file : bytes
+        The file that it was decoded from, where that is known; else empty.
     """
 
     pixels: Array
     srgb: bool
     uv_transform: Array = field(default_factory=lambda: np.eye(2, 3))
     wrap: tuple[str, str] = ("repeat", "repeat")
+    file: bytes = b""
 
     @property
     def alpha(self) -> Image | None:
         """Its last channel as an image of its own; None without alpha."""
         if self.pixels.ndim < 3 or self.pixels.shape[2] not in (2, 4):
             return None
-        return replace(self, pixels=to_unit(self.pixels[..., -1]), srgb=False)
+        return replace(self, pixels=to_unit(self.pixels[..., -1]), srgb=False, file=b"")
 
 
 @dataclass(slots=True)

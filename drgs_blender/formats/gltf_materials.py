@@ -25,6 +25,7 @@ class GltfMaterials:
         self.used: list[MaterialFile] = []
         self._known: dict[int | None, tuple[int, int]] = {}
         self._pixels: dict[int, Array | None] = {}
+        self._files: dict[int, bytes] = {}
 
     def use(self, index: int | None) -> tuple[int, int]:
         """(number in `used`, UV set) of the glTF material `index`; None is glTF's default material."""
@@ -137,13 +138,14 @@ class GltfMaterials:
                 float(document.numbers(moved, "rotation", (0.0,))[0]),
                 document.numbers(moved, "scale", (1.0, 1.0)),
             )
-        return Image(pixels, srgb, transform, (wrap[0], wrap[1])), uv_set
+        return Image(pixels, srgb, transform, (wrap[0], wrap[1]), self._files[source]), uv_set
 
     def _image(self, index: int) -> Array | None:
         """Pixels of an image; None, with a note, where it cannot be had: a mesh without it is still a mesh."""
         if index not in self._pixels:
             try:
-                self._pixels[index] = decode_image(*self.document.image(index))
+                self._files[index], name = self.document.image(index)
+                self._pixels[index] = decode_image(self._files[index], name)
             except AssetError as error:
                 self._pixels[index] = None
                 self.notes.append(f"texture left out: {error}")

@@ -10,7 +10,7 @@ import numpy as np
 from ..core.color import srgb_to_linear
 from ..core.errors import AssetError
 from .files import Image, MaterialFile, MeshFile
-from .images import load_image
+from .images import decode_image
 
 Array = np.ndarray
 
@@ -207,7 +207,7 @@ def _read_normal_map(material: MaterialFile, line: str, path: Path, notes: list[
     strength = float(words[words.index("-bm") + 1]) if "-bm" in words[:-1] else 1.0
     if not np.isfinite(strength):
         raise ValueError
-    material.normal_image, material.normal_strength = Image(image.pixels, srgb=False), strength
+    material.normal_image, material.normal_strength = Image(image.pixels, srgb=False, file=image.file), strength
 
 
 def _image(line: str, path: Path, notes: list[str]) -> Image | None:
@@ -228,7 +228,11 @@ def load_texture(file: Path | None, name: str, notes: list[str]) -> Image | None
         notes.append(f"texture {name} not found")
         return None
     try:
-        return Image(load_image(file), srgb=True)
+        data = file.read_bytes()
+        return Image(decode_image(data, str(file)), srgb=True, file=data)
+    except OSError as error:
+        notes.append(f"texture left out: {file} cannot be read ({error.strerror or error})")
+        return None
     except AssetError as error:
         notes.append(f"texture left out: {error}")
         return None

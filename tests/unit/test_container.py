@@ -17,6 +17,7 @@ from drgs_blender.core.asset import Asset, Binding, Environment, Mesh, Surfels
 from drgs_blender.core.asset.archive import read_archive, write_archive
 from drgs_blender.core.asset.container import (
     MANIFEST,
+    SCHEMA,
     check_asset,
     digest_asset,
     inspect_asset,
@@ -287,7 +288,7 @@ def test_unknown_members_and_foreign_conventions_are_refused(file: Path) -> None
     with pytest.raises(AssetError, match="up_axis"):
         read_asset(file)
     file.write_bytes(clean)
-    rewrite(file, {}, manifest={"schema": 3, "producer": "drgs-blender 9"})
+    rewrite(file, {}, manifest={"schema": SCHEMA + 1, "producer": "drgs-blender 9"})
     with pytest.raises(VersionError, match="drgs-blender 9"):
         read_asset(file)
 

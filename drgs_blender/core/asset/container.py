@@ -19,12 +19,13 @@ from ..version import __version__
 from .archive import read_archive, write_archive
 from .model import Asset, Binding, Environment, Mesh, SourceVertices, Surfels
 from .tensors import decode, dtype_name, encode, parse_json
+from .textures import check_textures, tensors_of, textures_of
 
 Array = np.ndarray
 PathLike = str | os.PathLike[str]
 
 #: Newest version of the layout. A reader refuses higher ones, because it cannot know what they mean.
-SCHEMA = 2
+SCHEMA = 4
 MANIFEST = "manifest.json"
 #: Conventions of all numbers in the file; a file that states others is refused.
 CONVENTIONS = {
@@ -52,9 +53,15 @@ TENSORS: dict[str, dict[str, str]] = {
     "binding.safetensors": {"face": "I32", **dict.fromkeys(("barycentric", "offset", "normal"), "F32")},
     "environment.safetensors": {"radiance": "F32"},
     "source.safetensors": {"index": "I32", "weights": "F32", "count": "I32", "transform": "F32"},
-}
+    "textures.safetensors": {
+        "uvs": "F32", "material": "I32", "slots": "I32", "factors": "F32", "transforms": "F32", "extensions": "I32",
+        "names": "U8", "normals": "F32", "images/": "U8",
+    },
+}  # fmt: skip
 _REQUIRED = ("surfels.safetensors", "mesh.safetensors")
 _OPTIONAL_TENSORS = {"sh", "transform"}
+_OPTIONAL_TENSORS |= {"normals"}
+_TEXTURES = "textures.safetensors"
 _RESTORE = "Restore the file from a copy, or import the source files again"
 
 
@@ -98,7 +105,7 @@ def write_asset(path: PathLike, asset: Asset) -> None:
     write_archive(path, [(MANIFEST, [memoryview(text)]), *buffers.items()])
 
 
-def read_asset(path: PathLike, verify: bool = True) -> Asset:
+def read_asset(path: PathLike, verify: bool = True, faults: list[str] | None = None) -> Asset:
     """Open the asset at `path`; its arrays are read-only views of the mapped file.
 
     Parameters
@@ -107,6 +114,8 @@ def read_asset(path: PathLike, verify: bool = True) -> Asset:
     verify : bool
         Also read everything once: SHA-256 of every member, finite values, ranges. Without it only structure, shapes and
         indices are checked, which is enough never to crash.
+    faults : list of str, optional
+        Where given, textures that are damaged are left out and named here; the rest of the asset is read.
 
     Raises
     ------
@@ -133,12 +142,21 @@ def read_asset(path: PathLike, verify: bool = True) -> Asset:
     subject = os.fspath(path)
     members = read_archive(path, check=(MANIFEST,))
     manifest = _manifest(members, subject)
-    tensors = {name: _tensors(name, members, manifest, subject, verify) for name in members if name != MANIFEST}
+    parts = [name for name in members if name not in (MANIFEST, _TEXTURES)]
+    tensors = {name: _tensors(name, members, manifest, subject, verify) for name in parts}
     try:
         asset = _asset(tensors, manifest["provenance"])
     except AssetError as error:
         raise AssetError(f"{subject}, {error.subject}", error.problem, error.remedy or _RESTORE) from error
     check_asset(asset, subject, values=verify)
+    if _TEXTURES in members:
+        try:
+            arrays = _tensors(_TEXTURES, members, manifest, subject, verify)
+            asset.mesh.textures = textures_of(arrays, len(asset.mesh.faces), f"{subject}, {_TEXTURES}")
+        except AssetError as error:
+            if faults is None:
+                raise
+            faults.append(f"{error}; its textures are left out, the materials of its vertices are shown")
     return asset
 
 
@@ -162,6 +180,7 @@ def inspect_asset(path: PathLike, verify: bool = True) -> dict[str, Any]:
         "source_vertices": mesh.source_count,
         "sh_coefficients": 0 if surfels.sh is None else surfels.sh.shape[1],
     }
+    counts |= {} if mesh.textures is None else {"images": len(mesh.textures.images)}
     ranges = {
         f"{kind}.{name}": _range(getattr(part, name))
         for kind, part, names in (
@@ -221,6 +240,8 @@ def check_asset(asset: Asset, subject: str, values: bool = True) -> None:
         if len(mesh.source.index) != len(mesh.vertices):
             raise AssetError(where, f"has {len(mesh.source.index)} rows for {len(mesh.vertices)} vertices", _RESTORE)
         _check_indices(mesh.source.index, mesh.source_count, where, "vertices of the source")
+    if mesh.textures is not None:
+        check_textures(mesh.textures, len(mesh.faces), f"{subject}, {_TEXTURES}")
     if values:
         for member, tensors in _tensors_of(asset).items():
             for name, array in tensors.items():
@@ -262,7 +283,7 @@ def _manifest(members: Mapping[str, Array], subject: str) -> dict[str, Any]:
 
 def _schema(members: Mapping[str, Any]) -> int:
     """The lowest schema that has these members, so that older versions read what they know."""
-    return 2 if "source.safetensors" in members else 1
+    return 4 if _TEXTURES in members else 2 if "source.safetensors" in members else 1
 
 
 def _tensors(
@@ -301,6 +322,8 @@ def _tensors_of(asset: Asset) -> dict[str, dict[str, Array]]:
         parts["binding.safetensors"] = _fields(asset.binding)
     if asset.environment is not None:
         parts["environment.safetensors"] = _fields(asset.environment)
+    if asset.mesh.textures is not None:
+        parts[_TEXTURES] = tensors_of(asset.mesh.textures)
     return parts
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import AssetError
+from .textures import MeshTextures
 
 Array = np.ndarray
 
@@ -164,6 +165,8 @@ class Mesh:
         Vertices of the named sets kept from the source (one per material or part).
     source : SourceVertices, optional
         Where the vertices come from; None: they are the source's own, in its order.
+    textures : MeshTextures, optional
+        Images on its faces, which rays meet in place of the materials of its vertices.
     """
 
     vertices: Array
@@ -173,6 +176,7 @@ class Mesh:
     metallic: Array
     groups: dict[str, Array] = field(default_factory=dict)
     source: SourceVertices | None = None
+    textures: MeshTextures | None = None
 
     def __post_init__(self) -> None:
         self.vertices = as_float(self.vertices, (-1, 3), "mesh vertices")

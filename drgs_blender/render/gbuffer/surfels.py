@@ -105,7 +105,7 @@ def primary_surfels(
     points = buffer.points
     stages.tie(
         scene,
-        (tied, scene.vertex_faces > 0),
+        (tied, scene.any_drgs),
         (splats.parameters, windows, camera.window[0], y0),
         (samples.depth, samples.surface, samples.object_index),
         (points.pixel, points.sample, points.flags),

@@ -15,7 +15,7 @@ from ...core.frame import Image, Material, MeshState
 from ..memory import AddressOf, address
 from .mesh_layers import MeshLayers, Placements
 from .textures import MaterialTable
-from .trace_mesh import Part, TraceObject
+from .trace_mesh import Part, TexturedObject, TraceObject
 
 
 @dataclass(slots=True)
@@ -70,6 +70,7 @@ class MeshMaterials:
         self._tables: tuple[Array, Array] = self.layers.tables(0)
         self.addresses: Array = self.addresses_at(address)
         self._given: list[Any] = []  # lists of materials, images
+        self._ordinary = 0  # meshes; those of DR-GS objects with textures follow
         self._first: list[int] = []  # of each mesh, in `table`
         self._names: list[Any] = []  # of the layers of each mesh
         self._shapes: list[tuple[slice, MeshState]] = []  # and the faces of each
@@ -82,9 +83,8 @@ class MeshMaterials:
 
     @property
     def names(self) -> list[str]:
-        """Names of all materials, in the order of `table`."""
-        given = self._given[: max(len(self._first) - 1, 0)]
-        return [material.name for materials in given for material in materials]
+        """Names of all materials of ordinary meshes, in the order of `table`."""
+        return [material.name for materials in self._given[: self._ordinary] for material in materials]
 
     @property
     def warnings(self) -> list[str]:
@@ -99,14 +99,15 @@ class MeshMaterials:
     @property
     def pass_indices(self) -> Array:
         """(k,) int32 pass index of each of `names`."""
-        given = self._given[: max(len(self._first) - 1, 0)]
+        given = self._given[: self._ordinary]
         return np.array([material.pass_index for materials in given for material in materials], np.int32)
 
     def of(self, face: Array) -> Array:
-        """(n,) int64 place in `names` of the materials of faces; one behind the last for negative ones."""
-        found = np.full(len(face), len(self.names), np.int64)
+        """(n,) int64 place in `names` of the materials of faces; one behind the last for those of DR-GS objects."""
+        none = len(self.names)
+        found = np.full(len(face), none, np.int64)
         meshes = face >= 0
-        found[meshes] = self.index[face[meshes]]
+        found[meshes] = np.minimum(self.index[face[meshes]], none)
         return found
 
     def update(
@@ -141,6 +142,7 @@ class MeshMaterials:
         """
         first_source, first_face = sources
         given: list[Any] = [mesh.materials for mesh in meshes]
+        self._ordinary = sum(not isinstance(mesh, TexturedObject) for mesh in meshes)
         first = [int(n) for n in np.cumsum([0, *(len(own) for own in given)])]
         given += images
         # Which layers there are, not what is in them.

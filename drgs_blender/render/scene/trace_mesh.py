@@ -70,6 +70,22 @@ class TraceObject:
 
 
 @dataclass(slots=True)
+class TexturedObject(MeshState):
+    """The mesh of a DR-GS object with textures: laid out as an ordinary mesh of one instance, seen as the object.
+
+    Attributes
+    ----------
+    owner : int
+        Which of the scene's objects it is; that `TraceObject` has no faces.
+    seen_only : bool
+        As of `TraceObject`.
+    """
+
+    owner: int = 0
+    seen_only: bool = False
+
+
+@dataclass(slots=True)
 class Part:
     """One object or mesh in the scene's arrays.
 
@@ -129,6 +145,11 @@ class Part:
         )
 
     @property
+    def owner(self) -> int:
+        """Which of the objects, or behind them of the meshes, its faces are of."""
+        return self.item.owner if isinstance(self.item, TexturedObject) else self.source
+
+    @property
     def traced_faces(self) -> Array:
         """Its faces with the dead ones collapsed to one point, where no ray meets them."""
         if self.dead is None:
@@ -181,7 +202,7 @@ class Part:
 
 def mask_of(item: TraceObject | MeshState) -> int:
     """Group mask of an object or a mesh."""
-    if isinstance(item, TraceObject):
+    if isinstance(item, TraceObject | TexturedObject):
         return group_mask(item.visibility, True, item.seen_only)
     return group_mask(item.visibility, False, clear=any(material.clear for material in item.materials))
 

@@ -22,20 +22,12 @@ from .mesh_layers import Placements
 from .mesh_materials import EmissiveMesh, MeshMaterials
 from .ray_masks import object_flags
 from .terminator import TerminatorOffsets
-from .trace_mesh import (
-    Part,
-    TraceObject,
-    mask_of,
-    own_faces,
-    place_vertices,
-    take_mesh,
-    take_object,
-)
+from .trace_mesh import Part, TexturedObject, TraceObject, mask_of, own_faces, place_vertices, take_mesh, take_object
 from .triangle_bvh import Group, TriangleBVH
 
 Array = np.ndarray
 
-__all__ = ["ObjectFaults", "TraceObject", "TraceScene"]
+__all__ = ["ObjectFaults", "TexturedObject", "TraceObject", "TraceScene"]
 
 
 @dataclass(slots=True)
@@ -53,7 +45,7 @@ class TraceScene:
     """All objects and meshes of a frame.
 
     Objects are numbered: DR-GS objects as given, then meshes as given, then the instances of meshes that have
-    several, in the order of the meshes.
+    several, in the order of the meshes. A `TexturedObject` is one of the meshes, yet its faces are of its owner.
 
     Attributes
     ----------
@@ -76,7 +68,9 @@ class TraceScene:
     normals : (r, 3) float32 array
         Of meshes; object space where these have several instances.
     vertex_faces : int
-        How many faces are of DR-GS objects; those come first.
+        How many faces are of DR-GS objects without textures; those come first.
+    any_drgs : bool
+        Whether any faces are of DR-GS objects.
     instances : (p, 3, 4) float32 array
         Object-to-world matrices of meshes of several instances.
     instance_object : (p,) int32 array
@@ -107,6 +101,7 @@ class TraceScene:
         self.normals: Array = np.empty((0, 3), np.float32)
         self.face_object: Array = np.empty(0, np.int32)
         self.vertex_faces = 0
+        self.any_drgs = False
         self.instances: Array = np.empty((0, 3, 4), np.float32)
         self.pass_index: Array = np.empty(0, np.int32)
         self.source: Array = np.empty(0, np.int64)
@@ -255,7 +250,7 @@ class TraceScene:
         self.cut = set()
         self.faults = [ObjectFaults(item.name, 0, 0, 0, p.bad if p else 0) for item, p in zip(items, instances)]
         for part in parts:
-            fault = self.faults[part.source]
+            fault = self.faults[part.owner]
             fault.bad_vertices, fault.empty_faces = part.bad_vertices, max(part.empty_faces, part.flat_faces)
             fault.bad_faces = part.bad_faces
         self._parts, self._known = parts, list(zip(meshes, stands))
@@ -274,8 +269,8 @@ class TraceScene:
         first = np.cumsum([0, *(len(p.matrices) if p.instanced else 0 for _, p in self._known)])
         for part in self._parts:
             own = vertices[part.vertex]
-            if isinstance(part.item, TraceObject):
-                place_vertices(objects[part.source], None, own)
+            if isinstance(part.item, TraceObject | TexturedObject):
+                place_vertices(objects[part.owner], None, own)
                 continue
             index = part.source - len(objects)
             pose, (mesh, now) = meshes[index], self._known[index]
@@ -308,7 +303,7 @@ class TraceScene:
             # Corners with normals of their own get a row each.
             corner = own if smooth else np.arange(3 * m, dtype=np.int32).reshape(m, 3)
             faces.append(corner + np.int32(row))
-            owners.append(np.full(m, source, np.int32))
+            owners.append(np.full(m, item.owner if isinstance(item, TexturedObject) else source, np.int32))
             rows[surfels] += n if smooth else 3 * m
             spans = slice(vertex, vertex + n), slice(face, face + m), slice(row, rows[surfels])
             instanced = where is not None and where.instanced
@@ -316,6 +311,7 @@ class TraceScene:
             vertex, face = vertex + n, face + m
             self.vertex_faces += m if surfels else 0
         self._vertex_count, self.layout = vertex, object()
+        self.any_drgs = any(isinstance(items[source], TraceObject | TexturedObject) for source in order)
         self.shading_faces, self.face_object = np.concatenate(faces), np.concatenate(owners)
         self.shading = np.zeros((rows[True], VERTEX), np.float32)
         self.normals = np.zeros((rows[False], 3), np.float32)
@@ -345,7 +341,8 @@ class TraceScene:
         self.source = np.concatenate([np.arange(len(seen)), np.repeat(np.arange(len(seen)), counts)])
         self.object_flags = flags[self.source]
         self._offsets.take(objects, meshes, self.source)
-        self.any_ordinary = any(mesh.visibility.camera and len(p.matrices) > 0 for mesh, p in zip(meshes, where))
+        visible = [len(p.matrices) > 0 and m.visibility.camera for m, p in zip(meshes, where)]
+        self.any_ordinary = any(v and not isinstance(m, TexturedObject) for v, m in zip(visible, meshes))
 
     def _commit(
         self,
