@@ -11,6 +11,7 @@ from bpy.props import BoolProperty, CollectionProperty, StringProperty
 from ..addon import assets, mesh_arrays
 from ..drgs_blender.core.asset import Asset, Environment
 from ..drgs_blender.core.asset.container import read_asset
+from .asset_materials import show_textures
 from .base import DrgsOperator, DropTarget
 from .mark_assets import mark
 
@@ -79,6 +80,8 @@ def new_object(path: Path, asset: Asset) -> bpy.types.Object:
     """An object, in no collection yet, that shows and stands for the asset at `path`."""
     mesh = mesh_arrays.new_mesh(path.stem, asset.mesh)
     mesh.materials.append(viewport_material())
+    if asset.mesh.textures is not None:
+        show_textures(mesh, asset.mesh.textures)
     obj = bpy.data.objects.new(path.stem, mesh)
     obj.drgs.asset = assets.anchor(path)
     return obj

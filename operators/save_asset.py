@@ -15,6 +15,7 @@ from ..drgs_blender.core.asset import MATERIAL_CHANNELS
 from ..drgs_blender.core.asset.container import write_asset
 from ..drgs_blender.core.errors import UsageError
 from ..drgs_blender.core.material_adjustments import edited_asset
+from ..drgs_blender.core.texture_adjustments import edited_textures
 from . import selection
 from .base import DrgsOperator
 
@@ -62,7 +63,9 @@ class DRGS_OT_save_asset(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
             if len(objects) > 1 and os.path.exists(target):  # the file browser asked for another name
                 raise UsageError(str(target), "is there already", "Choose another folder, or save the objects singly")
         for obj, target in zip(objects, paths):
-            save(obj, target, context.evaluated_depsgraph_get())
+            if lost := save(obj, target, context.evaluated_depsgraph_get()):
+                problem = f'"{obj.name}": textures of {lost} faces cannot say its adjustments'
+                self.report({"WARNING"}, f"{problem}; the file has the adjusted materials of their vertices")
         if self.use_saved:
             for obj, target in zip(selection.editable(objects, vertices=False, data=True), paths):
                 obj.drgs.asset = assets.anchor(target)
@@ -74,8 +77,10 @@ class DRGS_OT_save_asset(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
         return {"FINISHED"}
 
 
-def save(obj: bpy.types.Object, path: Path, depsgraph: bpy.types.Depsgraph) -> None:
+def save(obj: bpy.types.Object, path: Path, depsgraph: bpy.types.Depsgraph) -> int:
     """Write `obj` as `depsgraph` evaluates it to `path`; pose and shape are not part of it.
+
+    Returns how many faces lost images to adjustments, see `texture_adjustments.edited_textures`.
 
     Raises
     ------
@@ -89,6 +94,8 @@ def save(obj: bpy.types.Object, path: Path, depsgraph: bpy.types.Depsgraph) -> N
     painted, adjustment = appearance_of(obj.evaluated_get(depsgraph), asset, messages.Warnings())
     edited = edited_asset(asset, painted, adjustment)
     write_asset(path, replace(edited, provenance={**asset.provenance, "edited_from": source.name}))
+    textures = asset.mesh.textures
+    return 0 if textures is None else edited_textures(asset.mesh, textures, painted, adjustment)[1]
 
 
 CLASSES = (DRGS_OT_save_asset,)

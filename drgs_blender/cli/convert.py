@@ -180,13 +180,14 @@ def convert(args: argparse.Namespace) -> None:
     elif kind == "mesh":
         from ..build.make import scale_mesh
         from ..formats.atlas import material_loss
-        from ..formats.axes import vectors_from_z_up
+        from ..formats.axes import mesh_from_z_up
+        from ..formats.mesh_groups import kept
 
         mesh = replace(source.mesh())
         scale_mesh(mesh, args.scale, str(args.output))
-        writer.write(args.output, replace(mesh, vertices=vectors_from_z_up(mesh.vertices, up)))
+        writer.write(args.output, mesh_from_z_up(mesh, up))
         print(f"{args.output}: {len(mesh.faces)} triangles, {writer.name}, {up} up")
-        print(f"  {material_loss(mesh)}")
+        print(f"  {kept(mesh, str(args.output)) or material_loss(mesh)}")
     else:
         from ..formats.splats import scaled, splats_from_z_up
 

@@ -81,9 +81,9 @@ def open_source(args: argparse.Namespace) -> Source:
     if isinstance(file, EnvironmentFile):
         return AssetSource(args, Asset(_nothing(), Mesh.empty(), environment=file.environment), file.notes)
     if isinstance(file, MeshFile):
-        from ..build.make import mesh_with_materials
+        from ..build.make import MAX_TEXTURE, mesh_with_materials
 
-        mesh, report = mesh_with_materials(file, str(args.input), up=args.from_up)
+        mesh, report = mesh_with_materials(file, str(args.input), up=args.from_up, max_texture=MAX_TEXTURE)
         return AssetSource(args, Asset(_nothing(), mesh), report["notes"])
     raise UsageError(str(args.input), "holds materials alone", "Make an asset of it and its mesh first")
 
@@ -116,7 +116,14 @@ class AssetSource:
 
     def mesh(self) -> Mesh:
         """The mesh, posed."""
-        return replace(self._asset.mesh, vertices=self._vertices)
+        rest = self._asset.mesh
+        textures = rest.textures
+        if self._posed and textures is not None and textures.normals is not None:
+            from ..deform.face_frames import local_normals, posed_normals
+
+            local = local_normals(rest.vertices, rest.faces, textures.normals)
+            textures = replace(textures, normals=posed_normals(self._vertices, rest.faces, local))
+        return replace(rest, vertices=self._vertices, textures=textures)
 
     def splats(self) -> tuple[Splats, str]:
         """The surfels, posed, in the colour that was chosen."""
@@ -168,6 +175,8 @@ class FrameSource:
     def mesh(self) -> Mesh:
         """All meshes as one, with the materials they have in the frame."""
         meshes = [self._objects[i].mesh for i in self._visible]
+        if any(self._objects[i].asset.mesh.textures is not None for i in self._visible):
+            self.notes.append("textures of assets are not written of a frame, only the materials of their vertices")
         first = np.cumsum([0, *(len(m.vertices) for m in meshes)])
 
         def joined(name: str) -> Array:

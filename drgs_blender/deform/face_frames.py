@@ -91,6 +91,18 @@ def corner_frames(vertices: Array, faces: Array) -> Array:
     return shading_frames(measured, faces, vertices, face, corners).reshape(-1, 3, 3, 3)
 
 
+def local_normals(vertices: Array, faces: Array, normals: Array) -> Array:
+    """Normals (m, 3, 3) at the corners of a mesh, each in the frame of its corner, as `posed_normals` takes them."""
+    return np.einsum("fkji,fkj->fki", corner_frames(vertices, faces), normals)
+
+
+def posed_normals(vertices: Array, faces: Array, local: Array) -> Array:
+    """(m, 3, 3) float32 unit normals at the corners of a pose that have `local` ones."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        turned = np.einsum("fkij,fkj->fki", corner_frames(vertices, faces), local)
+        return unit(turned.reshape(-1, 3)).reshape(-1, 3, 3).astype(np.float32)
+
+
 def shading_frames(faces: Faces, indices: Array, vertices: Array, face: Array, barycentric: Array) -> Array:
     """Frames (n, 3, 3) with columns (t, b, s) at points of faces, as Binding.normal defines them.
 

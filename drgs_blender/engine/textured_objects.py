@@ -19,8 +19,7 @@ from ..core.errors import AssetError
 from ..core.frame import Adjustment, Image, Layer, Material, ObjectState, SurfaceDetail, Texture
 from ..core.material_adjustments import adjusted_number, recoloured
 from ..core.texture_adjustments import adjusted_textures, painted_faces
-from ..deform.face_frames import corner_frames
-from ..geometry.normals import unit
+from ..deform.face_frames import local_normals, posed_normals
 from ..render.scene.trace_scene import TexturedObject, TraceObject
 
 Array = np.ndarray
@@ -102,10 +101,8 @@ class TexturedAsset:
         if rest is None or vertices is None:
             return rest
         if self._local is None:
-            self._local = np.einsum("fkji,fkj->fki", corner_frames(self._vertices, faces), rest)
-        with np.errstate(over="ignore", invalid="ignore"):
-            turned = np.einsum("fkij,fkj->fki", corner_frames(vertices, faces), self._local)
-            return keep(unit(turned.reshape(-1, 3)).reshape(-1, 3, 3).astype(np.float32))
+            self._local = local_normals(self._vertices, faces, rest)
+        return keep(posed_normals(vertices, faces, self._local))
 
     @property
     def vertices(self) -> Array:

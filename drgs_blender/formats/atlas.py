@@ -24,7 +24,7 @@ _OFFSETS = np.array([(i, j) for i in range(CELL - 1) for j in range(CELL - 1 - i
 #: Largest side of a texture that everything reads.
 _LARGEST = 16384
 #: Materials that differ by less than this are one.
-_SAME = 1 / 512
+SAME = 1 / 512
 
 
 @dataclass(slots=True)
@@ -68,10 +68,8 @@ def mesh_material(mesh: Mesh, subject: str) -> UniformMaterial | TexturedMateria
     AssetError
         It has values that are not finite, or a size that no reader takes.
     """
-    if not len(mesh.faces):
-        raise UsageError(subject, "would hold a mesh without faces", "Choose an asset that has a mesh, or --as splats")
-    check_extent(mesh.vertices, subject)
-    values = np.concatenate([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], axis=1).clip(0, 1)
+    check_mesh(mesh, subject)
+    values = vertex_materials(mesh)
     if not np.isfinite(values).all():
         raise AssetError(subject, "would hold materials that are NaN", "Make the asset again")
     if _is_uniform(values, mesh.faces):
@@ -82,10 +80,21 @@ def mesh_material(mesh: Mesh, subject: str) -> UniformMaterial | TexturedMateria
     return TexturedMaterial(_png(linear_to_srgb(texels[..., :3])), _png(surface), uvs)
 
 
+def check_mesh(mesh: Mesh, subject: str) -> None:
+    """Raise UsageError where `mesh` has no faces, AssetError where it has a size that no reader takes."""
+    if not len(mesh.faces):
+        raise UsageError(subject, "would hold a mesh without faces", "Choose an asset that has a mesh, or --as splats")
+    check_extent(mesh.vertices, subject)
+
+
+def vertex_materials(mesh: Mesh) -> Array:
+    """(n, 5) albedo, roughness and metallic of the vertices of `mesh`, within [0, 1]."""
+    return np.concatenate([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], axis=1).clip(0, 1)
+
+
 def material_loss(mesh: Mesh) -> str:
     """What becomes of the materials of a mesh that `mesh_material` takes, in a sentence for the user."""
-    values = np.concatenate([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], axis=1).clip(0, 1)
-    if _is_uniform(values, mesh.faces):
+    if _is_uniform(vertex_materials(mesh), mesh.faces):
         return "one material of one colour, without UV map or textures: those of the source are lost"
     size = _side(len(mesh.faces))
     return (
@@ -96,7 +105,7 @@ def material_loss(mesh: Mesh) -> str:
 
 def _is_uniform(values: Array, faces: Array) -> bool:
     """Whether the materials of the vertices of `faces` are one."""
-    return bool(np.ptp(values[np.unique(faces)], axis=0).max() < _SAME)
+    return bool(np.ptp(values[np.unique(faces)], axis=0).max() < SAME)
 
 
 def _side(count: int) -> int:

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..core.asset import Surfels
+from ..core.asset import Mesh, Surfels
 from ..core.errors import UsageError
 from .files import MeshFile
 from .harmonics import rotate_harmonics, whole_bands
@@ -108,6 +108,14 @@ def mesh_to_z_up(mesh: MeshFile, up: str = "y") -> MeshFile:
         corner_normals=None if normals is None else vectors_to_z_up(normals, up),
         up_axis="Z",
     )
+
+
+def mesh_from_z_up(mesh: Mesh, up: str = "y") -> Mesh:
+    """Turn an asset's mesh from Z up to `up`: vertices, and the normals of its textures."""
+    textures = mesh.textures
+    if textures is not None and textures.normals is not None:
+        textures = replace(textures, normals=vectors_from_z_up(textures.normals, up))
+    return replace(mesh, vertices=vectors_from_z_up(mesh.vertices, up), textures=textures)
 
 
 def multiply_quaternions(a: Array, b: Array) -> Array:

@@ -16,7 +16,8 @@ from ..core.asset import Mesh
 from ..core.asset.archive import replace_file
 from ..core.version import __version__
 from ..geometry.normals import VertexNormals
-from .atlas import TexturedMaterial, UniformMaterial, mesh_material
+from .atlas import TexturedMaterial, UniformMaterial
+from .mesh_groups import FaceGroup, ImageMaterial, corner_normals, face_groups
 
 Array = np.ndarray
 
@@ -29,7 +30,7 @@ _BLOCK = 1 << 16
 
 
 def write_usd_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a USDZ with `mesh`, which is Z up, in metres; its materials as `atlas` puts them.
+    """Write a USDZ with `mesh`, which is Z up, in metres; its materials as `mesh_groups` puts them, a subset each.
 
     Raises
     ------
@@ -38,10 +39,11 @@ def write_usd_mesh(path: Path, mesh: Mesh) -> None:
     WriteError
         The file cannot be written.
     """
-    material = mesh_material(mesh, str(path))
-    files = {"asset.usda": _stage(mesh, material).encode()}
-    if isinstance(material, TexturedMaterial):
-        files |= {"textures/color.png": material.colour, "textures/surface.png": material.surface}
+    groups = face_groups(mesh, str(path))
+    files = {"asset.usda": _stage(mesh, groups).encode()}
+    for group in groups:
+        for file, content in _files(group):
+            files[f"textures/{file}"] = content
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
         for name, content in files.items():
@@ -53,10 +55,24 @@ def write_usd_mesh(path: Path, mesh: Mesh) -> None:
     replace_file(path, [data.getbuffer()])
 
 
-def _stage(mesh: Mesh, material: UniformMaterial | TexturedMaterial) -> str:
+def _files(group: FaceGroup) -> list[tuple[str, bytes]]:
+    """Name and content of the pictures of a group."""
+    if isinstance(group.material, TexturedMaterial):
+        return [("color.png", group.material.colour), ("surface.png", group.material.surface)]
+    if isinstance(group.material, UniformMaterial):
+        return []
+    m = group.material
+    pictures = (m.colour_picture, m.surface_picture, m.normal_picture)
+    return [(picture.name, picture.data) for picture in pictures if picture is not None]
+
+
+def _stage(mesh: Mesh, groups: list[FaceGroup]) -> str:
     """The stage as text."""
-    normals = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
     extent = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)])
+    if mesh.textures is None:
+        normals, interpolation = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices), "vertex"
+    else:
+        normals, interpolation = corner_normals(mesh).reshape(-1, 3), "faceVarying"
     lines = [
         "#usda 1.0",
         f'(\n    defaultPrim = "Asset"\n    doc = "DR-GS {__version__}"\n    metersPerUnit = 1\n    upAxis = "Z"\n)',
@@ -68,56 +84,119 @@ def _stage(mesh: Mesh, material: UniformMaterial | TexturedMaterial) -> str:
         f"int[] faceVertexCounts = [{', '.join(['3'] * len(mesh.faces))}]",
         f"int[] faceVertexIndices = [{', '.join(map(str, mesh.faces.ravel().tolist()))}]",
         f"point3f[] points = {_tuples(mesh.vertices)}",
-        f'normal3f[] normals = {_tuples(normals)} (\n    interpolation = "vertex"\n)',
+        f'normal3f[] normals = {_tuples(normals)} (\n    interpolation = "{interpolation}"\n)',
     ]
-    if isinstance(material, TexturedMaterial):
-        uvs = material.uvs.reshape(-1, 2) * [1, -1] + [0, 1]  # v points up in USD
-        lines.append(f'texCoord2f[] primvars:st = {_tuples(uvs)} (\n    interpolation = "faceVarying"\n)')
-    lines += ["rel material:binding = </Asset/Material>", "}", *_material(material), "}"]
-    return "\n".join(lines) + "\n"
+    if any(group.uvs is not None for group in groups):
+        uvs = np.zeros((len(mesh.faces), 3, 2))
+        for group in groups:
+            uvs[group.faces] = 0 if group.uvs is None else group.uvs * [1, -1] + [0, 1]  # v points up in USD
+        lines.append(
+            f'texCoord2f[] primvars:st = {_tuples(uvs.reshape(-1, 2))} (\n    interpolation = "faceVarying"\n)'
+        )
+    names = ["Material"] if len(groups) == 1 else [f"Material{k}" for k in range(len(groups))]
+    if len(groups) == 1:
+        lines.append("rel material:binding = </Asset/Material>")
+    else:
+        lines.append('uniform token subsetFamily:materialBind:familyType = "partition"')
+        for name, group in zip(names, groups, strict=True):
+            lines += _subset(name, group.faces)
+    materials = [line for name, group in zip(names, groups, strict=True) for line in _material(name, group.material)]
+    return "\n".join([*lines, "}", *materials, "}"]) + "\n"
 
 
-def _material(material: UniformMaterial | TexturedMaterial) -> list[str]:
+def _subset(material: str, faces: Array) -> list[str]:
+    return [
+        f'def GeomSubset "{material}" (\n    prepend apiSchemas = ["MaterialBindingAPI"]\n)\n{{',
+        'uniform token elementType = "face"',
+        'uniform token familyName = "materialBind"',
+        f"int[] indices = [{', '.join(map(str, faces.tolist()))}]",
+        f"rel material:binding = </Asset/{material}>",
+        "}",
+    ]
+
+
+def _material(name: str, material: UniformMaterial | TexturedMaterial | ImageMaterial) -> list[str]:
+    path = f"/Asset/{name}"
     surface = [
         'def Shader "Surface"\n{',
         'uniform token info:id = "UsdPreviewSurface"',
         "token outputs:surface",
     ]
     shaders: list[str] = []
-    if isinstance(material, UniformMaterial):
-        surface += [
-            f"color3f inputs:diffuseColor = ({', '.join(f'{v:.9g}' for v in material.colour)})",
-            f"float inputs:roughness = {material.roughness:.9g}",
-            f"float inputs:metallic = {material.metallic:.9g}",
+    colour = f"color3f inputs:diffuseColor.connect = <{path}/Color.outputs:rgb>"
+    numbers = [
+        f"float inputs:roughness.connect = <{path}/Parameters.outputs:g>",
+        f"float inputs:metallic.connect = <{path}/Parameters.outputs:b>",
+    ]
+    outputs = ["float outputs:g", "float outputs:b"]
+    if isinstance(material, TexturedMaterial):
+        surface += [colour, *numbers]
+        shaders = [
+            *_texture(path, "Color", "color.png", "sRGB", ["float3 outputs:rgb"]),
+            *_texture(path, "Parameters", "surface.png", "raw", outputs),
         ]
     else:
-        surface += [
-            "color3f inputs:diffuseColor.connect = </Asset/Material/Color.outputs:rgb>",
-            "float inputs:roughness.connect = </Asset/Material/Parameters.outputs:g>",
-            "float inputs:metallic.connect = </Asset/Material/Parameters.outputs:b>",
-        ]
+        picture = material.colour_picture if isinstance(material, ImageMaterial) else None
+        if picture is None:
+            surface.append(f"color3f inputs:diffuseColor = ({', '.join(f'{v:.9g}' for v in material.colour)})")
+        else:
+            surface.append(colour)
+            more = ["float3 outputs:rgb"], picture.extension, (*material.colour, 1.0)
+            shaders += _texture(path, "Color", picture.name, "sRGB", *more)
+        picture = material.surface_picture if isinstance(material, ImageMaterial) else None
+        if picture is None:
+            surface.append(f"float inputs:roughness = {material.roughness:.9g}")
+            surface.append(f"float inputs:metallic = {material.metallic:.9g}")
+        else:
+            surface += numbers
+            scale = (1.0, material.roughness, material.metallic, 1.0)
+            shaders += _texture(path, "Parameters", picture.name, "raw", outputs, picture.extension, scale)
+        if isinstance(material, ImageMaterial) and material.normal_picture is not None:
+            picture, strength = material.normal_picture, material.normal_strength
+            surface.append(f"normal3f inputs:normal.connect = <{path}/Normal.outputs:rgb>")
+            bias = (-strength, -strength, -1.0, 0.0)
+            scale = (2 * strength, 2 * strength, 2.0, 1.0)
+            placed = picture.extension, scale, bias
+            shaders += _texture(path, "Normal", picture.name, "raw", ["float3 outputs:rgb"], *placed)
+    if shaders:
         shaders = [
             'def Shader "Coordinates"\n{',
             'uniform token info:id = "UsdPrimvarReader_float2"',
             'string inputs:varname = "st"',
             "float2 outputs:result",
             "}",
-            *_texture("Color", "textures/color.png", "sRGB", ["float3 outputs:rgb"]),
-            *_texture("Parameters", "textures/surface.png", "raw", ["float outputs:g", "float outputs:b"]),
+            *shaders,
         ]
-    connection = "token outputs:surface.connect = </Asset/Material/Surface.outputs:surface>"
-    return ['def Material "Material"\n{', connection, *surface, "}", *shaders, "}"]
+    connection = f"token outputs:surface.connect = <{path}/Surface.outputs:surface>"
+    return [f'def Material "{name}"\n{{', connection, *surface, "}", *shaders, "}"]
 
 
-def _texture(name: str, file: str, space: str, outputs: list[str]) -> list[str]:
+def _texture(
+    material: str,
+    name: str,
+    file: str,
+    space: str,
+    outputs: list[str],
+    extension: str = "extend",
+    scale: tuple[float, ...] = (1.0,) * 4,
+    bias: tuple[float, ...] = (0.0,) * 4,
+) -> list[str]:
+    """A texture of a material: values times `scale`, plus `bias`."""
+    wrap = {"extend": "clamp"}.get(extension, extension)
+    more = [("scale", scale, (1.0,) * 4), ("bias", bias, (0.0,) * 4)]
     return [
         f'def Shader "{name}"\n{{',
         'uniform token info:id = "UsdUVTexture"',
-        f"asset inputs:file = @{file}@",
+        f"asset inputs:file = @textures/{file}@",
         f'token inputs:sourceColorSpace = "{space}"',
-        'token inputs:wrapS = "clamp"',
-        'token inputs:wrapT = "clamp"',
-        "float2 inputs:st.connect = </Asset/Material/Coordinates.outputs:result>",
+        f'token inputs:wrapS = "{wrap}"',
+        f'token inputs:wrapT = "{wrap}"',
+        *(
+            f"float4 inputs:{n} = ({', '.join(f'{v:.9g}' for v in given)})"
+            for n, given, plain in more
+            if given != plain
+        ),
+        f"float2 inputs:st.connect = <{material}/Coordinates.outputs:result>",
         *outputs,
         "}",
     ]

@@ -12,6 +12,7 @@ from PIL import Image as Pillow
 from shapes import look_along_y, sphere_mesh
 
 from drgs_blender.build.make import make_asset, mesh_with_materials
+from drgs_blender.cli.main import main
 from drgs_blender.core.asset import Asset, Mesh, Surfels
 from drgs_blender.core.asset.archive import read_archive, write_archive
 from drgs_blender.core.asset.container import inspect_asset, read_asset, write_asset
@@ -24,6 +25,7 @@ from drgs_blender.engine.session import Session
 from drgs_blender.engine.textured_objects import TexturedAsset
 from drgs_blender.formats.files import Image, MaterialFile, MeshFile
 from drgs_blender.formats.images import decode_image
+from drgs_blender.formats.registry import read_mesh
 from drgs_blender.geometry.normals import VertexNormals
 
 
@@ -333,6 +335,88 @@ def test_faces_without_images_lose_their_material() -> None:
     assert kept.slots[kept.material[10]].tolist() == [-1, 1, 1, -1]
     assert kept.slots[kept.material[20]].tolist() == [0, 1, 1, -1]
     assert without(textures, np.ones((288, 4), bool)) is None
+
+
+def converted(tmp_path: Path, asset: Asset, name: str) -> MeshFile:
+    """The mesh of an asset as a file of other programs says it, in the axes of the asset."""
+    path = tmp_path / name
+    write_asset(tmp_path / "a.drgs", asset)
+    assert main(["convert", str(tmp_path / "a.drgs"), str(path)]) == 0
+    return read_mesh(path)
+
+
+def slanted(asset: Asset) -> Asset:
+    """The square with normals of its own, half of its faces without textures."""
+    textures = asset.mesh.textures
+    assert textures is not None
+    corners = asset.mesh.vertices[asset.mesh.faces] * 0.3 + (0, -1, 0)
+    textures.normals = (corners / np.linalg.norm(corners, axis=2, keepdims=True)).astype(np.float32)
+    textures.material = np.repeat(np.array([0, -1], np.int32), 144)
+    return asset
+
+
+def test_gltf_has_the_images_and_an_atlas_for_the_rest(tmp_path: Path, capsys) -> None:
+    noise_pixels = np.random.default_rng(1).integers(0, 255, (16, 16, 3), np.uint8)
+    images = {"albedo": noise_pixels, "surface": noise_pixels[::-1], "bumps": noise_pixels[:, ::-1]}
+    asset = slanted(textured(images, (0, 1, 1, 2), albedo=np.random.default_rng(2).random((169, 3))))
+    textures = asset.mesh.textures
+    assert textures is not None
+    textures.factors[0] = 0.5, 0.75, 1, 0.5, 0.25, 0.7
+    file = converted(tmp_path, asset, "a.glb")
+    assert "1 materials with the images" in (out := capsys.readouterr().out) and "144 others" in out
+    own = file.face_material == 0
+    assert own.sum() == 144 and len(file.faces) == 288 and file.materials[0].name == "paint"
+    corners = asset.mesh.vertices[asset.mesh.faces]
+    np.testing.assert_allclose(file.vertices[file.faces], corners, atol=1e-6)
+    assert file.corner_normals is not None and file.corner_uvs is not None
+    np.testing.assert_allclose(file.corner_normals, textures.normals, atol=1e-6)
+    np.testing.assert_allclose(file.corner_uvs[own], textures.uvs[:144], atol=1e-6)
+    paint = file.materials[0]
+    assert paint.base_colour_image and paint.metallic_roughness_image and paint.normal_image
+    for image, name in zip((paint.base_colour_image, paint.metallic_roughness_image, paint.normal_image), images):
+        assert image.file == textures.images[name].tobytes() and image.wrap == ("clamp", "clamp")
+    np.testing.assert_allclose(paint.base_colour, (0.5, 0.75, 1))
+    np.testing.assert_allclose((paint.roughness, paint.metallic, paint.normal_strength), (0.5, 0.25, 0.7))
+    # An asset of that file has the same textures.
+    again, _ = mesh_with_materials(file, "again", max_triangles=10, max_texture=64)
+    assert again.textures is not None
+    assert [d.tobytes() for d in again.textures.images.values()][:3] == [d.tobytes() for d in textures.images.values()]
+
+
+def test_gltf_of_channels_that_vary_at_vertices_is_an_atlas(tmp_path: Path, capsys) -> None:
+    """Painted albedo under an image of roughness: no material of glTF has both."""
+    asset = textured(uniform((9, 9, 9)), (-1, 1, 1, -1), albedo=np.random.default_rng(2).random((169, 3)))
+    file = converted(tmp_path, asset, "a.glb")
+    assert "0 materials with the images" in capsys.readouterr().out and len(file.materials) == 1
+    image = file.materials[0].base_colour_image
+    assert image is not None and max(image.pixels.shape) > 16
+
+
+def test_usd_has_the_images(tmp_path: Path, capsys) -> None:
+    usd, shade = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdShade")
+    geometry = pytest.importorskip("pxr.UsdGeom")
+    noise_pixels = np.random.default_rng(1).integers(0, 255, (16, 16, 3), np.uint8)
+    asset = slanted(textured({"albedo": noise_pixels, "bumps": noise_pixels[::-1]}, (0, -1, -1, 1)))
+    textures = asset.mesh.textures
+    assert textures is not None
+    write_asset(tmp_path / "a.drgs", asset)
+    assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.usdz")]) == 0
+    stage = usd.Stage.Open(str(tmp_path / "a.usdz"))
+    mesh = geometry.Mesh(stage.GetPrimAtPath("/Asset/Mesh"))
+    np.testing.assert_allclose(np.array(mesh.GetNormalsAttr().Get()), textures.normals.reshape(-1, 3), atol=1e-6)
+    st = geometry.PrimvarsAPI(mesh).GetPrimvar("st").Get()
+    np.testing.assert_allclose(np.array(st)[: 3 * 144], textures.uvs[:144].reshape(-1, 2), atol=1e-6)
+    subsets = geometry.Subset.GetAllGeomSubsets(mesh)
+    assert [len(s.GetIndicesAttr().Get()) for s in subsets] == [144, 144]
+    material, _ = shade.MaterialBindingAPI(subsets[0].GetPrim()).ComputeBoundMaterial()
+    surface, _, _ = material.ComputeSurfaceSource()
+    assert abs(surface.GetInput("roughness").Get() - 0.5) < 1e-6
+    texture = surface.GetInput("diffuseColor").GetConnectedSource()[0].GetPrim()
+    path = str(shade.Shader(texture).GetInput("file").Get().resolvedPath)
+    import zipfile
+
+    with zipfile.ZipFile(tmp_path / "a.usdz") as archive:
+        assert archive.read(path.split("[")[1].rstrip("]")) == textures.images["albedo"].tobytes()
 
 
 def test_smooth_normals_are_kept_for_what_is_divided() -> None:

@@ -1,0 +1,187 @@
+"""A mesh as other programs take it: faces by material, with the images they have, or an atlas of their vertices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.asset import Mesh
+from ..core.asset.textures import ALBEDO, METALLIC, NORMAL, ROUGHNESS, MeshTextures
+from ..geometry.normals import VertexNormals, unit
+from .atlas import SAME, TexturedMaterial, UniformMaterial, check_mesh, mesh_material, vertex_materials
+
+Array = np.ndarray
+
+
+class Picture(NamedTuple):
+    """An image file on a surface.
+
+    Attributes
+    ----------
+    name : str
+        With suffix, of its own in the mesh.
+    data : bytes
+    extension : str
+        Of `core.asset.textures.EXTENSIONS`.
+    """
+
+    name: str
+    data: bytes
+    extension: str
+
+
+@dataclass(slots=True)
+class ImageMaterial:
+    """A material with images; factors multiply them, and stand alone where there is none.
+
+    Attributes
+    ----------
+    name : str
+    colour : tuple of float
+        Linear Rec.709.
+    roughness, metallic, normal_strength : float
+    colour_picture : Picture, optional
+        sRGB.
+    surface_picture : Picture, optional
+        Green is the roughness, blue the metallic.
+    normal_picture : Picture, optional
+        Tangent space, green upwards.
+    """
+
+    name: str
+    colour: tuple[float, float, float]
+    roughness: float
+    metallic: float
+    normal_strength: float
+    colour_picture: Picture | None = None
+    surface_picture: Picture | None = None
+    normal_picture: Picture | None = None
+
+
+@dataclass(slots=True)
+class FaceGroup:
+    """Faces of one material.
+
+    Attributes
+    ----------
+    faces : (k,) int64 array
+        Rows of the mesh's.
+    material : UniformMaterial, TexturedMaterial or ImageMaterial
+    uvs : (k, 3, 2) float32 array, optional
+        Of the corners, the origin at the upper left (glTF).
+    """
+
+    faces: Array
+    material: UniformMaterial | TexturedMaterial | ImageMaterial
+    uvs: Array | None = None
+
+
+def face_groups(mesh: Mesh, subject: str) -> list[FaceGroup]:
+    """All faces of `mesh` by material: first those with images, then the others with an atlas of their own.
+
+    Raises
+    ------
+    UsageError, AssetError
+        As `atlas.mesh_material`.
+    """
+    check_mesh(mesh, subject)
+    found: list[FaceGroup] = []
+    rest = np.ones(len(mesh.faces), bool)
+    textures = mesh.textures
+    for k in range(0 if textures is None else len(textures.names)):
+        assert textures is not None
+        rows = np.flatnonzero(textures.material == k)
+        material = _image_material(mesh, textures, k, rows) if len(rows) else None
+        if material is None:
+            continue
+        rest[rows] = False
+        slot = int(np.flatnonzero(textures.slots[k] >= 0)[0])
+        transform = textures.transforms[k, slot].astype(np.float64)
+        uvs = textures.uvs[rows] @ transform[:, :2].T + transform[:, 2]
+        found.append(FaceGroup(rows, material, (uvs * (1, -1) + (0, 1)).astype(np.float32)))
+    rows = np.flatnonzero(rest)
+    if len(rows):
+        left = mesh_material(replace(mesh, faces=mesh.faces[rows], textures=None), subject)
+        found.append(FaceGroup(rows, left, left.uvs if isinstance(left, TexturedMaterial) else None))
+    return found
+
+
+def corner_normals(mesh: Mesh) -> Array:
+    """(m, 3, 3) float32 unit normals at the corners of `mesh`: those of its textures, else smooth ones."""
+    if mesh.textures is not None and mesh.textures.normals is not None:
+        return unit(mesh.textures.normals.reshape(-1, 3)).reshape(-1, 3, 3).astype(np.float32)
+    return VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)[mesh.faces].astype(np.float32)
+
+
+def joined_corners(vertices: Array, normals: Array, uvs: Array | None) -> tuple[list[Array], Array]:
+    """Corners with equal values as one.
+
+    Parameters
+    ----------
+    vertices, normals : (k, 3, 3) float32 array
+    uvs : (k, 3, 2) float32 array, optional
+
+    Returns
+    -------
+    values : list of array
+        (n, 3), (n, 3) and perhaps (n, 2).
+    index : (3 k,) uint32 array
+        Of each corner.
+    """
+    given = [a.reshape(len(vertices) * 3, -1) for a in (vertices, normals, uvs) if a is not None]
+    rows = np.ascontiguousarray(np.concatenate(given, axis=1) + np.float32(0))  # no -0
+    _, first, index = np.unique(rows.view(f"V{rows.itemsize * rows.shape[1]}"), return_index=True, return_inverse=True)
+    return [values[first] for values in given], index.reshape(-1).astype(np.uint32)
+
+
+def kept(mesh: Mesh, subject: str) -> str:
+    """What becomes of the textures of `mesh`, in a sentence for the user; "" where it has none."""
+    if mesh.textures is None:
+        return ""
+    groups = [group for group in face_groups(mesh, subject) if isinstance(group.material, ImageMaterial)]
+    count = sum(len(group.faces) for group in groups)
+    text = f"{len(groups)} materials with the images, texture coordinates and normals of {count} triangles"
+    others = len(mesh.faces) - count
+    return text + (f"; {others} others have what is at their vertices, in a texture of its own" if others else "")
+
+
+def _image_material(mesh: Mesh, textures: MeshTextures, k: int, rows: Array) -> ImageMaterial | None:
+    """Material `k` of faces `rows`; None where other programs cannot have it with its images.
+
+    That is where a channel varies from vertex to vertex, or images lie on the surface in different ways.
+    """
+    slots, factors = textures.slots[k], textures.factors[k].astype(np.float64).copy()
+    used = slots >= 0
+    first = int(np.flatnonzero(used)[0])
+    alike = (textures.transforms[k, used] == textures.transforms[k, first]).all()
+    pair = [ROUGHNESS, METALLIC]
+    together = slots[ROUGHNESS] == slots[METALLIC] or not used[pair].all()
+    if not (alike and together):
+        return None
+    values = vertex_materials(mesh)[np.unique(mesh.faces[rows])]
+    for slot, own in ((ALBEDO, slice(0, 3)), (ROUGHNESS, slice(3, 4)), (METALLIC, slice(4, 5))):
+        if not used[slot]:
+            if np.ptp(values[:, own], axis=0).max() >= SAME:
+                return None
+            factors[own] = np.median(values[:, own], axis=0)
+    if used[pair].any() and not used[pair].all():
+        return None  # the image would multiply what is at the vertices
+    files = textures.files
+
+    def picture(slot: int) -> Picture | None:
+        if not used[slot]:
+            return None
+        number = int(slots[slot])
+        extension = ("repeat", "extend", "mirror")[textures.extensions[k, slot]]
+        return Picture(f"{number}_{_plain(files[number][0])}", files[number][1].tobytes(), extension)
+
+    red, green, blue, roughness, metallic, strength = factors.tolist()
+    pictures = picture(ALBEDO), picture(ROUGHNESS), picture(NORMAL)
+    return ImageMaterial(textures.names[k], (red, green, blue), roughness, metallic, strength, *pictures)
+
+
+def _plain(name: str) -> str:
+    """A name of a file of letters, digits and what is harmless everywhere."""
+    return "".join(c if c.isascii() and (c.isalnum() or c in "-.") else "_" for c in name)
