@@ -1,0 +1,131 @@
+"""Textures of assets in Blender: shown by its own materials as by DR-GS, and kept when an asset is saved."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import replace
+
+import bpy
+import numpy as np
+import parity
+import pytest
+from scenes import asset_of, part, sphere
+
+pytestmark = pytest.mark.blender_api
+
+
+def png(pixels: np.ndarray) -> np.ndarray:
+    """A PNG file of (h, w, 3) uint8."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    height, width, _ = pixels.shape
+    rows = b"".join(b"\0" + row.tobytes() for row in pixels)
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    parts = chunk(b"IHDR", head), chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b"")
+    return np.frombuffer(b"\x89PNG\r\n\x1a\n" + b"".join(parts), np.uint8)
+
+
+def textured_ball():
+    """A ball in two materials: one with all images, moved and scaled; one with an albedo that goes on as its edge."""
+    vertices, faces = sphere(12, 16)
+    asset = asset_of(vertices, faces)
+    rng = np.random.default_rng(1)
+    coarse = rng.integers(0, 255, (2, 8, 8, 3), np.uint8)
+    coarse[1] = coarse[1] // 3 * 2 + 60
+    bumps = np.full((8, 8, 3), (128, 128, 255), np.uint8)
+    bumps[::2] += np.array([40, 20, 0], np.uint8)
+    images = {"albedo": coarse[0], "surface": coarse[1], "bumps": bumps}
+    corners = vertices[faces]
+    uvs = np.stack([corners[..., 0] + 0.3 * corners[..., 1], corners[..., 2]], axis=-1)
+    transforms = np.tile(np.eye(2, 3), (2, 4, 1, 1))
+    transforms[0, :3] = (0.6, 0.2, 0.1), (-0.1, 0.8, 0.3)
+    textures = part("drgs_blender.core.asset.textures").MeshTextures(
+        uvs, (corners.mean(axis=1)[:, 2] > 0).astype(int), [(0, 1, 1, 2), (0, -1, -1, -1)],
+        [(0.9, 0.8, 1, 0.9, 0.5, 0.7), (1, 1, 1, 1, 1, 1)], transforms, [(0, 0, 0, 0), (1, 0, 0, 0)],
+        ["below", "above"], {name: png(pixels) for name, pixels in images.items()},
+    )  # fmt: skip
+    asset.mesh.textures = textures
+    return asset
+
+
+@pytest.fixture
+def ball(scene, tmp_path):
+    part("drgs_blender.core.asset.container").write_asset(tmp_path / "ball.drgs", textured_ball())
+    bpy.ops.import_scene.drgs(filepath=str(tmp_path / "ball.drgs"))
+    return bpy.context.active_object
+
+
+def read(path):
+    return part("drgs_blender.core.asset.container").read_asset(path).mesh.textures
+
+
+def test_an_import_has_uvs_materials_and_packed_images_once(ball, tmp_path):
+    textures, mesh = textured_ball().mesh.textures, ball.data
+    found = np.empty(6 * len(mesh.polygons), np.float32)
+    mesh.uv_layers["UVMap"].uv.foreach_get("vector", found)
+    np.testing.assert_array_equal(found.reshape(-1, 3, 2), textures.uvs)
+    assert [m.name for m in mesh.materials] == ["DR-GS", "below", "above"]
+    index = np.empty(len(mesh.polygons), np.int32)
+    mesh.polygons.foreach_get("material_index", index)
+    np.testing.assert_array_equal(index, textures.material + 1)
+    images = [i for i in bpy.data.images if i.packed_file]
+    assert {i.packed_file.data for i in images} == {data.tobytes() for data in textures.images.values()}
+    assert {(i.name, i.colorspace_settings.name, tuple(i.size)) for i in images} == {
+        ("albedo.png", "sRGB", (8, 8)), ("surface.png", "Non-Color", (8, 8)), ("bumps.png", "Non-Color", (8, 8)),
+    }  # fmt: skip
+    counts = len(bpy.data.images), len(bpy.data.materials)
+    bpy.ops.import_scene.drgs(filepath=str(tmp_path / "ball.drgs"))
+    assert (len(bpy.data.images), len(bpy.data.materials)) == counts
+    assert list(bpy.context.active_object.data.materials) == list(mesh.materials)
+
+
+def test_cycles_shows_the_imported_materials_as_drgs_the_asset(scene, ball):
+    parity.light(scene)
+    parity.set_up(scene, 64, samples=128, bounces=1)
+    scene.camera.location.y = -3.4
+    ours, theirs = parity.pictures(scene, "DRGS"), parity.pictures(scene, "CYCLES")
+    assert parity.psnr(ours, theirs) > 40
+
+
+def test_save_keeps_textures_and_what_factors_can_say(ball, tmp_path):
+    before = textured_ball().mesh.textures
+    assert bpy.ops.drgs.save_asset(filepath=str(tmp_path / "same.drgs")) == {"FINISHED"}
+    kept = read(tmp_path / "same.drgs")
+    for name in ("uvs", "material", "slots", "factors", "transforms", "extensions"):
+        np.testing.assert_array_equal(getattr(kept, name), getattr(before, name), err_msg=name)
+    assert {k: v.tobytes() for k, v in kept.images.items()} == {k: v.tobytes() for k, v in before.images.items()}
+    ball.drgs.adjustment.tint = (0.5, 1, 1)
+    bpy.ops.drgs.save_asset(filepath=str(tmp_path / "tint.drgs"))
+    kept = read(tmp_path / "tint.drgs")
+    np.testing.assert_allclose(kept.factors[:, 0], before.factors[:, 0] / 2, rtol=1e-6)
+    np.testing.assert_array_equal(kept.slots, before.slots)
+    ball.drgs.adjustment.hue = 0.25
+    bpy.ops.drgs.save_asset(filepath=str(tmp_path / "hue.drgs"))
+    assert (read(tmp_path / "hue.drgs").slots[:, 0] == -1).all()
+
+
+def test_paint_takes_the_image_of_its_faces(ball, tmp_path):
+    arrays = part("addon.mesh_arrays")
+    values = arrays.read_channel(ball.data, "albedo").copy()
+    values[0] = 0.9, 0.1, 0.1
+    arrays.write_channel(ball.data, "albedo", values)
+    bpy.ops.drgs.save_asset(filepath=str(tmp_path / "painted.drgs"))
+    kept, before = read(tmp_path / "painted.drgs"), textured_ball()
+    near = (before.mesh.faces == 0).any(axis=1)
+    albedo = np.append(kept.slots[:, 0], -1)[kept.material]
+    np.testing.assert_array_equal(albedo < 0, near)
+
+
+def test_other_materials_of_an_asset_stay_its_vertices(scene, tmp_path):
+    asset = textured_ball()
+    half = asset.mesh.textures.material.copy()
+    half[half == 1] = -1
+    asset.mesh.textures = replace(asset.mesh.textures, material=half)
+    part("drgs_blender.core.asset.container").write_asset(tmp_path / "half.drgs", asset)
+    bpy.ops.import_scene.drgs(filepath=str(tmp_path / "half.drgs"))
+    index = np.empty(len(half), np.int32)
+    bpy.context.active_object.data.polygons.foreach_get("material_index", index)
+    np.testing.assert_array_equal(index, half + 1)
