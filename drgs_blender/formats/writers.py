@@ -61,7 +61,10 @@ class Writer:
 
 
 #: What is lost in the pictures of `atlas`.
-_TEXTURES = "materials to 1/510 (base colour as sRGB), halfway between vertices as different as can be to 1/4"
+_TEXTURES = (
+    "images of materials with painted faces; materials at vertices to 1/510 (base colour as sRGB), halfway between "
+    "vertices as different as can be to 1/4"
+)
 
 WRITERS: tuple[Writer, ...] = (
     Writer(
@@ -101,13 +104,15 @@ WRITERS: tuple[Writer, ...] = (
     Writer(
         "glTF mesh",
         write_gltf_mesh,
-        "the mesh, posed or not, with its materials as metallic-roughness textures, a place in them for each triangle",
+        "the mesh, posed or not, with images, UV map and normals where it has textures; other materials as "
+        "metallic-roughness textures, a place in them for each triangle",
         f"surfels; {_TEXTURES}; shared vertices, unless the mesh is of one material",
     ),
     Writer(
         "USD mesh",
         write_usd_mesh,
-        "the mesh, posed or not, with its materials as the textures of a UsdPreviewSurface; shared vertices",
+        "the mesh, posed or not, with images, UV map and normals where it has textures; other materials as the "
+        "textures of a UsdPreviewSurface; shared vertices",
         f"surfels; {_TEXTURES}",
     ),
     Writer(
