@@ -53,22 +53,24 @@ def main() -> None:
     for name in FILES:
         theirs = np.stack([np.load(job["out"]) for job in jobs if f"make-{name}-" in job["out"]])
         for text, more in BUDGETS.items():
-            asset = asset_path(name, **more)
-            ours = np.stack([
-                relight(
-                    asset, light, cameras[name], samples=options.samples, subpixel_samples=16, bounces=BOUNCES,
-                    strength=STRENGTH, seed=seed,
-                )["Combined"]
-                for seed in range(options.seeds)
-            ])  # fmt: skip
-            error, _ = systematic_error(ours, theirs, foreground(theirs[..., 3].min(0)))
-            rows.append([name, text, len(read_asset(asset).surfels), f"{decibels(error):.1f}"])
+            asset, found = asset_path(name, **more), []
+            for sees in ("surfels", "mesh"):
+                ours = np.stack([
+                    relight(
+                        asset, light, cameras[name], samples=options.samples, subpixel_samples=16, bounces=BOUNCES,
+                        strength=STRENGTH, seed=seed, camera_sees=sees,
+                    )["Combined"]
+                    for seed in range(options.seeds)
+                ])  # fmt: skip
+                error, _ = systematic_error(ours, theirs, foreground(theirs[..., 3].min(0)))
+                found.append(f"{decibels(error):.1f}")
+            rows.append([name, text, len(read_asset(asset).surfels), *found])
             print(*rows[-1], flush=True)
     body = (
-        "glTF files of examples/ as Blender imports them, in Cycles, against the surfels of `drgs make`: "
+        "glTF files of examples/ as Blender imports them, in Cycles, against the surfels of `drgs make`, and its mesh: "
         f"{options.size} x {options.size}, HDRI, {BOUNCES} bounces, {options.seeds} seeds of {options.spp} "
         f"and {options.samples} samples. PSNR of the file's foreground in sRGB without the noise of either program.\n\n"
-        + table(["file", "surfels", "number", "dB"], rows)
+        + table(["file", "surfels", "number", "dB", "dB, Camera Sees: Mesh"], rows)
     )
     write_section("make", "Assets of textured files", body)
 

@@ -151,7 +151,6 @@ def textured_object(
         pass_indices=np.array([state.pass_index], np.int32),
         corner_normals=normals,
         uvs=uvs,
-        uv_map=uvs,
         material_index=index,
         materials=materials,
         layers=_layers(traced, faces, materials),

@@ -19,7 +19,16 @@ from drgs_blender.core.asset.container import inspect_asset, read_asset, write_a
 from drgs_blender.core.asset.textures import ALBEDO, MeshTextures, without
 from drgs_blender.core.color import srgb_to_linear
 from drgs_blender.core.errors import AssetError
-from drgs_blender.core.frame import Adjustment, Frame, ObjectState, RenderSettings, World
+from drgs_blender.core.frame import (
+    Adjustment,
+    Frame,
+    MeshState,
+    MotionStep,
+    ObjectState,
+    Pose,
+    RenderSettings,
+    World,
+)
 from drgs_blender.core.material_adjustments import edited_asset
 from drgs_blender.engine.session import Session
 from drgs_blender.engine.textured_objects import TexturedAsset
@@ -222,6 +231,42 @@ def test_a_saved_edit_looks_as_it_did(seen, adjustment: Adjustment | None) -> No
     before, _ = seen(asset, albedo=painted, adjustment=adjustment)
     after, _ = seen(edited_asset(asset, {"albedo": painted}, adjustment))
     np.testing.assert_allclose(after, before, atol=4e-3)
+
+
+@pytest.mark.parametrize("camera_sees", ["mesh", "surfels"])
+def test_a_textured_object_is_the_object_in_every_pass(tmp_path: Path, camera_sees: str) -> None:
+    """With images of the colours of its vertices, an object has the passes that it has without: light, motion, IDs."""
+    colour = np.full((4, 4, 3), (200, 100, 50), np.uint8)
+    file = square_file(6, Image(colour, srgb=True))
+    asset = make_asset(file, density=40, max_triangles=200)
+    assert asset.mesh.textures is not None and len(asset.surfels)
+    asset.mesh.textures.normals = None
+    bare = replace(asset, mesh=replace(asset.mesh, textures=None))
+    session, found = Session(), []
+    moved = (asset.mesh.vertices + np.array((0.3, 0, 0.15))).astype(np.float32)
+    turned = np.diag([-0.8, 0.7, 0.9, 1.0])  # mirrored
+    floor = MeshState(
+        "floor", np.float32([[-3, -3, -1], [3, -3, -1], [3, 3, -1], [-3, 3, -1]]), np.int32([[0, 1, 2], [0, 2, 3]]),
+        np.eye(4)[None], np.array([3], np.int32),
+    )  # fmt: skip
+    for name, own in (("textured", asset), ("bare", bare)):
+        write_asset(tmp_path / f"{name}.drgs", own)
+        key = session.load_asset(tmp_path / f"{name}.drgs")
+        state = ObjectState("thing", key, turned, vertices=asset.mesh.vertices, pass_index=5, material_pass_index=2)
+        frame = Frame(
+            0, look_along_y(32, focal=45.0), [state], World(),
+            RenderSettings(samples=8, bounces=2, camera_sees=camera_sees, rays_see="mesh"),
+            ("Combined", "Vector", "IndexOB", "IndexMA", "CryptoObject00", "CryptoMaterial00", "Depth", "UV"),
+            meshes=[floor],
+            previous=MotionStep(look_along_y(32, focal=45.0), [Pose("thing", turned[None], moved)], [None]),
+        )  # fmt: skip
+        found.append(session.render(frame))
+        assert session._scene_cache.objects[0].textured is not None or name == "bare"
+    textured_passes, plain_passes = found
+    assert textured_passes.keys() == plain_passes.keys() and len(plain_passes) >= 8
+    assert np.abs(plain_passes["Vector"]).max() > 1
+    for name, expected in plain_passes.items():
+        np.testing.assert_allclose(textured_passes[name], expected, rtol=2e-3, atol=2e-3, err_msg=name)
 
 
 def test_normals_follow_the_pose() -> None:
