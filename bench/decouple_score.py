@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from drgs_blender.core.asset import Mesh
-from drgs_blender.core.asset.model import MATERIAL_CHANNELS, PosedSurfels, Surfels
+from drgs_blender.core.asset.model import BASE_CHANNELS, PosedSurfels, Surfels
 from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
 from drgs_blender.evaluate.metrics import material_scores, relight_scores
 from drgs_blender.evaluate.truth import TruthSet, read_truth
@@ -52,7 +52,7 @@ class Scene:
 def with_materials_of(true: Mesh, part: Part, points: Array) -> Part:
     """A mesh or surfels, at `points` (n, 3), with the materials of the nearest vertices of `true`."""
     nearest = cKDTree(true.vertices).query(points)[1]
-    return replace(part, **{name: getattr(true, name)[nearest] for name in MATERIAL_CHANNELS})
+    return replace(part, **{name: getattr(true, name)[nearest] for name in BASE_CHANNELS})
 
 
 def passes_of(

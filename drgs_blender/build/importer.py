@@ -156,16 +156,15 @@ def _finite(surfels: Surfels, name: str) -> tuple[Surfels, int]:
     if not len(surfels):
         raise AssetError(name, "has no surfels", "Export the capture again")
     good = np.ones(len(surfels), bool)
-    for channel in ("centre", "scale", "rotation", "opacity", "albedo", "roughness", "metallic"):
+    names = [name for name in Surfels.__dataclass_fields__ if name not in ("sh", "extras")]
+    names = [name for name in names if getattr(surfels, name) is not None]
+    for channel in names:
         good &= np.isfinite(getattr(surfels, channel).reshape(len(surfels), -1)).all(axis=1)
     if not good.any():
         raise AssetError(name, f"has {len(surfels)} surfels, none with finite values", "Export the capture again")
     if good.all():
         return replace(surfels), 0
-    kept = {
-        channel: getattr(surfels, channel)[good]
-        for channel in ("centre", "scale", "rotation", "opacity", "albedo", "roughness", "metallic")
-    }
+    kept = {channel: getattr(surfels, channel)[good] for channel in names}
     sh = None if surfels.sh is None else surfels.sh[good]
     extras = {key: values[good] for key, values in surfels.extras.items()}
     return Surfels(**kept, sh=sh, extras=extras), int((~good).sum())

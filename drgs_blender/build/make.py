@@ -19,7 +19,7 @@ from ..formats.mesh import check_extent
 from .mesh_textures import MAX_TEXTURE, mesh_textures
 from .refine import MAX_TRIANGLES, TOLERANCE, refine
 from .surface_detail import MAX_SURFELS, CornerFrames, SurfaceDetail
-from .texture import ALPHA, CUT_OUT, Materials
+from .texture import CUT, CUT_OUT, Materials
 from .topology import Net, weld
 
 Array = np.ndarray
@@ -149,15 +149,17 @@ def detailed_mesh(
     net, (source, corners), frames = _net(file, name, report, materials.width)
     faces = len(net.faces)
     net, values, report["rounds"], report["unresolved_edges"] = refine(net, materials, tolerance, max_triangles)
-    channels = values[:, :3], values[:, 3], values[:, 4]
+    columns = {
+        n: values[:, own] if own.stop - own.start > 1 else values[:, own.start] for n, own in materials.columns.items()
+    }
+    alpha = columns.pop(CUT, None)
     count = file.file_count or len(file.vertices)
     origin = _source(net, file.vertex_numbers[source], file.vertex_numbers[corners], count)
     divided = len(net.faces) > faces
-    if materials.width > ALPHA:
-        _cut_out(net, values[:, ALPHA], materials.cut_out, name, report)
-    report["notes"] += [f"{material}: partly transparent, shown as opaque" for material in materials.veiled]
+    if alpha is not None:
+        _cut_out(net, alpha, materials.cut_out, name, report)
     report["vertices"], report["faces"] = len(net.vertices), len(net.faces)
-    mesh = Mesh(net.vertices, net.faces, *channels, _groups(net, file), origin)
+    mesh = Mesh(net.vertices, net.faces, **columns, groups=_groups(net, file), source=origin)
     if max_texture > 0:
         mesh.textures = mesh_textures(net, file, frames, divided, max_texture, report["notes"])
     if turned not in (None, "z"):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .texture import Materials, perceived
+from .texture import Materials
 from .topology import Net, close_marks, edge_lengths, edges, subdivide, survivors
 
 Array = np.ndarray
@@ -122,7 +122,7 @@ class _TextureFit:
             self._corners = before._corners.take(kept, axis=1)
             self._along, self._middle = before._along.take(kept, axis=0), before._middle.take(kept)
         self._corners[:, new] = _at_corners(net, materials, np.flatnonzero(new))
-        self.values = _at_vertices(net, self._corners)
+        self.values = _at_vertices(net, materials, self._corners)
         moved = np.zeros(len(net.vertices), bool)  # their values are others than before
         moved[net.faces[new]] = True
         moved = moved[net.faces]
@@ -153,7 +153,7 @@ def _at_corners(net: Net, materials: Materials, some: Array) -> Array:
     return found.T.reshape(materials.width, len(some), 3)
 
 
-def _at_vertices(net: Net, corners: Array) -> Array:
+def _at_vertices(net: Net, materials: Materials, corners: Array) -> Array:
     """Values (n, channels) float32 of the vertices: the mean over all their corners, channel by channel in memory."""
     flat, n = net.faces.reshape(-1), len(net.vertices)
     count = np.maximum(np.bincount(flat, minlength=n), 1)
@@ -161,7 +161,7 @@ def _at_vertices(net: Net, corners: Array) -> Array:
     values[:3] *= net.values[:, :3].T
     own = net.values[:, 3:].T
     np.copyto(values[3:], own, where=np.isfinite(own))
-    return np.clip(values, 0, 1).astype(np.float32).T
+    return materials.clipped(values).astype(np.float32).T
 
 
 def _corner_size(uvs: Array) -> Array:
@@ -183,7 +183,7 @@ class _Comparison:
 
     def __init__(self, net: Net, materials: Materials, values: Array) -> None:
         self._net, self._materials = net, materials
-        self._values = perceived(values.T).astype(np.float64)
+        self._values = materials.perceived(values.T).astype(np.float64)
         colours = net.values[:, :3].T
         self._colours = None if (colours == 1).all() else np.where(np.isfinite(colours), colours, 1)
         self._given = np.isfinite(net.values.T)  # channels the file gives at its vertices have no textures
@@ -234,7 +234,7 @@ class _Comparison:
         if self._colours is not None:
             texture[:3] *= _mean(weights, [self._colours.take(vertex, axis=1) for vertex in vertices])
         values = _mean(weights, [self._values.take(vertex, axis=1) for vertex in vertices])
-        difference = np.abs(perceived(texture) - values)
+        difference = np.abs(self._materials.perceived(texture) - values)
         for channel, given in zip(difference, self._given):
             if given.any():
                 channel[given[vertices[0]]] = 0

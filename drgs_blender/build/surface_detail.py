@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.asset.model import Binding, Mesh, Surfels
+from ..core.asset.model import MATERIAL_CHANNELS, Binding, Mesh, Surfels
 from ..deform.face_frames import Faces, dot, shading_frames
 from ..geometry.distinct_rows import distinct_row_indices
 from ..geometry.normals import VertexNormals, unit
-from .texture import ALPHA, Materials, perceived
+from .texture import CUT, Materials
 from .topology import Net
 
 Array = np.ndarray
@@ -130,7 +130,7 @@ class SurfaceDetail:
         own = np.einsum("nk,nkc->nc", weights, net.values[net.faces[face]])
         values[:, :3] *= own[:, :3]
         np.copyto(values[:, 3:], own[:, 3:], where=np.isfinite(own[:, 3:]))
-        return np.clip(values, 0, 1)
+        return self._materials.clipped(values.T).T
 
     def normals_at(self, face: Array, weights: Array, extent: Array) -> Array:
         """Unit shading normals (n, 3) of points, object space; of a map averaged over an extent (n, 2)."""
@@ -157,11 +157,16 @@ class SurfaceDetail:
             return error
         some, fine = face[shown], 0.35 * extent[shown]
         middle = pieces[shown].mean(axis=1)
-        values, normals = perceived(self.values_at(some, middle, fine).T), self.normals_at(some, middle, fine)
+        values, normals = (
+            self._materials.perceived(self.values_at(some, middle, fine).T),
+            self.normals_at(some, middle, fine),
+        )
         worst = np.zeros(len(shown))
         for probe in _PROBES:
             at = np.einsum("k,nkc->nc", probe, pieces[shown])
-            apart = np.abs(perceived(self.values_at(some, at, fine).T) - values).max(axis=0) / DIFFERENCE
+            apart = (
+                np.abs(self._materials.perceived(self.values_at(some, at, fine).T) - values).max(axis=0) / DIFFERENCE
+            )
             turn = np.arccos(np.clip(dot(self.normals_at(some, at, fine), normals), -1, 1)) / TURN
             worst = np.maximum(worst, np.maximum(apart, turn))
         corners = np.einsum("nij,njc->nic", pieces[shown], net.vertices[net.faces[some]])
@@ -188,11 +193,12 @@ class SurfaceDetail:
         face, weights = binding.face, binding.barycentric.astype(np.float64)
         extent = self.extent_of(face, pieces)
         values = self.values_at(face, weights, extent).astype(np.float32)
-        surfels.albedo, surfels.roughness, surfels.metallic = (
-            np.ascontiguousarray(values[:, :3]), np.ascontiguousarray(values[:, 3]), np.ascontiguousarray(values[:, 4]),
-        )  # fmt: skip
-        if values.shape[1] > ALPHA:
-            surfels.opacity *= values[:, ALPHA]
+        for name, own in self._materials.columns.items():
+            channel = np.ascontiguousarray(values[:, own] if own.stop - own.start > 1 else values[:, own.start])
+            if name == CUT:
+                surfels.opacity *= channel
+            elif MATERIAL_CHANNELS[name].surfels:
+                setattr(surfels, name, channel)
         faces = Faces.of(mesh.vertices, mesh.faces)
         normals = self.normals_at(face, weights, extent)
         inward = dot(normals, faces.normal[face]) < LEAST_FACING

@@ -6,14 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..core.asset.model import MATERIAL_CHANNELS, OPTIONAL_CHANNELS
 from ..core.color import srgb_to_linear, to_unit
 from ..formats.files import Image, MaterialFile
 
 Array = np.ndarray
 
-#: Columns of sampled materials: albedo (linear Rec.709), roughness, metallic; then alpha, where any material has some.
+#: Columns that sampled materials always have: albedo (linear Rec.709), roughness, metallic.
 CHANNELS = 5
-ALPHA = CHANNELS
+#: The alpha of materials that are cut out, among `Materials.columns`.
+CUT = "cut"
 #: Alpha below which there is no surface, where a material is cut out.
 CUT_OUT = 0.5
 #: A material is cut out where this part of its alpha is at most .1 or at least .9, and some of it the former.
@@ -168,8 +170,9 @@ class Materials:
         Which have images, and which normal maps.
     cut_out : (materials + 1,) bool array
         Whose alpha says where there is a surface.
-    veiled : list of str
-        Names of those that are partly transparent in another way, which is not sampled.
+    columns : dict of str to slice
+        Where channels stand in what is sampled. Beside albedo, roughness and metallic these are `CUT` and the optional
+        channels of an asset that any material needs.
     width : int
         Columns of `sample`.
     """
@@ -180,9 +183,17 @@ class Materials:
         self._materials = [*materials, plain]  # index -1 finds the last
         self.bumpy = np.array([m.normal_image is not None for m in self._materials])
         self.cut_out = np.array([_is_cut_out(m) for m in self._materials])
+        self.columns = {"albedo": slice(0, 3), "roughness": slice(3, 4), "metallic": slice(4, 5)}
+        self.width = CHANNELS
+        for name, neutral in ((CUT, 1.0), *((name, MATERIAL_CHANNELS[name].neutral) for name in OPTIONAL_CHANNELS)):
+            values = [np.asarray(self._factor(index, name)) for index in range(len(self._materials))]
+            if any((value != neutral).any() for value in values) or self._has_image(name):
+                self.columns[name] = slice(self.width, self.width + values[0].size)
+                self.width += values[0].size
+        self._limit = np.ones((self.width, 1), np.float32)
+        if "emission" in self.columns:
+            self._limit[self.columns["emission"]] = np.inf
         self.textured = np.array([bool(self._images(k)) for k in range(len(self._materials))])
-        self.veiled = [m.name for m, cut in zip(self._materials, self.cut_out) if not cut and _alpha_of(m).mean() < 1]
-        self.width = CHANNELS + int(self.cut_out.any())
 
     def sample(self, material: Array, uvs: Array, scale: Array) -> Array:
         """Values (n, width) of points, channel by channel in memory.
@@ -202,14 +213,28 @@ class Materials:
             for first in range(0, len(of_material), TOGETHER):
                 rows = of_material[first : first + TOGETHER]
                 result[:, rows] = self._of_material(index, uvs[rows], scale[rows])
-        return np.clip(result, 0, 1, out=result).T
+        return self.clipped(result).T
+
+    def clipped(self, values: Array) -> Array:
+        """Values (width, n) within the limits of their channels, in place."""
+        return np.clip(values, 0, self._limit, out=values)
+
+    def perceived(self, values: Array) -> Array:
+        """Values (width, n) in which equal steps look about equal: the square root of colours, of emission up to 1."""
+        result = values.copy()
+        result[:3] = np.sqrt(np.maximum(values[:3], 0))
+        if (own := self.columns.get("emission")) is not None:
+            radiance = np.maximum(values[own], 0)
+            result[own] = np.sqrt(radiance / (1 + radiance))
+        return result
 
     def _of_material(self, index: int, uvs: Array, scale: Array) -> Array:
         """Values (width, n) of points of one material."""
         m = self._materials[index]
         values = np.empty((self.width, len(uvs)), np.float32)
-        alpha = m.alpha if self.cut_out[index] else 1.0
-        values[:] = np.array((*m.base_colour, m.roughness, m.metallic, alpha)[: self.width])[:, None]
+        values[:CHANNELS] = np.array((*m.base_colour, m.roughness, m.metallic))[:, None]
+        for name, own in list(self.columns.items())[3:]:
+            values[own] = np.reshape(self._factor(index, name), (-1, 1))
         taps: dict[tuple[object, ...], TrilinearTaps] = {}
         for image, columns, channels in self._images(index):
             pyramid = self._pyramid(image)
@@ -257,12 +282,36 @@ class Materials:
     def _images(self, index: int) -> list[tuple[Image, slice, slice]]:
         """(image, columns of the values it multiplies, its channels) of a material."""
         m = self._materials[index]
-        images = (
+        images = [
             (m.base_colour_image, slice(0, 3), slice(0, 3)),
             (m.metallic_roughness_image, slice(3, 5), slice(1, 3)),
-            (m.alpha_image if self.cut_out[index] else None, slice(ALPHA, ALPHA + 1), slice(0, 1)),
-        )
+        ]
+        for name, own in list(self.columns.items())[3:]:
+            images.append((self._image(index, name), own, slice(0, own.stop - own.start)))
         return [(image, columns, channels) for image, columns, channels in images if image is not None]
+
+    def _factor(self, index: int, name: str) -> float | tuple[float, ...]:
+        """What the image of a column of a material is multiplied by; the value where there is no image."""
+        m = self._materials[index]
+        if name in (CUT, "opacity"):
+            return m.alpha if self.cut_out[index] == (name == CUT) else 1.0
+        factor: float | tuple[float, ...] = getattr(m, name)
+        return factor
+
+    def _image(self, index: int, name: str) -> Image | None:
+        """The image of a column of a material."""
+        m = self._materials[index]
+        if name in (CUT, "opacity"):
+            return m.alpha_image if self.cut_out[index] == (name == CUT) else None
+        image: Image | None = getattr(m, f"{name}_image")
+        return image
+
+    def _has_image(self, name: str) -> bool:
+        """Whether a material has an image for a column that is not white."""
+        images = [self._image(index, name) for index in range(len(self._materials))]
+        if name == "opacity":
+            return any(image is not None and to_unit(image.pixels).min(initial=1) < 1 for image in images)
+        return any(image is not None for image in images)
 
     def _pyramid(self, image: Image) -> Pyramid:
         if id(image) not in self._pyramids:
@@ -320,10 +369,3 @@ def _wrap(index: Array, size: Array, mode: str) -> Array:
     else:
         index[outside] = np.mod(out, size)
     return index
-
-
-def perceived(values: Array) -> Array:
-    """Values (channels, n) with the square root of albedo, in which equal steps look about equal."""
-    result = values.copy()
-    result[:3] = np.sqrt(np.maximum(values[:3], 0))
-    return result

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..core.asset.model import Binding, Mesh, Surfels
+from ..core.asset.model import BASE_CHANNELS, MATERIAL_CHANNELS, SURFEL_CHANNELS, Binding, Mesh, Surfels
 from ..deform.binding import clamp_weights
 from ..deform.face_frames import Faces, dot
 from ..geometry.normals import VertexNormals, rotation_matrices
@@ -44,7 +44,7 @@ def surfels_to_vertices(mesh: Mesh, surfels: Surfels, binding: Binding) -> int:
     )
     normal = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
     tree, k, lonely = cKDTree(surfels.centre), min(NEAREST, len(surfels)), 0
-    found = {name: np.empty_like(getattr(mesh, name)) for name in ("albedo", "roughness", "metallic")}
+    found = {name: np.empty_like(getattr(mesh, name)) for name in BASE_CHANNELS}
     for first in range(0, len(mesh.vertices), _TOGETHER):
         rows = slice(first, first + _TOGETHER)
         vertices = mesh.vertices[rows].astype(np.float64)
@@ -109,6 +109,7 @@ def vertices_to_surfels(mesh: Mesh, surfels: Surfels, binding: Binding) -> None:
     """Give the surfels the materials of the points that they hang on; edit `surfels` in place."""
     weights = clamp_weights(binding.barycentric.astype(np.float64))
     corners = mesh.faces[binding.face]
-    for name in ("albedo", "roughness", "metallic"):
-        values = getattr(mesh, name)[corners]
-        setattr(surfels, name, np.einsum("nk,nk...->n...", weights, values).astype(np.float32).clip(0, 1))
+    for name in mesh.channels:
+        if name in BASE_CHANNELS or name in SURFEL_CHANNELS:
+            values = np.einsum("nk,nk...->n...", weights, getattr(mesh, name)[corners]).astype(np.float32)
+            setattr(surfels, name, values.clip(0, MATERIAL_CHANNELS[name].limit))

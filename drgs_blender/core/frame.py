@@ -109,6 +109,8 @@ class Adjustment:
         Gain, offset, lowest, highest: new = clip(gain * old + offset, lowest, highest).
     mask : (n,) float32 array, optional
         How much of it a vertex gets, in [0, 1]; None: all of it everywhere.
+    emission, opacity : float
+        Factors on those of the object; of the opacity at most 1.
     """
 
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -118,6 +120,8 @@ class Adjustment:
     roughness: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 1.0)
     metallic: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 1.0)
     mask: Array | None = None
+    emission: float = 1.0
+    opacity: float = 1.0
 
 
 @dataclass(slots=True)
@@ -141,6 +145,10 @@ class ObjectState:
         Per-vertex overrides; None keeps the asset's.
     roughness, metallic : (n,) array, optional
         Per-vertex overrides; None keeps the asset's.
+    opacity, specular, coat : (n,) array, optional
+        Per-vertex overrides; None keeps the asset's.
+    emission : (n, 3) array, optional
+        Per-vertex overrides, linear Rec.709 radiance; None keeps the asset's.
     pass_index, material_pass_index : int
         Blender's object index pass, and that of its material.
     visibility : Visibility
@@ -181,6 +189,10 @@ class ObjectState:
     aovs: list[ShaderAOV] = field(default_factory=list)
     light_group: str = ""
     terminator_offset: float = 0.0
+    opacity: Array | None = None
+    emission: Array | None = None
+    specular: Array | None = None
+    coat: Array | None = None
 
 
 @dataclass(slots=True)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 
-from ..core.asset.model import Binding, Mesh, Surfels
+from ..core.asset.model import MATERIAL_CHANNELS, SURFEL_CHANNELS, Binding, Mesh, Surfels
 from ..core.errors import AssetError
 from ..geometry.distinct_rows import distinct_row_indices
 from ..geometry.normals import lengths, quaternions, unit
@@ -150,7 +150,8 @@ def attach(
         frame, deviation = _fit(frame, centre, pieces, spread, rims)
 
     at = mesh.faces[patches.face]
-    mix = lambda values: np.clip(np.einsum("nk,nk...->n...", weights, values[at]), 0, 1)  # noqa: E731
+    mix = lambda values, most=1: np.clip(np.einsum("nk,nk...->n...", weights, values[at]), 0, most)  # noqa: E731
+    optional = [name for name in SURFEL_CHANNELS if getattr(mesh, name) is not None]
     surfels = Surfels(
         centre=centre,
         scale=deviation,
@@ -159,6 +160,7 @@ def attach(
         albedo=mix(mesh.albedo),
         roughness=mix(mesh.roughness),
         metallic=mix(mesh.metallic),
+        **{name: mix(getattr(mesh, name), MATERIAL_CHANNELS[name].limit) for name in optional},
     )
     binding = Binding(
         face=patches.face, barycentric=weights, offset=np.zeros(n), normal=np.tile([0.0, 0.0, 1.0], (n, 1))

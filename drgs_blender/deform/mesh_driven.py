@@ -17,7 +17,7 @@ import numpy as np
 
 from ..compute.jit import njit, plain
 from ..compute.threads import ELEMENTS, over_range
-from ..core.asset.model import MATERIAL_CHANNELS, Binding, Mesh, PosedSurfels, Surfels
+from ..core.asset.model import BASE_CHANNELS, Binding, Mesh, PosedSurfels, Surfels, neutral_values
 from ..core.errors import AssetError
 from ..geometry.normals import VertexNormals, rotation_matrices, unit
 from .face_frames import Faces
@@ -187,15 +187,18 @@ class MeshDriven:
         if torn is not None:
             smooth_faces = np.where(torn[:, None], np.int32(0), smooth_faces)
             opacity = np.where(torn[self.binding.face], np.float32(0.0), opacity)
-        channels = {name: self._channel(name, (materials or {}).get(name)) for name in MATERIAL_CHANNELS}
+        channels = {name: self.channel(name, (materials or {}).get(name)) for name in BASE_CHANNELS}
         sign = -1.0 if np.linalg.det(linear) < 0 else 1.0
         return Posing(vertices, normals, smooth_faces, linear, sign, opacity, channels)
 
-    def _channel(self, name: str, edited: Array | None) -> Array:
-        """A material channel of the surfels after the vertices' values became `edited`."""
-        own, rest = getattr(self.surfels, name), getattr(self.mesh, name)
+    def channel(self, name: str, edited: Array | None) -> Array:
+        """A material channel of the surfels after the vertices' values became `edited`; None: these are the asset's."""
+        own: Array | None = getattr(self.surfels, name)
+        if own is None:
+            own = neutral_values(name, len(self.surfels))
         if edited is None:
             return own
+        rest = self.mesh.channel(name)
         edited = np.ascontiguousarray(edited, dtype=np.float32)
         if edited.shape != rest.shape:
             raise AssetError(f"{name} of the vertices", f"has shape {edited.shape}, expected {rest.shape}")

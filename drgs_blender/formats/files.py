@@ -101,6 +101,14 @@ class MaterialFile:
         First channel multiplies `alpha`; never sRGB.
     cut_out : bool
         Whether alpha is 0 or 1 by intent, as of leaves: then what is mostly transparent is not there.
+    emission : tuple of float
+        Linear Rec.709 radiance.
+    emission_image : Image, optional
+        RGB; multiplies emission.
+    specular, coat : float
+        As `core.asset.model.MATERIAL_CHANNELS` has them.
+    specular_image, coat_image : Image, optional
+        First channel; multiplies the factors; never sRGB.
     """
 
     name: str
@@ -114,6 +122,12 @@ class MaterialFile:
     alpha: float = 1.0
     alpha_image: Image | None = None
     cut_out: bool = False
+    emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    emission_image: Image | None = None
+    specular: float = 0.5
+    specular_image: Image | None = None
+    coat: float = 0.0
+    coat_image: Image | None = None
 
 
 @dataclass(slots=True)

@@ -14,6 +14,8 @@ from .images import decode_image
 
 Array = np.ndarray
 
+#: Extensions that are read, where they are named here.
+_READ = ("KHR_materials_emissive_strength", "KHR_materials_specular", "KHR_materials_clearcoat")
 _WRAP = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
 
 
@@ -54,13 +56,58 @@ class GltfMaterials:
         material.metallic_roughness_image, other_set = self._texture(pbr, "metallicRoughnessTexture", srgb=False)
         if material.base_colour_image and material.metallic_roughness_image and colour_set != other_set:
             self.notes.append(f"{material.name}: textures on two UV maps; the one of the base colour is used for both")
-        if get(entry, "emissiveTexture", dict) or document.numbers(entry, "emissiveFactor", (0.0, 0.0, 0.0)).any():
-            self.notes.append(f"{material.name}: emission ignored")
         self._alpha(entry, material, float(colour[3]))
-        uv_set = self._normal_map(entry, material, colour_set if material.base_colour_image else other_set)
+        first = colour_set if material.base_colour_image else other_set
+        uv_set = self._normal_map(entry, material, self._layers(entry, extensions, material, first))
         for name in extensions:
-            if name.startswith("KHR_materials_"):
+            if name.startswith("KHR_materials_") and name not in _READ:
                 self.notes.append(f"{material.name}: {name} ignored")
+        return uv_set
+
+    def _layers(self, entry: dict[str, Any], extensions: dict[str, Any], material: MaterialFile, uv_set: int) -> int:
+        """Read emission, specular level and coat; return the UV set of all textures, as `_normal_map` does."""
+        document, get = self.document, self.document.get
+        glow = get(extensions, "KHR_materials_emissive_strength", dict, {})
+        strength = float(document.numbers(glow, "emissiveStrength", (1.0,))[0])
+        radiance = strength * document.numbers(entry, "emissiveFactor", (0.0, 0.0, 0.0)).astype(np.float64)
+        usable = np.isfinite(radiance).all() and (radiance >= 0).all()
+        if not usable:
+            self.notes.append(f"{material.name}: emission ignored: its factor or strength is negative or no number")
+        specular = get(extensions, "KHR_materials_specular", dict, {})
+        coat = get(extensions, "KHR_materials_clearcoat", dict, {})
+        factors = (
+            document.numbers(specular, "specularFactor", (1.0,)),
+            document.numbers(coat, "clearcoatFactor", (0.0,)),
+        )
+        level, weight = (float(np.clip(np.nan_to_num(factor[0]), 0, 1)) for factor in factors)
+        tint = np.nan_to_num(document.numbers(specular, "specularColorFactor", (1.0, 1.0, 1.0)).astype(np.float64))
+        # A level of 0.5 is the 4 % that glTF's dielectrics reflect.
+        material.specular, material.coat = float(np.clip(0.5 * level * tint.mean(), 0, 1)), weight
+        if np.ptp(tint) > 1e-3 or "specularColorTexture" in specular:
+            self.notes.append(f"{material.name}: colour of KHR_materials_specular ignored, its mean is used")
+        roughness = float(document.numbers(coat, "clearcoatRoughnessFactor", (0.0,))[0])
+        odd = abs(roughness - 0.03) > 0.03 or "clearcoatRoughnessTexture" in coat or "clearcoatNormalTexture" in coat
+        if weight > 0 and odd:
+            self.notes.append(
+                f"{material.name}: roughness and normals of KHR_materials_clearcoat ignored: coats are smooth"
+            )
+        if usable and radiance.any():
+            material.emission = _rgb(radiance)
+        wanted = (
+            ("emission", entry, "emissiveTexture", usable and radiance.any()),
+            ("specular", specular, "specularTexture", level > 0),
+            ("coat", coat, "clearcoatTexture", weight > 0),
+        )
+        for name, place, key, used in wanted:
+            image, own_set = self._texture(place, key, srgb=name == "emission") if used else (None, 0)
+            if image is None:
+                continue
+            others = (material.base_colour_image, material.metallic_roughness_image, material.emission_image)
+            if own_set != uv_set and any(other is not None for other in others):
+                self.notes.append(f"{material.name}: {key} ignored: its UV map is not that of the other textures")
+                continue
+            uv_set = own_set
+            setattr(material, f"{name}_image", image.alpha if name == "specular" else image)
         return uv_set
 
     def _alpha(self, entry: dict[str, Any], material: MaterialFile, factor: float) -> None:
@@ -86,7 +133,8 @@ class GltfMaterials:
         image, own_set = self._texture(entry, "normalTexture", srgb=False)
         if image is None:
             return uv_set
-        if own_set != uv_set and (material.base_colour_image or material.metallic_roughness_image):
+        others = (material.base_colour_image, material.metallic_roughness_image, material.emission_image)
+        if own_set != uv_set and any(other is not None for other in others):
             self.notes.append(f"{material.name}: normal map ignored: its UV map is not that of the other textures")
             return uv_set
         info = self.document.get(entry, "normalTexture", dict, {})

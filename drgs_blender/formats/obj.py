@@ -186,6 +186,17 @@ def _read_mtl(path: Path, notes: list[str]) -> dict[str, MaterialFile]:
                 picture = _image(line, path, notes)
                 if picture is not None:
                     current.alpha_image = picture.alpha or replace(picture, srgb=False)
+            elif keyword == "ke":
+                r, g, b = (float(w) for w in words[1:4])
+                if not (np.isfinite((r, g, b)).all() and min(r, g, b) >= 0):
+                    raise ValueError
+                current.emission = r, g, b
+            elif keyword == "map_ke":
+                current.emission_image = _image(line, path, notes)
+                if current.emission_image is not None:
+                    current.emission = (1.0, 1.0, 1.0)
+            elif keyword == "pc":
+                current.coat = float(np.clip(float(words[1]), 0, 1))
             elif keyword in ("norm", "map_bump", "bump"):
                 _read_normal_map(current, line, path, notes)
             elif keyword in ("map_pr", "map_pm", "map_ns"):

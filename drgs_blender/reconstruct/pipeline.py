@@ -15,7 +15,7 @@ import torch
 from ..build.transfer import surfels_to_vertices
 from ..compute.prepare import PHASE, prepare_kernels
 from ..core.arrays import Array
-from ..core.asset.model import MATERIAL_CHANNELS, Asset, Binding, Environment, Mesh, Surfels
+from ..core.asset.model import BASE_CHANNELS, Asset, Binding, Environment, Mesh, Surfels
 from ..core.errors import Cancelled, WriteError
 from ..deform.binding import bind
 from ..deform.mesh_driven import MeshDriven
@@ -321,7 +321,7 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: 
 def _copy_materials(surfels: Surfels, mesh: Mesh, binding: Binding) -> None:
     """Give surfels the materials of the mesh where they hang on it, in place."""
     corners, share = mesh.faces[binding.face], binding.barycentric
-    for name in MATERIAL_CHANNELS:
+    for name in BASE_CHANNELS:
         blended = np.einsum("nk,nk...->n...", share, getattr(mesh, name)[corners])
         setattr(surfels, name, np.clip(blended, 0, 1).astype(np.float32))
 
@@ -329,8 +329,8 @@ def _copy_materials(surfels: Surfels, mesh: Mesh, binding: Binding) -> None:
 def _visible_surfels(gaussians: Gaussians, visible: Array) -> Surfels:
     """Surfels that can be seen."""
     surfels = gaussians.surfels()
-    rows = {name: getattr(surfels, name)[visible] for name in Surfels.__dataclass_fields__ if name != "extras"}
-    return Surfels(**rows)
+    names = [name for name in Surfels.__dataclass_fields__ if name != "extras" and getattr(surfels, name) is not None]
+    return Surfels(**{name: getattr(surfels, name)[visible] for name in names})
 
 
 def _rows(binding: Binding, keep: Array) -> Binding:

@@ -8,6 +8,7 @@ import os
 import struct
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -291,6 +292,58 @@ def test_unknown_members_and_foreign_conventions_are_refused(file: Path) -> None
     rewrite(file, {}, manifest={"schema": SCHEMA + 1, "producer": "drgs-blender 9"})
     with pytest.raises(VersionError, match="drgs-blender 9"):
         read_asset(file)
+
+
+def with_channels() -> Asset:
+    asset = make_asset()
+    n, k = len(asset.mesh.vertices), len(asset.surfels)
+    asset.mesh.emission, asset.mesh.opacity = np.full((n, 3), 20, F), np.full(n, 0.5, F)
+    asset.surfels.emission, asset.surfels.coat = np.full((k, 3), 30, F), np.full(k, 0.25, F)
+    return asset
+
+
+def test_optional_channels_need_the_schema_that_has_them(tmp_path: Path) -> None:
+    """Files without them are what they were."""
+    plain, more = tmp_path / "plain.drgs", tmp_path / "more.drgs"
+    write_asset(plain, make_asset())
+    write_asset(more, with_channels())
+    manifests = [json.loads(read_archive(path)[MANIFEST].tobytes()) for path in (plain, more)]
+    assert [manifest["schema"] for manifest in manifests] == [1, 3]
+    old = [list(manifest["members"]["mesh.safetensors"]["tensors"]) for manifest in manifests]
+    assert old[1][: len(old[0])] == old[0] and set(old[1]) - set(old[0]) == {"opacity", "emission"}
+    asset = read_asset(more)
+    assert asset.surfels.emission.max() == 30 and asset.mesh.opacity.max() == 0.5 and asset.mesh.coat is None
+    write_asset(tmp_path / "again.drgs", asset)
+    assert (tmp_path / "again.drgs").read_bytes() == more.read_bytes()
+    ranges = inspect_asset(more)["ranges"]
+    assert ranges["mesh.emission"] == [20, 20] and "mesh.coat" not in ranges
+    rewrite(more, {}, manifest={"schema": 2})
+    with pytest.raises(AssetError, match="emission: with type float32 is not part of schema 2"):
+        read_asset(more)
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "array", "words"),
+    [
+        ("mesh", "emission", np.full((12, 3), np.nan, F), "NaN"),
+        ("surfels", "emission", np.full((40, 3), -1, F), "negative"),
+        ("mesh", "opacity", np.full(12, 1.5, F), "outside"),
+        ("surfels", "specular", np.full(40, -1, F), "outside"),
+    ],
+)
+def test_bad_channels_are_refused(tmp_path: Path, part: str, name: str, array: np.ndarray, words: str) -> None:
+    asset = with_channels()
+    setattr(getattr(asset, part), name, array)
+    with pytest.raises(AssetError, match=words) as caught:
+        write_asset(tmp_path / "a.drgs", asset)
+    assert name in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["opacity", "emission", "specular", "coat"])
+def test_channels_of_the_wrong_length_are_refused(name: str) -> None:
+    asset = make_asset()
+    with pytest.raises(AssetError, match=f"mesh {name}.*shape"):
+        replace(asset.mesh, **{name: np.zeros((3, 3), F)})
 
 
 HOSTILE = {

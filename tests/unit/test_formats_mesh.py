@@ -184,9 +184,35 @@ def test_materials_textures_and_colours(tmp_path: Path) -> None:
     assert material.base_colour_image.wrap == ("clamp", "repeat")
     np.testing.assert_allclose(mesh.corner_uvs[0], [[0, 1], [1, 1], [0, 0]])
     np.testing.assert_allclose(mesh.vertex_colours[0], [1, 0, 0.2], atol=1e-7)  # linear by definition
-    notes = " ".join(mesh.notes)
-    assert "emission ignored" in notes
+    assert material.emission == (1.0, 0.0, 0.0) and material.emission_image is None and not mesh.notes
     assert material.alpha == 1.0 and material.alpha_image is None
+
+
+def test_gltf_has_emission_specular_and_coat(tmp_path) -> None:
+    pixels = np.zeros((2, 2, 4), np.uint8)
+    pixels[..., 0], pixels[..., 3] = 128, 64
+    Pillow.fromarray(pixels).save(tmp_path / "t.png")
+    b = quad(material=0)
+    b.json["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = b.accessor(np.zeros((4, 2), np.float32), "VEC2")
+    extensions = {
+        "KHR_materials_emissive_strength": {"emissiveStrength": 8},
+        "KHR_materials_specular": {"specularFactor": 0.5, "specularTexture": {"index": 0}},
+        "KHR_materials_clearcoat": {"clearcoatFactor": 0.75, "clearcoatTexture": {"index": 0}},
+        "KHR_materials_sheen": {},
+    }
+    entry = {
+        "name": "lamp", "emissiveFactor": [1, 0.5, 0], "emissiveTexture": {"index": 0}, "extensions": extensions,
+    }  # fmt: skip
+    b.json |= {"materials": [entry], "textures": [{"source": 0}], "images": [{"uri": "t.png"}]}
+    mesh = read_mesh(b.write(tmp_path / "a.gltf"))
+    material = mesh.materials[0]
+    assert (material.emission, material.specular, material.coat) == ((8.0, 4.0, 0.0), 0.25, 0.75)
+    assert material.emission_image.srgb and not material.coat_image.srgb
+    assert material.specular_image.pixels.max() == pytest.approx(64 / 255)
+    assert mesh.notes == ["lamp: KHR_materials_sheen ignored"]
+    entry["emissiveFactor"] = [-1, 0, 0]
+    mesh = read_mesh(b.write(tmp_path / "b.gltf"))
+    assert not any(mesh.materials[0].emission) and "emission ignored" in mesh.notes[0]
 
 
 @pytest.mark.parametrize(("mode", "cut"), [("MASK", True), ("BLEND", False), ("OPAQUE", False)])

@@ -13,10 +13,12 @@ from test_build_make import plane, ramp
 
 from drgs_blender.build.make import make_asset, read_mesh_file
 from drgs_blender.build.surface_detail import CornerFrames
+from drgs_blender.core.asset.container import read_asset, write_asset
 from drgs_blender.core.asset.model import Asset
 from drgs_blender.core.errors import AssetError
 from drgs_blender.deform.face_frames import Faces, shading_frames
 from drgs_blender.formats.files import Image, MaterialFile, MeshFile
+from drgs_blender.formats.registry import read_mesh
 
 
 def shading_normals(asset: Asset) -> np.ndarray:
@@ -197,12 +199,44 @@ def test_cut_out_cards_keep_the_leaf_alone(said: bool) -> None:
     assert any("cut out" in note for note in asset.provenance["report"]["notes"])
 
 
-def test_glass_stays_and_is_told() -> None:
+def test_glass_keeps_its_opacity() -> None:
     asset = make_asset(card(MaterialFile("lens", alpha=0.3)))
-    assert asset.surfels.opacity.min() > 0.95
-    assert "lens: partly transparent, shown as opaque" in asset.provenance["report"]["notes"]
+    assert asset.surfels.opacity.min() > 0.95 and (asset.mesh.opacity == np.float32(0.3)).all()
     veil = make_asset(card(MaterialFile("veil", alpha_image=alpha_image(np.full((4, 4), 0.4)))))
     assert veil.surfels.opacity.min() > 0.95 and len(veil.mesh.faces) == 8
+    np.testing.assert_allclose(veil.mesh.opacity, 0.4, atol=1e-6)
+    assert make_asset(card(MaterialFile("solid"))).mesh.opacity is None
+
+
+def test_emission_specular_and_coat_are_kept(tmp_path) -> None:
+    """Radiance beyond 1 is not cut, and its texture divides the mesh."""
+    half = np.zeros((64, 64, 3), np.float32)
+    half[:, :32] = 1
+    image = Image(half, srgb=False, wrap=("clamp", "clamp"))
+    file = card(MaterialFile("lamp", emission=(20.0, 10.0, 0.0), emission_image=image, specular=0.25, coat=0.75))
+    asset = make_asset(file)
+    left = asset.mesh.vertices[:, 0] < 0.45
+    np.testing.assert_allclose(asset.mesh.emission[left], np.tile([20, 10, 0], (left.sum(), 1)), rtol=1e-3)
+    assert not asset.mesh.emission[asset.mesh.vertices[:, 0] > 0.55].any() and len(asset.mesh.faces) > 8
+    bright = asset.surfels.centre[:, 0] < 0.45
+    np.testing.assert_allclose(asset.surfels.emission[bright, 0], 20, rtol=1e-3)
+    assert (asset.mesh.specular == 0.25).all() and (asset.surfels.coat == 0.75).all() and asset.mesh.opacity is None
+    write_asset(tmp_path / "a.drgs", asset)
+    again = read_asset(tmp_path / "a.drgs")
+    for name in ("emission", "specular", "coat"):
+        np.testing.assert_array_equal(getattr(again.mesh, name), getattr(asset.mesh, name))
+        np.testing.assert_array_equal(getattr(again.surfels, name), getattr(asset.surfels, name))
+
+
+def test_obj_emits(tmp_path) -> None:
+    lines = "newmtl glow\nKd 1 1 1\nKe 4 2 1\nd 0.5\nPc 0.3\nnewmtl bad\nKe nan 0 0\n"
+    (tmp_path / "m.mtl").write_text(lines)
+    text = "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nusemtl glow\nf 1 2 3\nusemtl bad\nf 1 3 2\n"
+    (tmp_path / "a.obj").write_text(text)
+    file = read_mesh(tmp_path / "a.obj")
+    glow, bad = file.materials
+    assert (glow.emission, glow.alpha, glow.coat) == ((4.0, 2.0, 1.0), 0.5, 0.3)
+    assert not any(bad.emission) and any("Ke nan" in note for note in file.notes)
 
 
 def test_nothing_but_holes_is_refused() -> None:

@@ -17,7 +17,18 @@ import numpy as np
 from ..errors import AssetError, VersionError
 from ..version import __version__
 from .archive import read_archive, write_archive
-from .model import Asset, Binding, Environment, Mesh, SourceVertices, Surfels
+from .model import (
+    BASE_CHANNELS,
+    MATERIAL_CHANNELS,
+    OPTIONAL_CHANNELS,
+    SURFEL_CHANNELS,
+    Asset,
+    Binding,
+    Environment,
+    Mesh,
+    SourceVertices,
+    Surfels,
+)
 from .tensors import decode, dtype_name, encode, parse_json
 from .textures import check_textures, tensors_of, textures_of
 
@@ -41,13 +52,13 @@ TOLERANCE = 1e-3
 #: member -> tensor -> dtype; names that end in "/" are families (extras of any name).
 TENSORS: dict[str, dict[str, str]] = {
     "surfels.safetensors": {
-        **dict.fromkeys(("centre", "scale", "rotation", "opacity", "albedo", "roughness", "metallic", "sh"), "F32"),
+        **dict.fromkeys(("centre", "scale", "rotation", "opacity", *BASE_CHANNELS, "sh", *SURFEL_CHANNELS), "F32"),
         "extras/": "F32",
     },
     "mesh.safetensors": {
         "vertices": "F32",
         "faces": "I32",
-        **dict.fromkeys(("albedo", "roughness", "metallic"), "F32"),
+        **dict.fromkeys((*BASE_CHANNELS, *OPTIONAL_CHANNELS), "F32"),
         "groups/": "I32",
     },
     "binding.safetensors": {"face": "I32", **dict.fromkeys(("barycentric", "offset", "normal"), "F32")},
@@ -59,9 +70,20 @@ TENSORS: dict[str, dict[str, str]] = {
     },
 }  # fmt: skip
 _REQUIRED = ("surfels.safetensors", "mesh.safetensors")
-_OPTIONAL_TENSORS = {"sh", "transform"}
-_OPTIONAL_TENSORS |= {"normals"}
 _TEXTURES = "textures.safetensors"
+#: (member, tensor) -> the first schema that has it.
+_SINCE = {
+    **{("surfels.safetensors", name): 3 for name in SURFEL_CHANNELS},
+    **{("mesh.safetensors", name): 3 for name in OPTIONAL_CHANNELS},
+    **{("source.safetensors", name): 2 for name in TENSORS["source.safetensors"]},
+    **{(_TEXTURES, name): 4 for name in TENSORS[_TEXTURES]},
+}
+_OPTIONAL_TENSORS = {
+    *[("surfels.safetensors", name) for name in ("sh", *SURFEL_CHANNELS)],
+    *[("mesh.safetensors", name) for name in OPTIONAL_CHANNELS],
+    ("source.safetensors", "transform"),
+    (_TEXTURES, "normals"),
+}
 _RESTORE = "Restore the file from a copy, or import the source files again"
 
 
@@ -184,10 +206,11 @@ def inspect_asset(path: PathLike, verify: bool = True) -> dict[str, Any]:
     ranges = {
         f"{kind}.{name}": _range(getattr(part, name))
         for kind, part, names in (
-            ("surfels", surfels, ("scale", "opacity", "albedo", "roughness", "metallic")),
-            ("mesh", mesh, ("albedo", "roughness", "metallic")),
+            ("surfels", surfels, ("scale", "opacity", *BASE_CHANNELS, *SURFEL_CHANNELS)),
+            ("mesh", mesh, MATERIAL_CHANNELS),
         )
         for name in names
+        if getattr(part, name) is not None
     }
     if asset.environment is not None:
         ranges["environment.radiance"] = _range(asset.environment.radiance)
@@ -216,8 +239,9 @@ def digest_asset(path: PathLike) -> str:
 def check_asset(asset: Asset, subject: str, values: bool = True) -> None:
     """Raise AssetError where counts disagree or indices are out of range; with `values`, where numbers are not valid.
 
-    Valid numbers are finite; materials and opacity are in [0, 1], scales and radiance not negative, quaternions and
-    binding normals of unit length, barycentric coordinates and source weights of sum 1, the latter not negative.
+    Valid numbers are finite; materials and opacity are in [0, 1], scales, radiance and emission not negative,
+    quaternions and binding normals of unit length, barycentric coordinates and source weights of sum 1, the latter not
+    negative.
     """
     surfels, mesh, binding = asset.surfels, asset.mesh, asset.binding
     for name, extra in surfels.extras.items():
@@ -230,10 +254,7 @@ def check_asset(asset: Asset, subject: str, values: bool = True) -> None:
         _check_indices(group, len(mesh.vertices), f"{subject}, mesh groups/{name}", "vertices")
     if binding is not None:
         if binding.face.shape != (len(surfels),):
-            raise AssetError(
-                f"{subject}, binding",
-                f"has face shape {binding.face.shape} for {len(surfels)} surfels",
-            )
+            raise AssetError(f"{subject}, binding", f"has face shape {binding.face.shape} for {len(surfels)} surfels")
         _check_indices(binding.face, len(mesh.faces), f"{subject}, binding face", "faces")
     if mesh.source is not None:
         where = f"{subject}, source index"
@@ -282,8 +303,9 @@ def _manifest(members: Mapping[str, Array], subject: str) -> dict[str, Any]:
 
 
 def _schema(members: Mapping[str, Any]) -> int:
-    """The lowest schema that has these members, so that older versions read what they know."""
-    return 4 if _TEXTURES in members else 2 if "source.safetensors" in members else 1
+    """The lowest schema that has these members and tensors, so that older versions read what they know."""
+    used = [_SINCE.get((member, name), 1) for member, entry in members.items() for name in entry["tensors"]]
+    return max(used, default=1)
 
 
 def _tensors(
@@ -299,13 +321,13 @@ def _tensors(
     tensors = decode(data, where)
     if entry.get("tensors") != {n: {"dtype": dtype_name(a), "shape": list(a.shape)} for n, a in tensors.items()}:
         raise AssetError(where, "does not hold the tensors that the manifest lists", _RESTORE)
-    schema = TENSORS[member]
+    known, schema = TENSORS[member], manifest["schema"]
     for name, array in tensors.items():
         family = name.split("/", 1)[0] + "/" if "/" in name else name
-        if schema.get(family) != dtype_name(array):
-            raise AssetError(f"{where}, {name}", f"with type {array.dtype} is not part of schema {SCHEMA}", _RESTORE)
-    for name in schema:
-        if name not in tensors and not name.endswith("/") and name not in _OPTIONAL_TENSORS:
+        if known.get(family) != dtype_name(array) or _SINCE.get((member, name), 1) > schema:
+            raise AssetError(f"{where}, {name}", f"with type {array.dtype} is not part of schema {schema}", _RESTORE)
+    for name in known:
+        if name not in tensors and not name.endswith("/") and (member, name) not in _OPTIONAL_TENSORS:
             raise AssetError(f"{where}, {name}", "is missing", _RESTORE)
     return tensors
 
@@ -373,9 +395,10 @@ def _check_values(array: Array, name: str, where: str) -> None:
         bad = int(np.count_nonzero(~np.isfinite(array)))
         raise AssetError(where, f"has {bad} values that are NaN or infinite", "Import the source files again")
     wrong = ""
-    if name in ("opacity", "albedo", "roughness", "metallic") and (low < -TOLERANCE or high > 1 + TOLERANCE):
+    channel = MATERIAL_CHANNELS.get(name)
+    if channel is not None and channel.limit == 1 and (low < -TOLERANCE or high > 1 + TOLERANCE):
         wrong = f"reaches from {low:g} to {high:g}, outside [0, 1]"
-    elif name in ("scale", "radiance") and low < 0:
+    elif name in ("scale", "radiance", "emission") and low < 0:
         wrong = f"has the negative value {low:g}"
     elif name in ("rotation", "normal"):
         squared = np.einsum("ij,ij->i", array, array)

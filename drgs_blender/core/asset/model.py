@@ -7,6 +7,7 @@ Asset arrays are in **object space**: the space in which the mesh object's verti
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,8 +18,54 @@ from .textures import MeshTextures
 
 Array = np.ndarray
 
-#: Material channels of a surfel or vertex: name -> width. Albedo is linear Rec.709 in [0, 1].
-MATERIAL_CHANNELS: dict[str, int] = {"albedo": 3, "roughness": 1, "metallic": 1}
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A material channel of vertices and surfels.
+
+    Attributes
+    ----------
+    width : int
+        Numbers per vertex: 3 of a colour, else 1.
+    neutral : float or None
+        Value that an asset without the channel has everywhere; None: every asset has the channel.
+    limit : float
+        Largest value; the least is 0.
+    surfels : bool
+        Whether surfels have values of their own; else theirs are those of the vertices around them.
+    """
+
+    width: int
+    neutral: float | None = None
+    limit: float = 1.0
+    surfels: bool = True
+
+
+#: Material channels by name. Albedo is linear Rec.709; opacity is the share of the surface that is there; emission is
+#: linear Rec.709 radiance; specular is Principled's specular IOR level, coat the weight of a coat of roughness 0.03.
+MATERIAL_CHANNELS: dict[str, Channel] = {
+    "albedo": Channel(3),
+    "roughness": Channel(1),
+    "metallic": Channel(1),
+    "opacity": Channel(1, neutral=1.0, surfels=False),
+    "emission": Channel(3, neutral=0.0, limit=float("inf")),
+    "specular": Channel(1, neutral=0.5),
+    "coat": Channel(1, neutral=0.0),
+}
+#: Channels that every asset has, and that every surfel of a frame is rendered with.
+BASE_CHANNELS = tuple(name for name, channel in MATERIAL_CHANNELS.items() if channel.neutral is None)
+#: Channels that an asset may lack.
+OPTIONAL_CHANNELS = tuple(name for name, channel in MATERIAL_CHANNELS.items() if channel.neutral is not None)
+#: Those of them that surfels have of their own.
+SURFEL_CHANNELS = tuple(name for name in OPTIONAL_CHANNELS if MATERIAL_CHANNELS[name].surfels)
+
+
+def _optional_channels(part: Surfels | Mesh, names: Iterable[str], count: int, subject: str) -> None:
+    """Bring the channels `names` of `part`, where it has them, to their shapes; AssetError where they do not fit."""
+    for name in names:
+        if (values := getattr(part, name)) is not None:
+            shape = (count, 3) if MATERIAL_CHANNELS[name].width == 3 else (count,)
+            setattr(part, name, as_float(values, shape, f"{subject} {name}"))
 
 
 def as_float(values: Any, shape: tuple[int, ...], name: str) -> Array:
@@ -31,6 +78,13 @@ def as_float(values: Any, shape: tuple[int, ...], name: str) -> Array:
     if not fits:
         raise AssetError(name, f"has shape {array.shape}, expected {shape}")
     return array
+
+
+def neutral_values(name: str, count: int) -> Array:
+    """(count,) or (count, 3) float32 neutral values of an optional channel."""
+    channel = MATERIAL_CHANNELS[name]
+    assert channel.neutral is not None
+    return np.full((count, 3) if channel.width == 3 else count, channel.neutral, np.float32)
 
 
 @dataclass(slots=True)
@@ -55,6 +109,8 @@ class Surfels:
         Spherical-harmonic outgoing colour as captured (3DGS basis and order).
     extras : dict of str to (n,) or (n, c) float32 array
         Unknown per-surfel properties kept from the file.
+    emission, specular, coat : array, optional
+        See `MATERIAL_CHANNELS`; None: neutral everywhere.
     """
 
     centre: Array
@@ -66,6 +122,9 @@ class Surfels:
     metallic: Array
     sh: Array | None = None
     extras: dict[str, Array] = field(default_factory=dict)
+    emission: Array | None = None
+    specular: Array | None = None
+    coat: Array | None = None
 
     def __post_init__(self) -> None:
         self.centre = as_float(self.centre, (-1, 3), "surfel centre")
@@ -78,6 +137,7 @@ class Surfels:
         self.metallic = as_float(self.metallic, (n,), "surfel metallic")
         if self.sh is not None:
             self.sh = as_float(self.sh, (n, -1, 3), "surfel sh")
+        _optional_channels(self, SURFEL_CHANNELS, n, "surfel")
 
     def __len__(self) -> int:
         return len(self.centre)
@@ -167,6 +227,8 @@ class Mesh:
         Where the vertices come from; None: they are the source's own, in its order.
     textures : MeshTextures, optional
         Images on its faces, which rays meet in place of the materials of its vertices.
+    opacity, emission, specular, coat : array, optional
+        Per vertex, see `MATERIAL_CHANNELS`; None: neutral everywhere.
     """
 
     vertices: Array
@@ -176,6 +238,10 @@ class Mesh:
     metallic: Array
     groups: dict[str, Array] = field(default_factory=dict)
     source: SourceVertices | None = None
+    opacity: Array | None = None
+    emission: Array | None = None
+    specular: Array | None = None
+    coat: Array | None = None
     textures: MeshTextures | None = None
 
     def __post_init__(self) -> None:
@@ -189,6 +255,17 @@ class Mesh:
         self.albedo = as_float(self.albedo, (n, 3), "mesh albedo")
         self.roughness = as_float(self.roughness, (n,), "mesh roughness")
         self.metallic = as_float(self.metallic, (n,), "mesh metallic")
+        _optional_channels(self, OPTIONAL_CHANNELS, n, "mesh")
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the material channels that it has."""
+        return tuple(name for name in MATERIAL_CHANNELS if getattr(self, name) is not None)
+
+    def channel(self, name: str) -> Array:
+        """(n,) or (n, 3) float32 values of a material channel; neutral ones where it has none."""
+        values: Array | None = getattr(self, name)
+        return neutral_values(name, len(self.vertices)) if values is None else values
 
     @property
     def source_count(self) -> int:

@@ -14,7 +14,7 @@ import numpy as np
 from ...compute.warp.kernels import Launcher, WarpKernel
 from ...compute.warp.posed_surfels import DevicePosedSurfels
 from ...compute.warp.runtime import warp
-from ...core.asset.model import MATERIAL_CHANNELS, PosedSurfels
+from ...core.asset.model import BASE_CHANNELS, PosedSurfels
 from ...geometry.normals import face_normal, vertex_normal
 from .. import pose
 from ..mesh_driven import MeshDriven, Posing
@@ -141,7 +141,7 @@ class Deformer:
         arguments = mesh, posing.normals is not None, posing.linear, posing.sign, tables.rest
         launcher.launch(POSE, n, arguments, (*made, opacity))
         names = "centre", "tangent_u", "tangent_v", "normal"
-        channels = {name: self._own(tables, driven, name, posing.channels[name]) for name in MATERIAL_CHANNELS}
+        channels = {name: self._own(tables, driven, name, posing.channels[name]) for name in BASE_CHANNELS}
         there = dict(zip(names, made)) | channels | {"opacity": opacity, "object_index": owner}
         return DevicePosedSurfels(there, here, posing.channels)
 
@@ -161,7 +161,7 @@ class Deformer:
         if known is None:
             copy, smoother = self.launcher.array, driven.normals
             with self.launcher.failures("copying a binding"):
-                own = {name: copy(getattr(driven.surfels, name)) for name in ("opacity", *MATERIAL_CHANNELS)}
+                own = {name: copy(getattr(driven.surfels, name)) for name in ("opacity", *BASE_CHANNELS)}
                 rest = tuple(map(copy, driven.rest))
                 known = _Tables(rest, copy(driven.mesh.faces), copy(smoother.start), copy(smoother.place), own)
             self._known[driven] = known

@@ -86,7 +86,7 @@ class CapturedObject:
         rest, larger = self.rest, np.float32(np.sqrt(step))
         few = {f.name: np.ascontiguousarray(getattr(self.posed, f.name)[::step]) for f in fields(PosedSurfels)}
         few |= {name: few[name] * larger for name in ("tangent_u", "tangent_v")}
-        names = [f.name for f in fields(rest) if f.name != "extras"]
+        names = [f.name for f in fields(rest) if f.name != "extras" and getattr(rest, f.name) is not None]
         own = {name: getattr(rest, name)[::step] for name in names}
         extras = {name: values[::step] for name, values in rest.extras.items() if name == "thickness"}
         return replace(self, posed=PosedSurfels(**few), rest=Surfels(**own, extras=extras))
