@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,40 +26,19 @@ from ..render.lights.light_groups import group, groups_of
 from ..render.lights.light_links import link
 from ..render.lights.light_sampler import Lights
 from ..render.lights.mesh_lights import Emitters
-from ..render.scene.ray_masks import group_mask
 from ..render.scene.see_through import MOST
-from ..render.scene.trace_scene import TexturedObject, TraceObject, TraceScene
+from ..render.scene.trace_scene import TraceScene
 from ..render.surfels.captured import CapturedObject
 from ..render.surfels.surfel_bvh import SurfelBVH
-from .captured_objects import captured_faults, captured_object, glowing_mesh, shows_captured
-from .loaded_assets import LoadedAsset
-from .scene_objects import in_asset_order, join, material_faults, moved_vertices, posed_surfels, traced_object
-from .textured_objects import stub, textured_object
+from .cached_objects import CachedObject, LoadedAsset, begun, emission_of, surfel_mask
+from .captured_objects import captured_faults, captured_object, shows_captured
+from .scene_objects import in_asset_order, join, moved_vertices, posed_surfels
+from .stand_ins import has_channels, may_need, stand_in_faults, stand_in_pose, surfel_emission
+
+Array = np.ndarray
 
 #: Surfels a vertex up to which a mesh is taken for as detailed as a coarse picture.
 _SURFELS_A_VERTEX = 16
-
-
-@dataclass(slots=True)
-class CachedObject:
-    """An object as it was in the last frame, and what was made of it.
-
-    One that is shown in captured colours is `captured` for the camera, and for rays `glowing`. One whose textures are
-    met is `textured`, with its `images`; `met` is what stands for it in the scene then.
-    """
-
-    state: ObjectState
-    loaded: LoadedAsset
-    traced: TraceObject
-    posed: PosedSurfels | None = None
-    hidden_count: int = 0
-    faults: list[str] = field(default_factory=list)
-    mode: tuple[bool, bool, bool] = (False, False, False)
-    captured: CapturedObject | None = None
-    glowing: MeshState | None = None
-    textured: TexturedObject | None = None
-    images: list[Image] = field(default_factory=list)
-    met: TraceObject | None = None
 
 
 class SceneCache:
@@ -89,6 +68,8 @@ class SceneCache:
         Of the last frame.
     captured : tuple of CapturedObject
         Objects of the last frame that the camera sees in captured colours.
+    emission : (n, 3) float32 array, optional
+        Radiance of the surfels that the camera sees; see ``PreparedScene.emission``.
     """
 
     def __init__(self) -> None:
@@ -107,6 +88,7 @@ class SceneCache:
         self._background: World | None = None
         self.lights = Lights([])
         self.captured: tuple[CapturedObject, ...] = ()
+        self.emission: Array | None = None
         self._captured_faults: list[str] = []
         self._emitters = Emitters()
         self._deformer: Deformer | None = None
@@ -135,8 +117,7 @@ class SceneCache:
         stamp = status.st_ino, status.st_mtime_ns, status.st_size
         known = self._assets.get(key)
         if known is None or known.stamp != stamp:
-            faults: list[str] = []
-            self._assets[key] = LoadedAsset(read_asset(key, faults=faults), stamp, faults=faults)
+            self._assets[key] = LoadedAsset(read_asset(key), stamp)
         return key
 
     def asset(self, key: str) -> Asset:
@@ -152,6 +133,12 @@ class SceneCache:
         if any(shows_captured(state, asset, frame) for state, asset in zip(known, assets, strict=True)):
             return False
         return all(len(a.surfels) <= _SURFELS_A_VERTEX * len(a.mesh.vertices) for a in assets)
+
+    def jobs_of(self, frame: Frame) -> tuple[str, ...]:
+        """Jobs of `compute.manifest` that a frame needs for what its assets are."""
+        known = [self._assets.get(state.asset) for state in frame.objects]
+        given = [loaded.asset for loaded in known if loaded is not None]
+        return ("lights",) if len(given) == len(known) and may_need(frame, given) else ()
 
     def snapshot(self, frame: Frame) -> Frame:
         """Copy of a frame that is safe from later changes of its arrays; those of the scene are copies already."""
@@ -179,41 +166,50 @@ class SceneCache:
             state = in_asset_order(state, loaded.asset)
             known = self.objects[index] if index < len(self.objects) else None
             kept = reuse_equal(state, None if known is None else known.state)
-            mode = met, shown, loaded.asset.mesh.textures is not None and not shown and not (seen and met)
+            # What may have a stand-in depends on how it is seen.
+            mode = met, shown, seen or not has_channels(state, loaded.asset)
             if known is not None and known.loaded is loaded and known.state is kept and known.mode == mode:
                 item = known
             else:
-                item = _begun(kept, loaded, mode, index)
+                item = begun(kept, loaded, mode, frame.settings)
             if (seen or met) and item.posed is None:
                 given = item.state, index, loaded.surfels_of(item.state), item.traced
                 item.posed, item.hidden_count = posed_surfels(*given, self._poser(backend))
             if shown and item.captured is None and item.posed is not None:
                 item.captured = captured_object(item.state, loaded.asset, item.posed)
+            if seen and item.posed is not None and item.emission is None and not (shown or item.seen_by_mesh):
+                driven = loaded.driven if isinstance(loaded.surfels_of(item.state), MeshDriven) else None
+                item.emission = surfel_emission(item.state, loaded.asset, driven)
             objects.append(item)
             faults += captured_faults(kept, loaded.asset, frame)
+            if not shown:
+                faults += stand_in_faults(kept, loaded.asset, item.channels, frame.settings)
         meshes, images = reuse_equal(frame.meshes, self.meshes), reuse_equal(frame.images, self.images)
         same = len(objects) == len(self.objects) and all(a is b for a, b in zip(objects, self.objects))
         if not (self._current and same and meshes is self.meshes and images is self.images):
             self._current = False  # an update that fails half way leaves nothing to be taken for current
             glowing = [item for item in objects if item.glowing is not None]
             glows = {item.state.asset: item.loaded.glow_of(item.state.asset).image for item in glowing}
-            others = [*meshes, *(item.glowing for item in glowing if item.glowing is not None)]
-            others += [item.textured for item in objects if item.textured is not None]
-            textures = {image.name: image for item in objects for image in item.images}
-            traced = [item.traced if item.met is None else item.met for item in objects]
-            self.scene.update(traced, others, [*images, *glows.values(), *textures.values()])
+            others = [*meshes, *(item.other_mesh for item in objects if item.other_mesh is not None)]
+            self.scene.update([item.traced for item in objects], others, [*images, *glows.values()])
+            # What stands for an object is that object, in mattes and for linked lights.
+            own = [index for index, item in enumerate(objects) if item.other_mesh is not None]
+            first = len(objects) + len(meshes)
+            self.scene.source[first : first + len(own)] = own
             self._current = True
         self.objects, self.meshes, self.images, self._captured_faults = objects, meshes, images, faults
         used = {state.asset for state in frame.objects}
         for key, loaded in self._assets.items():
             if key not in used:
-                loaded.driven = loaded.glow = loaded.textured = None
+                loaded.driven = loaded.glow = None
         along_rays = seen and bool(frame.camera.panorama)
         tree = self._surfel_bvh(objects if met or along_rays else None)
         self.tree, self.seen_tree = tree if met else None, tree if along_rays else None
         visible = [item for item in objects if item.state.visibility.camera] if seen else []
         self.captured = tuple(item.captured for item in visible if item.captured is not None)
-        lit = [item.posed for item in visible if item.posed is not None and item.captured is None]
+        visible = [item for item in visible if item.captured is None and not item.seen_by_mesh]
+        self.emission = emission_of(objects if along_rays else visible)
+        lit = [item.posed for item in visible if item.posed is not None]
         return self._joined(lit, backend)
 
     def _poser(self, backend: RenderBackend) -> Callable[..., PosedSurfels]:
@@ -250,8 +246,7 @@ class SceneCache:
         if known is not None and same:
             return known
         tree = SurfelBVH() if known is None else known
-        # Of what glows, rays meet the mesh.
-        masks = [0 if item.glowing is not None else group_mask(item.state.visibility, True) for item in objects]
+        masks = [surfel_mask(item) for item in objects]
         tree.update(join([item.posed for item in objects if item.posed is not None]), np.array(masks, np.int32))
         self._in_tree = objects
         return tree
@@ -272,8 +267,12 @@ class SceneCache:
             None if pose is None else moved_vertices(item.state, item.loaded.asset, pose)
             for pose, item in zip(step.objects, self.objects)
         ]
-        others = sum((item.glowing is not None) + (item.textured is not None) for item in self.objects)
-        vertices, instances = self.scene.at(moved, [*step.meshes, *[None] * others])
+        others = [
+            None if item.stand_in is None else stand_in_pose(item.state, item.loaded.asset, pose)
+            for pose, item in zip(step.objects, self.objects)
+            if item.other_mesh is not None
+        ]
+        vertices, instances = self.scene.at(moved, [*step.meshes, *others])
         return SceneState(vertices, instances, camera_parameters(step.camera, frame.settings, frame.noise_index))
 
     def warnings(self) -> list[str]:
@@ -343,26 +342,11 @@ class SceneCache:
         low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
         sphere = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
         self.lights = Lights(lights, *sphere, self._emitters)
-        glowing = [item.glowing for item in self.objects if item.glowing is not None]
-        shapes: list[ObjectState | MeshState] = [*(item.state for item in self.objects), *self.meshes, *glowing]
+        shapes: list[ObjectState | MeshState] = [*(item.state for item in self.objects), *self.meshes]
+        shapes += [item.other_mesh for item in self.objects if item.other_mesh is not None]
         link(self.lights, lights, shapes, self.scene, sphere)
         group(self.lights, lights, shapes, frame.world.light_group, groups_of(frame.passes))
         return self.lights
-
-
-def _begun(state: ObjectState, loaded: LoadedAsset, mode: tuple[bool, bool, bool], index: int) -> CachedObject:
-    """An object that is new or has changed, without its surfels."""
-    met, shown, textured = mode
-    item = CachedObject(state, loaded, traced_object(state, loaded.asset, met or shown), mode=mode)
-    item.faults = [*(f"{state.name}: {fault}" for fault in loaded.faults), *material_faults(state)]
-    if textured:
-        given = state, item.traced, loaded.textured_of(state.asset), index
-        item.textured, item.images, faults = textured_object(*given)
-        item.met = stub(item.traced)
-        item.faults += faults
-    if shown and len(loaded.asset.mesh.faces):
-        item.glowing = glowing_mesh(state, item.traced, loaded.glow_of(state.asset))
-    return item
 
 
 def _light_of(world: World, known: World | None, light: EnvironmentLight | None) -> EnvironmentLight:

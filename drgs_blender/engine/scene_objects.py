@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..compute.warp.posed_surfels import FIELDS, with_fields
-from ..core.asset.model import MATERIAL_CHANNELS, Asset, PosedSurfels, Surfels, as_float
+from ..core.asset.model import BASE_CHANNELS, MATERIAL_CHANNELS, Asset, PosedSurfels, Surfels, as_float
 from ..core.errors import AssetError, UsageError
 from ..core.frame import ObjectState, Pose
 from ..core.material_adjustments import adjusted
@@ -16,6 +16,7 @@ from ..deform.fracture import torn_faces
 from ..deform.granular import grainy
 from ..deform.mesh_driven import MeshDriven
 from ..deform.rigid import pose_by_matrix
+from ..render.scene.texture_lookup import BRIGHTEST
 from ..render.scene.trace_scene import TraceObject
 
 Array = np.ndarray
@@ -65,14 +66,15 @@ def moved_vertices(state: ObjectState, asset: Asset, pose: Pose) -> Array | None
         return world_vertices(vertices, np.asarray(pose.matrices[0], np.float64))
 
 
-def _material(state: ObjectState, name: str, rest: Array, what: str) -> Array:
-    """Material channel `name` within [0, 1]; the asset's, `rest`, where there is none or it is not a number."""
+def material(state: ObjectState, name: str, rest: Array, what: str) -> Array:
+    """Material channel `name` within its limits; the asset's, `rest`, where there is none or it is not a number."""
     given = _checked_array(state, name, rest.shape, what)
     if given is None:
         return rest
-    if given.min(initial=0) >= 0 and given.max(initial=1) <= 1:  # both are NaN where one value is
+    limit = min(MATERIAL_CHANNELS[name].limit, float(BRIGHTEST))
+    if given.min(initial=0) >= 0 and given.max(initial=limit) <= limit:  # both are NaN where one value is
         return given
-    return np.where(np.isnan(given), rest, np.clip(given, 0, 1))
+    return np.where(np.isnan(given), rest, np.clip(given, 0, np.float32(limit)))
 
 
 def _mask(state: ObjectState, vertices: int) -> Array | None:
@@ -97,7 +99,7 @@ def _adjusted_surfels(state: ObjectState, posed: PosedSurfels, driven: MeshDrive
         if mask is not None:
             corners = driven.mesh.faces[driven.binding.face]
             mask = np.einsum("nk,nk->n", driven.binding.barycentric, mask[corners])
-    own = {name: getattr(posed, name) for name in MATERIAL_CHANNELS}
+    own = {name: getattr(posed, name) for name in BASE_CHANNELS}
     return with_fields(posed, adjusted(own, state.adjustment, mask))
 
 
@@ -142,7 +144,7 @@ def traced_object(state: ObjectState, asset: Asset, seen_only: bool = False) -> 
     vertices = _checked_array(state, "vertices", (n, 3), f"{n} vertices")
     vertices = mesh.vertices if vertices is None else vertices
     normals = _checked_array(state, "corner_normals", (m, 3, 3), f"{m} faces")
-    materials = {name: _material(state, name, getattr(mesh, name), f"{n} vertices") for name in MATERIAL_CHANNELS}
+    materials = {name: material(state, name, getattr(mesh, name), f"{n} vertices") for name in BASE_CHANNELS}
     if state.adjustment is not None:
         materials = adjusted(materials, state.adjustment, _mask(state, n))
     linear = matrix[:3, :3]
@@ -207,8 +209,8 @@ def posed_surfels(
         normals = np.ascontiguousarray(normals[:, _MIRRORED])  # back to the order of the asset's corners
     mesh = driven.mesh
     materials = {
-        name: _material(state, name, getattr(mesh, name), "a mesh") if _has(state, name) else None
-        for name in MATERIAL_CHANNELS
+        name: material(state, name, getattr(mesh, name), "a mesh") if _has(state, name) else None
+        for name in BASE_CHANNELS
     }
     pose = pose if state.grain <= 0 else MeshDriven.pose  # grains are made here
     given = driven, traced.vertices, normals, materials

@@ -262,7 +262,8 @@ class Session:
         self, frame: Frame, jobs: tuple[str, ...], progress: OnProgress | None, cancelled: IsCancelled | None
     ) -> None:
         """Have the kernels compiled that a frame and some jobs besides need."""
-        missing = [job for job in dict.fromkeys((*jobs_of(frame), *jobs)) if job not in self._compiled]
+        wanted = dict.fromkeys((*jobs_of(frame), *self._scene_cache.jobs_of(frame), *jobs))
+        missing = [job for job in wanted if job not in self._compiled]
         if missing:
             prepare_kernels(missing, progress, cancelled)
             self._compiled.update(missing)
@@ -283,8 +284,9 @@ class Session:
         cache = self._scene_cache
         seen, captured = cache.seen_tree, cache.captured
         return PreparedScene(
-            cache.scene, environment, posed, lights, cache.tree, seen, captured=captured, background=background
-        )
+            cache.scene, environment, posed, lights, cache.tree, seen, captured=captured, background=background,
+            emission=cache.emission,
+        )  # fmt: skip
 
     def _warnings(self, settings: RenderSettings) -> list[str]:
         trouble = cache_folder().trouble

@@ -12,9 +12,10 @@ from collections.abc import Callable
 import numpy as np
 
 from ..compute.threads import use_threads
+from ..compute.warp.posed_surfels import with_fields
 from ..core.cryptomatte import KINDS
 from ..core.errors import Cancelled, UsageError
-from ..core.frame import Frame
+from ..core.frame import Camera, Frame
 from ..core.passes import BY_NAME, pass_of
 from .backend import CPU, RenderBackend
 from .camera import camera_parameters
@@ -28,13 +29,14 @@ from .film.surface_film import SurfaceFilm
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.mesh import primary_mesh
 from .gbuffer.surfel_rays import SurfelRays, blend_along_rays
-from .gbuffer.surfels import Stages, primary_surfels, show_captured, snap_windows
+from .gbuffer.surfels import Stages, primary_surfels, show_captured, show_emission, snap_windows
 from .gbuffer.visible_lights import visible_lights
 from .integrator.adaptive import part_count, sample_adaptively
 from .integrator.variance import variances
 from .prepared_scene import PreparedScene
 from .scene.terminator import terminators
 from .shading_points import RECEIVER, UNLIT, Radiance, ShadingPoints
+from .surfel_columns import ALBEDO
 from .surfels import captured
 from .surfels.raster import SurfelSamples
 from .surfels.splats import Splats
@@ -189,6 +191,7 @@ class VisibleSurfaces:
         self._tree, self._objects, self._backend = prepared.surfel_bvh, len(frame.objects), backend
         self._splats: Splats | SurfelRays | None = None
         self._captured: captured.CapturedSplats | None = None
+        self._glowing: Splats | SurfelRays | None = None
         self._rasterise: Callable[..., SurfelSamples] = backend.rasterise
         prepared.scene.cut.clear()
         if frame.settings.camera_sees == "surfels":
@@ -201,6 +204,16 @@ class VisibleSurfaces:
             self._windows = snap_windows(prepared.scene, len(frame.objects))
             if prepared.captured:
                 self._captured = captured.project(prepared.captured, frame.camera, parameters)
+            if prepared.emission is not None:
+                self._glowing = self._with_radiance(prepared, frame.camera, prepared.emission)
+
+    def _with_radiance(self, prepared: PreparedScene, camera: Camera, emission: Array) -> Splats | SurfelRays:
+        """The surfels that the camera sees, with the radiance that they emit in place of their albedo."""
+        if isinstance(self._splats, SurfelRays):
+            surface = self._splats.bvh.surface.copy()
+            surface[:, ALBEDO : ALBEDO + 3] = emission
+            return self._splats._replace(surface=surface)
+        return self._backend.prepare(with_fields(prepared.surfels, {"albedo": emission}), camera, self._parameters)
 
     def rows(self, y0: int, y1: int) -> GBuffer:
         """The samples of the rows ``y0 .. y1`` of the full picture."""
@@ -209,6 +222,8 @@ class VisibleSurfaces:
         if geometry.terminators:
             tied = buffer.face, buffer.instance, buffer.barycentric, points.geometric_normal
             points.terminator = terminators(*tied, geometry)
+        if self._glowing is not None:
+            show_emission(buffer, self._rasterise(self._glowing, y0, y1), self._camera.window[0], self._camera.width)
         if self._receiver is not None:
             sets = self._receiver[self._scene.source[buffer.object_index]]
             buffer.points.flags |= (sets << RECEIVER).astype(np.uint8)

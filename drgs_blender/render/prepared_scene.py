@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ..core.arrays import Array
 from ..core.asset.model import PosedSurfels
 from .film.motion_vectors import SceneState
 from .lights.environment import EnvironmentLight
@@ -37,6 +38,9 @@ class PreparedScene:
         The scene one frame earlier and later, for motion vectors; None: nothing moves.
     captured : tuple of CapturedObject
         Objects that the camera sees unlit, with the colours of their capture.
+    emission : (n, 3) float32 array, optional
+        Radiance that the surfels send to the camera, linear Rec.709: of ``surfels``, or of ``seen_surfels`` where the
+        camera is panoramic; None: none emits.
     """
 
     scene: TraceScene
@@ -48,6 +52,7 @@ class PreparedScene:
     previous: SceneState | None = None
     following: SceneState | None = None
     captured: tuple[CapturedObject, ...] = ()
+    emission: Array | None = None
     background: EnvironmentLight | None = None
 
     @property

@@ -92,12 +92,20 @@ def thinned_scene(prepared: PreparedScene, pixels: int) -> PreparedScene:
     shown = thinned(prepared.surfels, pixels)
     step = sum(len(item.rest) for item in prepared.captured) // max(1, SURFELS_PER_PIXEL * pixels)
     captured = prepared.captured if step < 2 else tuple(item.thinned(step) for item in prepared.captured)
-    return replace(prepared, surfels=shown, captured=captured)
+    emission = prepared.emission
+    if emission is not None and prepared.seen_surfels is None:  # else they are of the tree, which stays
+        emission = np.ascontiguousarray(emission[:: _step(len(emission), pixels)])
+    return replace(prepared, surfels=shown, captured=captured, emission=emission)
+
+
+def _step(count: int, pixels: int) -> int:
+    """Every which of `count` surfels a picture of `pixels` can show."""
+    return max(1, count // max(1, SURFELS_PER_PIXEL * pixels))
 
 
 def thinned(posed: PosedSurfels, pixels: int) -> PosedSurfels:
     """Keep every n-th surfel, enlarged, where there are far more surfels than a picture of `pixels` can show."""
-    step = len(posed) // max(1, SURFELS_PER_PIXEL * pixels)
+    step = _step(len(posed), pixels)
     if step < 2:
         return posed
     few = {f.name: np.ascontiguousarray(getattr(posed, f.name)[::step]) for f in fields(posed)}

@@ -14,6 +14,7 @@ from ...compute.jit import njit
 from ...compute.threads import ROWS, over_range
 from ...core.frame import Camera
 from ..camera import CLIP_END, CLIP_START, SUBPIXELS, WIDTH, sample_ray
+from ..memory import address
 from ..sampling import ONE, ZERO, F
 from ..scene.ray import Ray
 from ..scene.ray_masks import CAMERA
@@ -36,12 +37,15 @@ class SurfelRays(NamedTuple):
         `camera.camera_parameters`.
     x0, x1 : int
         Columns of the camera's window, half-open.
+    surface : (n, SURFEL) float32 array, optional
+        In place of the tree's.
     """
 
     bvh: SurfelBVH
     parameters: Array
     x0: int
     x1: int
+    surface: Array | None = None
 
     @classmethod
     def of(cls, bvh: SurfelBVH, camera: Camera, parameters: Array) -> SurfelRays:
@@ -63,7 +67,10 @@ def blend_along_rays(rays: SurfelRays, y0: int, y1: int) -> SurfelSamples:
     )
     if len(rays.bvh):
         place = rays.parameters, rays.x0, y0
-        over_range(_blend, y1 - y0, tracer_of(rays.bvh), place, np.int32(CAMERA), samples, fewest=ROWS)
+        tracer = tracer_of(rays.bvh)
+        if rays.surface is not None:
+            tracer = tracer._replace(surface=address(rays.surface))
+        over_range(_blend, y1 - y0, tracer, place, np.int32(CAMERA), samples, fewest=ROWS)
     return samples
 
 

@@ -142,6 +142,25 @@ def show_captured(buffer: GBuffer, blended: CapturedSamples, x0: int, width: int
     points.flags[shown] |= UNLIT
 
 
+def show_emission(buffer: GBuffer, emitted: SurfelSamples, x0: int, width: int) -> None:
+    """Have the points of surfels emit.
+
+    Parameters
+    ----------
+    buffer : GBuffer
+        Of `primary_surfels`; written.
+    emitted : SurfelSamples
+        The same samples of surfels that have radiance in place of their albedo.
+    x0, width : int
+        First column of the window, and columns of the picture.
+    """
+    points = buffer.points
+    shown = np.flatnonzero(points.flags & (SECOND | UNLIT) == 0)
+    row, column = np.divmod(points.pixel[shown], width)
+    own = emitted.surface[row - buffer.rows[0], column - x0, points.sample[shown]]
+    buffer.emission[shown] = own[:, ALBEDO : ALBEDO + 3]
+
+
 @njit
 def _edge_lengths(vertices, faces, face_object, total, count):  # type: ignore[no-untyped-def]
     """Sum and number of edge lengths an object, from at most about 100,000 evenly chosen faces."""

@@ -1,0 +1,233 @@
+"""Objects whose assets have emission, opacity and other optional channels: in pictures, passes and rays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pictures import assert_same_bits, with_meshes
+from test_motion import moving_frame
+
+from drgs_blender.core.asset.container import read_asset, write_asset
+from drgs_blender.core.asset.model import Asset, Mesh, neutral_values
+from drgs_blender.core.cryptomatte import name_hash
+from drgs_blender.core.errors import AssetError
+from drgs_blender.core.frame import Adjustment, Frame, Material, ObjectState, Visibility, World
+from drgs_blender.deform.attach import attach
+from drgs_blender.engine.session import Session
+
+RADIANCE = (3.0, 1.5, 0.25)
+
+
+@pytest.fixture(scope="module")
+def save(tmp_path_factory: pytest.TempPathFactory, mesh: Mesh) -> Callable[..., Path]:
+    """Function that saves the ball with constant channels, attached again."""
+
+    def make(**channels: object) -> Path:
+        n = len(mesh.vertices)
+        full = {k: np.full((n, 3) if k == "emission" else n, v, np.float32) for k, v in channels.items()}
+        own = replace(mesh, **full)
+        surfels, binding, _ = attach(own, density=12.0)
+        path = tmp_path_factory.mktemp("channels") / "ball.drgs"
+        write_asset(path, Asset(surfels, own, binding))
+        return path
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def glowing_path(save) -> Path:
+    return save(emission=RADIANCE)
+
+
+@pytest.fixture(scope="module")
+def veil_path(save) -> Path:
+    return save(opacity=0.25)
+
+
+def use(frame: Frame, path: Path) -> Session:
+    """A session that knows the asset, which the frame's object gets."""
+    frame.objects[0].asset = str(path.resolve())
+    made = Session()
+    made.load_asset(path)
+    return made
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"camera_sees": "mesh"}, {"rays_see": "surfels"}, {"panorama": "equirectangular"}], ids=str
+)
+def test_the_camera_sees_what_is_emitted(glowing_path, make_frame, settings) -> None:
+    panorama = settings.pop("panorama", "")
+    frame = make_frame(**settings)
+    if panorama:
+        camera = replace(frame.camera, panorama=panorama, fx=40.0, fy=40.0)
+        frame.camera = camera
+    frame.passes = ("Combined", "Emit", "Coverage")
+    frame.world = World(strength=0.0)
+    picture = use(frame, glowing_path).render(frame)
+    share = picture["Coverage"]
+    assert (share > 0.9).sum() > 100
+    np.testing.assert_allclose(picture["Emit"], share * RADIANCE, rtol=1e-4, atol=1e-5)
+
+
+def lit_floor(frame: Frame, session: Session) -> np.ndarray:
+    """Mean light on the floor, under a black world."""
+    with_meshes(frame)
+    frame.meshes = frame.meshes[:1]
+    frame.meshes[0].pass_indices = np.int32([9])
+    frame.passes = ("DiffDir", "IndexOB")
+    frame.world = World(strength=0.0)
+    picture = session.render(frame)
+    return picture["DiffDir"][picture["IndexOB"][..., 0] == 9].mean(axis=0)
+
+
+def test_emission_lights_others_as_a_mesh_of_that_material_does(glowing_path, asset_path, make_frame) -> None:
+    frame = make_frame(samples=32, camera_sees="mesh")
+    ours = lit_floor(frame, use(frame, glowing_path))
+    other = make_frame(samples=32, camera_sees="mesh")
+    session = use(other, asset_path)
+    made = with_meshes(make_frame()).meshes[0]
+    asset = read_asset(asset_path)
+    lamp = replace(
+        made, name="Lamp", vertices=other.objects[0].vertices, faces=asset.mesh.faces, matrices=np.eye(4)[None]
+    )
+    lamp.materials = [Material("Lamp", emission=RADIANCE)]
+    other.objects[0].visibility = Visibility(camera=False, diffuse=False, glossy=False, shadow=False)
+    with_meshes(other)
+    other.meshes = [other.meshes[0], lamp]
+    other.meshes[0].pass_indices, lamp.pass_indices = np.int32([9]), np.int32([1])
+    other.passes, other.world = ("DiffDir", "IndexOB"), World(strength=0.0)
+    picture = session.render(other)
+    theirs = picture["DiffDir"][picture["IndexOB"][..., 0] == 9].mean(axis=0)
+    assert theirs.min() > 0.001
+    np.testing.assert_allclose(ours, theirs, rtol=0.02)
+
+
+@pytest.mark.parametrize("settings", [{}, {"camera_sees": "mesh"}, {"rays_see": "surfels"}], ids=str)
+def test_opacity_hides_its_share_of_what_is_behind(veil_path, make_frame, settings) -> None:
+    """A closed surface is passed twice."""
+    frame = make_frame(samples=22, size=(24, 18), **settings)
+    frame.settings.subpixel_samples = 64
+    frame.passes = ("Combined", "CryptoObject00")
+    picture = use(frame, veil_path).render(frame)
+    middle = picture["Combined"][6:12, 9:15, 3]
+    assert middle.mean() == pytest.approx(1 - 0.75**2, abs=0.01)
+    matte = picture["CryptoObject00"][6:12, 9:15]
+    assert (matte[..., 0] == np.array(name_hash("Ball"), np.uint32).view(np.float32)).all()
+    np.testing.assert_allclose(matte[..., 1], middle, atol=1e-5)
+
+
+def test_shadows_are_as_thin_as_what_throws_them(save, make_frame) -> None:
+    def shadow(path: Path) -> float:
+        frame = make_frame(samples=40, size=(24, 18))
+        with_meshes(frame)
+        frame.meshes = frame.meshes[:1]
+        frame.objects[0].visibility = Visibility(camera=False, diffuse=False, glossy=False)
+        frame.passes, frame.settings.bounces = ("DiffDir",), 0
+        light = np.zeros((16, 32, 3), np.float32)
+        light[0] = 50.0  # straight above
+        frame.world = World(light)
+        return float(use(frame, path).render(frame)["DiffDir"].mean(axis=2)[-1, 12])
+
+    none, half, all_of_it = (shadow(save(opacity=share)) for share in (0.0, 0.25, 1.0))
+    assert all_of_it < 0.3 * none
+    assert half == pytest.approx(all_of_it + 0.75**2 * (none - all_of_it), rel=0.06)
+
+
+def test_neutral_channels_change_no_bit(save, make_frame) -> None:
+    plain = save()
+    neutral = save(emission=0.0, opacity=1.0, specular=0.5, coat=0.0)
+    for settings in ({}, {"rays_see": "surfels"}):
+        frame = make_frame(bounces=1, **settings)
+        a = use(frame, plain).render(frame)
+        b = use(frame, neutral).render(frame)
+        assert_same_bits(a, b)
+        assert not b.warnings
+
+
+def test_a_fade_is_opacity(veil_path, save, make_frame) -> None:
+    frame = make_frame()
+    painted = use(frame, veil_path).render(frame)
+    frame.objects[0].adjustment = Adjustment(opacity=0.25)
+    faded = use(frame, save()).render(frame)
+    assert_same_bits(painted, faded)
+
+
+def test_painted_emission_takes_the_place_of_the_assets(glowing_path, make_frame) -> None:
+    frame = make_frame()
+    frame.passes = ("Emit", "Coverage")
+    session = use(frame, glowing_path)
+    n = len(read_asset(glowing_path).mesh.vertices)
+    frame.objects[0].emission = np.full((n, 3), 0.5, np.float32)
+    picture = session.render(frame)
+    np.testing.assert_allclose(picture["Emit"], picture["Coverage"] * np.full(3, 0.5), rtol=1e-4, atol=1e-6)
+    frame.objects[0].adjustment = Adjustment(emission=4.0)
+    brighter = session.render(frame)
+    np.testing.assert_allclose(brighter["Emit"], 4 * picture["Emit"], rtol=1e-4, atol=1e-6)
+    frame.objects[0].emission = None
+    frame.objects[0].adjustment = Adjustment(emission=0.0)
+    assert not session.render(frame)["Emit"].any()
+
+
+def test_bad_channels_are_named(save, make_frame) -> None:
+    path = save()
+    frame = make_frame()
+    frame.passes = ("Combined", "Emit")
+    session = use(frame, path)
+    n = len(read_asset(path).mesh.vertices)
+    emission = np.full((n, 3), np.nan, np.float32)
+    emission[0] = -1.0
+    frame.objects[0].emission = emission
+    picture = session.render(frame)
+    assert any("emission are not numbers" in text for text in picture.warnings)
+    assert not picture["Emit"].any() and np.isfinite(picture["Combined"]).all()
+    frame.objects[0].emission = np.zeros((n + 1, 3), np.float32)
+    with pytest.raises(AssetError, match="emission"):
+        session.render(frame)
+
+
+def test_what_is_not_shown_is_said(save, make_frame) -> None:
+    frame = make_frame()
+    said = use(frame, save(specular=1.0, coat=0.5)).render(frame).warnings
+    assert said == ["Ball: its specular and coat are kept in the asset, but not rendered"]
+    said = use(frame, save(opacity=0.5)).render(frame).warnings
+    assert said == ["Ball: light passes it, so the camera sees its mesh, not its surfels"]
+
+
+def test_a_surface_of_an_object_moves_with_it(save, make_frame) -> None:
+    """Motion of what stands for an object is the object's own."""
+    frame, _ = moving_frame(make_frame, camera_sees="mesh")
+    plain = use(frame, save()).render(frame)
+    moved = use(frame, save(emission=0.01)).render(frame)
+    for name in ("Vector", "Previous Position", "IndexOB", "Depth"):
+        np.testing.assert_allclose(moved[name], plain[name], atol=1e-4, err_msg=name)
+
+
+def test_a_holdout_stays_a_hole_where_it_is_dense(veil_path, make_frame) -> None:
+    frame = make_frame(size=(24, 18))
+    frame.settings.subpixel_samples = 64
+    frame.objects[0].visibility = Visibility(holdout=True)
+    frame.settings.film_transparent = False
+    frame.world = World(colour=(1.0, 1.0, 1.0))
+    picture = use(frame, veil_path).render(frame)["Combined"][6:12, 9:15, :3]
+    assert picture.mean() == pytest.approx(0.75**2, abs=0.01)
+
+
+def test_the_viewport_sees_it_too(glowing_path, make_frame) -> None:
+    frame = make_frame(size=(96, 72))
+    frame.passes = ("Combined", "Emit")
+    session = use(frame, glowing_path)
+    first = session.view("v", frame)
+    assert first["Emit"].max() == pytest.approx(RADIANCE[0], rel=1e-3)
+    while first.statistics["view.fraction"] < 1:
+        first = session.refine("v")
+    assert_same_bits(first, session.render(frame))
+
+
+def test_neutral_values() -> None:
+    assert neutral_values("emission", 2).tolist() == [[0, 0, 0], [0, 0, 0]]
+    assert neutral_values("opacity", 2).tolist() == [1, 1]
+    assert ObjectState("a", "b").emission is None
