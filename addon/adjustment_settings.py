@@ -19,8 +19,9 @@ Array = np.ndarray
 NUMBERS = (
     *("hue", "saturation", "value"),
     *(f"{channel}_{part}" for channel in ("roughness", "metallic") for part in ("gain", "offset", "low", "high")),
+    *("emission", "opacity"),
 )
-_NEUTRAL = ((1.0, 1.0, 1.0), 0.0, 1.0, 1.0, *(2 * (1.0, 0.0, 0.0, 1.0)))
+_NEUTRAL = ((1.0, 1.0, 1.0), 0.0, 1.0, 1.0, *(2 * (1.0, 0.0, 0.0, 1.0)), 1.0, 1.0)
 
 
 def _masks(settings: DrgsAdjustmentSettings, context: bpy.types.Context, typed: str) -> Iterable[str]:
@@ -79,6 +80,8 @@ class DrgsAdjustmentSettings(bpy.types.PropertyGroup):
     metallic_offset: _number("Offset", "Added to the metallic channel after the factor", min=-1.0, max=1.0, default=0.0)
     metallic_low: _number("Minimum", "The metallic channel becomes no lower than this", min=0.0, max=1.0, default=0.0)
     metallic_high: _number("Maximum", "The metallic channel becomes no higher than this", min=0.0, max=1.0, default=1.0)
+    emission: _number("Emission", "Factor on the light of the surface; 0 is none", min=0.0, soft_max=10.0, default=1.0)
+    opacity: _number("Opacity", "Factor on the opacity, to fade an object out", min=0.0, max=1.0, default=1.0)
     mask: StringProperty(
         name="Mask",
         description="Vertex group or point attribute that limits the adjustments by its values; empty is everywhere",
@@ -116,4 +119,6 @@ class DrgsAdjustmentSettings(bpy.types.PropertyGroup):
             roughness=tuple(getattr(own, f"roughness_{part}") for part in ("gain", "offset", "low", "high")),
             metallic=tuple(getattr(own, f"metallic_{part}") for part in ("gain", "offset", "low", "high")),
             mask=mask,
+            emission=own.emission,
+            opacity=own.opacity,
         )

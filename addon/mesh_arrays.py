@@ -11,8 +11,8 @@ Array = np.ndarray
 
 #: Material channel -> (attribute data type, its value property, values an element).
 ATTRIBUTES = {
-    name: ("FLOAT_COLOR", "color", 4) if width == 3 else ("FLOAT", "value", 1)
-    for name, width in MATERIAL_CHANNELS.items()
+    name: ("FLOAT_COLOR", "color", 4) if channel.width == 3 else ("FLOAT", "value", 1)
+    for name, channel in MATERIAL_CHANNELS.items()
 }
 #: Types of attributes that brushes can paint.
 COLOURS = ("FLOAT_COLOR", "BYTE_COLOR")
@@ -31,7 +31,7 @@ def new_mesh(name: str, source: Mesh) -> bpy.types.Mesh:
     mesh.loops.foreach_set("vertex_index", source.faces.ravel())
     mesh.polygons.add(faces)
     mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * faces, 3, dtype=np.int32))
-    for channel in MATERIAL_CHANNELS:
+    for channel in source.channels:
         write_channel(mesh, channel, getattr(source, channel))
     for group, members in source.groups.items():
         mask = np.zeros(len(source.vertices), bool)
@@ -58,6 +58,17 @@ def write_channel(mesh: bpy.types.Mesh, channel: str, values: Array) -> None:
     mesh.update_tag()
 
 
+def restore_channels(mesh: bpy.types.Mesh, source: Mesh) -> None:
+    """Set the point attributes of all material channels to those of `source`; those that it lacks go."""
+    for channel in MATERIAL_CHANNELS:
+        attribute = mesh.attributes.get(channel)
+        if (values := getattr(source, channel)) is not None:
+            write_channel(mesh, channel, values)
+        elif attribute is not None:
+            mesh.attributes.remove(attribute)
+            mesh.update_tag()
+
+
 def make_paintable(mesh: bpy.types.Mesh, channel: str, values: Array) -> None:
     """Set a material channel, (n, 3) or (n,) float32, as the active colour attribute, which brushes can paint."""
     attribute = mesh.attributes.get(channel)
@@ -73,7 +84,7 @@ def make_paintable(mesh: bpy.types.Mesh, channel: str, values: Array) -> None:
 
 
 def read_channel(mesh: bpy.types.Mesh, channel: str) -> Array | None:
-    """The point attribute of a material channel, linear and clamped to [0, 1], NaN kept; None where there is none.
+    """The point attribute of a material channel, linear and within its limits, NaN kept; None where there is none.
 
     Of a number that is stored as a colour, as brushes need it, the mean of red, green and blue.
 
@@ -98,7 +109,7 @@ def read_channel(mesh: bpy.types.Mesh, channel: str) -> Array | None:
             values[:, i] = colours[:, i]
         if width == 1:
             values = _brightness(values)
-    return np.clip(values, 0, 1, out=values)
+    return np.clip(values, 0, MATERIAL_CHANNELS[channel].limit, out=values)
 
 
 def _brightness(colours: Array) -> Array:

@@ -9,13 +9,12 @@ import numpy as np
 from bpy.props import BoolProperty, CollectionProperty, StringProperty
 
 from ..addon import assets, mesh_arrays
+from ..addon.viewport_material import viewport_material
 from ..drgs_blender.core.asset import Asset, Environment
 from ..drgs_blender.core.asset.container import read_asset
 from .asset_materials import show_textures
 from .base import DrgsOperator, DropTarget
 from .mark_assets import mark
-
-MATERIAL = "DR-GS"
 
 
 class DRGS_OT_import_asset(DrgsOperator, bpy.types.Operator):
@@ -79,32 +78,12 @@ def import_assets(
 def new_object(path: Path, asset: Asset) -> bpy.types.Object:
     """An object, in no collection yet, that shows and stands for the asset at `path`."""
     mesh = mesh_arrays.new_mesh(path.stem, asset.mesh)
-    mesh.materials.append(viewport_material())
+    mesh.materials.append(viewport_material(asset.mesh.channels))
     if asset.mesh.textures is not None:
         show_textures(mesh, asset.mesh.textures)
     obj = bpy.data.objects.new(path.stem, mesh)
     obj.drgs.asset = assets.anchor(path)
     return obj
-
-
-def viewport_material() -> bpy.types.Material:
-    """Principled BSDF fed by the attributes: what Solid, Material Preview and Cycles show; one for all objects."""
-    material = bpy.data.materials.get(MATERIAL)
-    if material is not None and not material.library:
-        return material
-    material = bpy.data.materials.new(MATERIAL)
-    if material.node_tree is None:  # before Blender 5.0
-        material.use_nodes = True
-    nodes, links = material.node_tree.nodes, material.node_tree.links
-    surface = next(n for n in nodes if n.type == "BSDF_PRINCIPLED")
-    surface.distribution = "GGX"
-    inputs = {"albedo": ("Color", "Base Color"), "roughness": ("Fac", "Roughness"), "metallic": ("Fac", "Metallic")}
-    for row, (name, (output, target)) in enumerate(inputs.items()):
-        attribute = nodes.new("ShaderNodeAttribute")
-        attribute.attribute_name = attribute.label = name
-        attribute.location = (surface.location.x - 300, surface.location.y - 180 * row)
-        links.new(attribute.outputs[output], surface.inputs[target])
-    return material
 
 
 def new_world(name: str, environment: Environment) -> bpy.types.World:

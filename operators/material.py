@@ -10,7 +10,8 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
 from ..addon import assets, mesh_arrays
-from ..drgs_blender.core.asset import MATERIAL_CHANNELS
+from ..addon.viewport_material import update_viewport_material
+from ..drgs_blender.core.asset import BASE_CHANNELS, MATERIAL_CHANNELS, OPTIONAL_CHANNELS, Mesh
 from ..drgs_blender.core.errors import AssetError, UsageError
 from . import selection
 from .base import DrgsOperator
@@ -135,8 +136,8 @@ class DRGS_OT_restore_material(DrgsOperator, selection.ObjectMode, bpy.types.Ope
 
     def run(self, context: bpy.types.Context) -> set[str]:
         for obj in selection.editable(selection.selected(context), data=True):
-            for channel in MATERIAL_CHANNELS:
-                mesh_arrays.write_channel(obj.data, channel, captured(obj, channel))
+            mesh_arrays.restore_channels(obj.data, captured(obj))
+            update_viewport_material(obj.data)
             obj.drgs.adjustment.reset()
         return {"FINISHED"}
 
@@ -157,11 +158,15 @@ class DRGS_OT_copy_material(DrgsOperator, selection.ObjectMode, bpy.types.Operat
             )
         place = source_of(source)
         values = {channel: present(source, channel) for channel in MATERIAL_CHANNELS}
+        shown = {*BASE_CHANNELS, *(n for n in OPTIONAL_CHANNELS if (values[n] != MATERIAL_CHANNELS[n].neutral).any())}
         for obj in selection.editable(objects, data=True):
             match = nearest(selection.world_vertices(obj), [place])
             for channel, own in values.items():
+                if channel not in shown and channel not in obj.data.attributes:
+                    continue
                 copied = np.einsum("nc,nc...->n...", match.barycentric, own[match.corners])
                 mesh_arrays.write_channel(obj.data, channel, copied)
+            update_viewport_material(obj.data)
             obj.drgs.adjustment.copy_from(source.drgs.adjustment)
         return {"FINISHED"}
 
@@ -194,6 +199,10 @@ class DRGS_OT_paint(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
             ("albedo", "Albedo", "The colour of the surface without light"),
             ("roughness", "Roughness", "Black is a mirror, white is matte"),
             ("metallic", "Metallic", "Black is no metal, white is metal"),
+            ("opacity", "Opacity", "Light passes what is black; white lets none through"),
+            ("emission", "Emission", "Light that the surface gives off by itself; black is none"),
+            ("specular", "Specular", "Middle grey reflects as glass does, black not at all. It is kept, not rendered"),
+            ("coat", "Coat", "White is varnished, black is not. It is kept, not rendered"),
         ),
         default="albedo",
     )
@@ -203,6 +212,7 @@ class DRGS_OT_paint(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
         if not obj.visible_get():
             raise UsageError(f'Object "{obj.name}"', "is hidden", "Show it in the Outliner")
         mesh_arrays.make_paintable(obj.data, self.channel, present(obj, self.channel))
+        update_viewport_material(obj.data)
         obj.select_set(True)
         context.view_layer.objects.active = obj
         bpy.ops.object.mode_set(mode="VERTEX_PAINT")
@@ -223,22 +233,22 @@ def present(obj: bpy.types.Object, channel: str) -> Array:
         values = mesh_arrays.read_channel(obj.data, channel)
     except TypeError:  # an attribute of another kind, which the render does not heed either
         values = None
-    return captured(obj, channel) if values is None else values
+    return captured(obj).channel(channel) if values is None else values
 
 
-def captured(obj: bpy.types.Object, channel: str) -> Array:
-    """A material channel of the asset, one value a vertex of `obj`.
+def captured(obj: bpy.types.Object) -> Mesh:
+    """The mesh of the asset, which has as many vertices as that of `obj`.
 
     Raises
     ------
     AssetError
         The file is absent, or the mesh is not the asset's any more.
     """
-    own = getattr(assets.load(assets.file_of(obj)).mesh, channel)
-    if len(own) != len(obj.data.vertices):
+    own = assets.load(assets.file_of(obj)).mesh
+    if len(own.vertices) != len(obj.data.vertices):
         raise AssetError(
             f'Object "{obj.name}"',
-            f"its mesh has {len(obj.data.vertices)} vertices, the asset {len(own)}",
+            f"its mesh has {len(obj.data.vertices)} vertices, the asset {len(own.vertices)}",
             "Undo the edit, or import the asset again",
         )
     return own

@@ -11,7 +11,7 @@ from bpy.props import BoolProperty, StringProperty
 
 from ..addon import assets, mesh_arrays, messages
 from ..addon.export.objects import appearance_of
-from ..drgs_blender.core.asset import MATERIAL_CHANNELS
+from ..addon.viewport_material import update_viewport_material
 from ..drgs_blender.core.asset.container import write_asset
 from ..drgs_blender.core.errors import UsageError
 from ..drgs_blender.core.material_adjustments import edited_asset
@@ -70,9 +70,8 @@ class DRGS_OT_save_asset(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
             for obj, target in zip(selection.editable(objects, vertices=False, data=True), paths):
                 obj.drgs.asset = assets.anchor(target)
                 obj.drgs.adjustment.reset()
-                mesh = assets.load(target).mesh
-                for channel in MATERIAL_CHANNELS:
-                    mesh_arrays.write_channel(obj.data, channel, getattr(mesh, channel))
+                mesh_arrays.restore_channels(obj.data, assets.load(target).mesh)
+                update_viewport_material(obj.data)
         self.report({"INFO"}, f"Saved {', '.join(map(str, paths))}")
         return {"FINISHED"}
 

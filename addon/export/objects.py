@@ -158,7 +158,7 @@ def _edited(obj: bpy.types.Object, mesh: bpy.types.Mesh, asset: Asset, channel: 
         return None
     if values is None:
         return None
-    own, lost = getattr(asset.mesh, channel), np.isnan(values)
+    own, lost = asset.mesh.channel(channel), np.isnan(values)
     if lost.any():
         warn(f'"{obj.name}": {lost.sum()} values of attribute {channel} are not numbers; the asset\'s are used there')
         values[lost] = own[lost]

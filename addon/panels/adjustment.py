@@ -35,6 +35,9 @@ class _Adjustments:
             column = layout.column(align=True)
             for part in ("gain", "offset", "low", "high"):
                 column.prop(settings, f"{channel}_{part}")
+        column = layout.column(align=True)
+        for name in ("emission", "opacity"):
+            column.prop(settings, name)
         row = layout.row(align=True)
         row.prop(settings, "mask")
         row.prop(settings, "use_invert", text="", icon="ARROW_LEFTRIGHT")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import bpy
 import numpy as np
 import pytest
@@ -152,6 +154,53 @@ def test_a_painted_channel_is_what_the_engine_gets(ball, export, channel):
     np.testing.assert_array_equal(painted[1:], before[channel][1:])
     bpy.ops.drgs.restore_material()
     np.testing.assert_array_equal(channels(ball)[channel], before[channel])
+
+
+@pytest.mark.parametrize("channel", ["opacity", "emission", "specular", "coat"])
+def test_a_channel_that_the_asset_lacks_is_painted_saved_and_taken_away(ball, export, tmp_path, channel):
+    neutral = {"opacity": 1.0, "emission": 0.0, "specular": 0.5, "coat": 0.0}[channel]
+    plain = ball.data.materials[0].name
+    assert channel not in ball.data.attributes and getattr(export()[0].objects[0], channel) is None
+    assert bpy.ops.drgs.paint(channel=channel) == {"FINISHED"}
+    assert ball.data.attributes.active_color.name == channel
+    ball.data.attributes[channel].data[0].color = (0.25, 0.25, 0.25, 1)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    ball.data.update_tag()
+    painted = getattr(export()[0].objects[0], channel)
+    np.testing.assert_allclose(painted[0], 0.25, atol=1e-6)
+    assert (painted[1:] == neutral).all()
+    assert ball.data.materials[0].name == f"{plain} {channel}"
+    assert bpy.ops.drgs.save_asset(filepath=str(tmp_path / "painted.drgs")) == {"FINISHED"}
+    saved = part("drgs_blender.core.asset.container").read_asset(tmp_path / "painted.drgs")
+    np.testing.assert_array_equal(getattr(saved.mesh, channel), painted)
+    assert bpy.ops.drgs.restore_material() == {"FINISHED"}
+    assert channel not in ball.data.attributes and getattr(export()[0].objects[0], channel) is None
+    assert ball.data.materials[0].name == plain
+
+
+def test_radiance_beyond_white_goes_through_blender_unchanged(ball, export, ball_file, tmp_path):
+    container, core = part("drgs_blender.core.asset.container"), part("drgs_blender.core.asset.model")
+    asset = container.read_asset(ball_file)
+    n, k = len(asset.mesh.vertices), len(asset.surfels)
+    mesh = dataclasses.replace(asset.mesh, emission=np.full((n, 3), 20.0), opacity=np.full(n, 0.5))
+    surfels = dataclasses.replace(asset.surfels, emission=np.full((k, 3), 20.0))
+    container.write_asset(tmp_path / "lamp.drgs", core.Asset(surfels, mesh, asset.binding))
+    bpy.ops.import_scene.drgs(filepath=str(tmp_path / "lamp.drgs"))
+    lamp = bpy.context.active_object
+    assert [n in lamp.data.attributes for n in ("emission", "opacity", "coat")] == [True, True, False]
+    state = export()[0].objects[1]
+    assert state.emission is None and state.opacity is None  # they are the asset's
+    shader = next(n for n in lamp.data.materials[0].node_tree.nodes if n.type == "BSDF_PRINCIPLED")
+    assert shader.inputs["Emission Color"].is_linked and shader.inputs["Alpha"].is_linked
+    adjustment(lamp).emission = 2.0
+    assert bpy.ops.drgs.save_asset(filepath=str(tmp_path / "again.drgs"), use_saved=True) == {"FINISHED"}
+    saved = container.read_asset(tmp_path / "again.drgs")
+    assert (saved.mesh.emission == 40).all() and (saved.surfels.emission == 40).all()
+    select(ball, lamp)
+    bpy.ops.drgs.copy_material()
+    state = next(o for o in export()[0].objects if o.name == ball.name)
+    np.testing.assert_allclose(state.emission, 40, rtol=1e-5)
+    np.testing.assert_allclose(state.opacity, 0.5, rtol=1e-5)
 
 
 def test_a_material_is_copied_from_the_nearest_places(ball, tmp_path):
