@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..core.asset.model import Asset, PosedSurfels, Surfels
@@ -68,6 +70,15 @@ def surfels_of_pose(rest: Surfels, posed: PosedSurfels, *, mirrored: bool = Fals
         sh,
         extras,
     )
+
+
+def faded(surfels: Surfels, asset: Asset, opacity: Array | None) -> Surfels:
+    """`surfels` of `asset` with their opacity times that of the vertices around them, (n,); None: all of it."""
+    if opacity is None or asset.binding is None:
+        return surfels
+    corners = opacity[asset.mesh.faces[asset.binding.face]]
+    share = np.einsum("nk,nk->n", asset.binding.barycentric, corners).clip(0, 1)
+    return replace(surfels, opacity=surfels.opacity * share.astype(np.float32))
 
 
 def _turns(rest: Surfels, tangents: Array, normal: Array, mirrored: bool) -> Array:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from ..core.asset import Asset, Environment, Mesh, Surfels
+from ..core.asset import OPTIONAL_CHANNELS, Asset, Environment, Mesh, Surfels
+from ..core.asset.model import neutral_values
 from ..core.errors import UsageError
 from ..core.file_types import Held
 from ..core.frame import RenderSettings, World
@@ -17,6 +18,9 @@ from .placed_frame import surface_frame
 from .pose_file import in_asset_order, read_vertices
 from .progress import FractionBar
 from .relight import read_environment, rotation_z
+
+if TYPE_CHECKING:
+    from ..engine.session import PosedObject
 
 Array = np.ndarray
 
@@ -132,7 +136,14 @@ class AssetSource:
             from ..build.export import posed_surfels
 
             surfels = posed_surfels(asset, self._vertices)
+        from ..build.export import faded
+
+        surfels = faded(surfels, asset, asset.mesh.opacity)
         choice = args.colour or ("relit" if args.env else "captured")
+        emission = asset.surfels.emission
+        if emission is not None:
+            lost = "is left out" if choice != "relit" else "is seen, but lights nothing else"
+            self.notes = [*self.notes, f"what the surfels emit {lost}"]
         if choice != "relit":
             return _unlit(surfels, choice)
         from ..build.relit import relit_colours
@@ -142,6 +153,7 @@ class AssetSource:
         settings = RenderSettings(samples=args.samples, subpixel_samples=1)
         with FractionBar(args, "lighting") as progress:
             colour = relit_colours(asset, surfels, self._vertices, world, settings, progress)
+        colour = colour if emission is None else colour + emission
         return splats_of(surfels, colour), _COLOUR_NAMES["relit"]
 
 
@@ -188,23 +200,37 @@ class FrameSource:
             joined("albedo"),
             joined("roughness"),
             joined("metallic"),
+            **self._optional_channels(),
         )
+
+    def _optional_channels(self) -> dict[str, Any]:
+        """Optional channels of all meshes; neutral where one lacks what another has."""
+        items = [self._objects[i] for i in self._visible]
+        names = [name for name in OPTIONAL_CHANNELS if any(name in item.channels for item in items)]
+
+        def values(item: PosedObject, name: str) -> Array:
+            return item.channels.get(name, neutral_values(name, len(item.mesh.vertices)))
+
+        return {name: np.concatenate([values(item, name) for item in items]) for name in names}
 
     def splats(self) -> tuple[Splats, str]:
         """The surfels of all objects, in the colour that was chosen."""
         choice = self._args.colour or "captured"
         if choice != "relit":
             parts = [_unlit(self._surfels(i), choice) for i in self._visible]
+            glowing = [self._objects[i].state.name for i in self._visible if self._objects[i].emission is not None]
+            self.notes += [f"{name}: what its surfels emit is left out" for name in glowing]
             return join_splats([splats for splats, _ in parts]), " or the ".join(dict.fromkeys(s for _, s in parts))
         with FractionBar(self._args, "lighting") as progress:
             lit = [self._lit(i, progress) for i in self._visible]
         return join_splats(lit), _COLOUR_NAMES["scene"]
 
     def _surfels(self, index: int) -> Surfels:
-        from ..build.export import surfels_of_pose
+        from ..build.export import faded, surfels_of_pose
 
         item = self._objects[index]
-        return surfels_of_pose(item.asset.surfels, item.surfels, mirrored=_mirrors(item.state.matrix_world))
+        posed = surfels_of_pose(item.asset.surfels, item.surfels, mirrored=_mirrors(item.state.matrix_world))
+        return faded(posed, item.asset, item.channels.get("opacity"))
 
     def _lit(self, index: int, progress: FractionBar) -> Splats:
         from ..build.relit import lit_colours, own_surfels, points_of_surfels, points_on_mesh
@@ -222,7 +248,7 @@ class FrameSource:
         colour = lit_colours(
             self._prepared.scene, self._prepared.environment, points, settings, self._prepared.lights, tree, progress
         )
-        return splats_of(surfels, colour)
+        return splats_of(surfels, colour if item.emission is None else colour + item.emission)
 
 
 def _unlit(surfels: Surfels, choice: str) -> tuple[Splats, str]:

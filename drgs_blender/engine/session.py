@@ -9,7 +9,7 @@ import logging
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from ..render.scene.trace_scene import TraceObject
 from .denoise_history import Histories
 from .progressive_view import Pace, View
 from .scene_cache import SceneCache
+from .stand_ins import surfel_emission
 
 logger = logging.getLogger(__name__)
 
@@ -56,12 +57,18 @@ class PosedObject:
         As rays see it, with the frame's materials.
     surfels : PosedSurfels
         Posed; of `asset`, one each.
+    channels : dict of str to array
+        Optional channels of the vertices that are not neutral everywhere.
+    emission : (n, 3) float32 array, optional
+        Radiance of the surfels.
     """
 
     state: ObjectState
     asset: Asset
     mesh: TraceObject
     surfels: PosedSurfels
+    channels: dict[str, Array] = field(default_factory=dict)
+    emission: Array | None = None
 
 
 class _StageTimer:
@@ -171,7 +178,14 @@ class Session:
         self._compile(frame, (), progress, None)
         prepared = self._prepare(frame, _StageTimer(None), progress)
         posed = [
-            PosedObject(item.state, item.loaded.asset, item.traced, item.posed)
+            PosedObject(
+                item.state,
+                item.loaded.asset,
+                item.traced,
+                item.posed,
+                item.channels,
+                surfel_emission(item.state, item.loaded.asset, item.loaded.driven),
+            )
             for item in self._scene_cache.objects
             if item.posed is not None
         ]

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from PIL import Image as Pillow
 
-from ..core.asset import Mesh
+from ..core.asset import MATERIAL_CHANNELS, Mesh
 from ..core.color import linear_to_srgb
 from ..core.errors import AssetError, UsageError
 from .mesh import check_extent
@@ -29,11 +30,15 @@ SAME = 1 / 512
 
 @dataclass(slots=True)
 class UniformMaterial:
-    """One material for the whole mesh; linear Rec.709."""
+    """One material for all of some faces; linear Rec.709, see `core.asset.model.MATERIAL_CHANNELS`."""
 
     colour: tuple[float, float, float]
     roughness: float
     metallic: float
+    opacity: float = 1.0
+    emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    specular: float = 0.5
+    coat: float = 0.0
 
 
 @dataclass(slots=True)
@@ -43,16 +48,31 @@ class TexturedMaterial:
     Attributes
     ----------
     colour : bytes
-        PNG of the base colour, sRGB.
+        PNG of the base colour, sRGB; with alpha where the mesh has opacity.
     surface : bytes
         PNG whose green is the roughness and whose blue is the metallic (glTF).
     uvs : (m, 3, 2) float32 array
         Of the corners of the triangles, the origin at the upper left (glTF).
+    translucent : bool
+        Whether `colour` has alpha.
+    emission : bytes, optional
+        PNG of the radiance over `strength`, sRGB.
+    strength : float
+        The largest radiance.
+    layers : bytes, optional
+        PNG whose red is the coat, and whose alpha is the specular level over `level`.
+    level : float
+        The largest specular level.
     """
 
     colour: bytes
     surface: bytes
     uvs: Array
+    translucent: bool = False
+    emission: bytes | None = None
+    strength: float = 0.0
+    layers: bytes | None = None
+    level: float = 0.5
 
 
 def mesh_material(mesh: Mesh, subject: str) -> UniformMaterial | TexturedMaterial:
@@ -69,15 +89,51 @@ def mesh_material(mesh: Mesh, subject: str) -> UniformMaterial | TexturedMateria
         It has values that are not finite, or a size that no reader takes.
     """
     check_mesh(mesh, subject)
-    values = vertex_materials(mesh)
+    values, columns = vertex_channels(mesh)
     if not np.isfinite(values).all():
         raise AssetError(subject, "would hold materials that are NaN", "Make the asset again")
     if _is_uniform(values, mesh.faces):
-        red, green, blue, roughness, metallic = np.median(values[np.unique(mesh.faces)], axis=0).tolist()
-        return UniformMaterial((red, green, blue), roughness, metallic)
+        middle = np.median(values[np.unique(mesh.faces)], axis=0)
+        return UniformMaterial(**uniform_channels(middle, columns))
+    strength = {name: max(float(values[:, own].max()), 1e-12) for name, own in columns.items()}
+    for name in ("emission", "specular"):
+        if name in columns:
+            values[:, columns[name]] /= strength[name]
     texels, uvs = bake_atlas(values[mesh.faces], subject)
-    surface = np.insert(texels[..., 3:], 0, 0.0, axis=2)
-    return TexturedMaterial(_png(linear_to_srgb(texels[..., :3])), _png(surface), uvs)
+    found = {name: texels[..., own] for name, own in columns.items()}
+    surface = np.concatenate([np.zeros_like(found["roughness"]), found["roughness"], found["metallic"]], axis=2)
+    colour = linear_to_srgb(found["albedo"])
+    if "opacity" in found:
+        colour = np.concatenate([colour, found["opacity"]], axis=2)
+    made = TexturedMaterial(_png(colour), _png(surface), uvs, "opacity" in found)
+    if "emission" in found:
+        made.emission, made.strength = _png(linear_to_srgb(found["emission"])), strength["emission"]
+    if "specular" in found or "coat" in found:
+        layers = np.ones((*texels.shape[:2], 4), np.float32)
+        layers[..., :1] = found.get("coat", np.float32(0.0))
+        if "specular" in found:
+            layers[..., 3:], made.level = found["specular"], strength["specular"]
+        made.layers = _png(layers)
+    return made
+
+
+def vertex_channels(mesh: Mesh) -> tuple[Array, dict[str, slice]]:
+    """Material channels of the vertices side by side, (n, c) float32, and where each is; albedo first."""
+    columns, parts, width = {}, [], 0
+    for name in mesh.channels:
+        limit = MATERIAL_CHANNELS[name].limit
+        part = getattr(mesh, name).reshape(len(mesh.vertices), -1).clip(0, limit)
+        columns[name] = slice(width, width + part.shape[1])
+        parts.append(part)
+        width += part.shape[1]
+    return np.concatenate(parts, axis=1), columns
+
+
+def uniform_channels(values: Array, columns: dict[str, slice]) -> dict[str, Any]:
+    """Fields of a `UniformMaterial` with (c,) `values` in `columns` as `vertex_channels` has them."""
+    given = {name: tuple(values[own].tolist()) for name, own in columns.items()}
+    found: dict[str, Any] = {name: value if len(value) > 1 else value[0] for name, value in given.items()}
+    return {"colour": found.pop("albedo"), **found}
 
 
 def check_mesh(mesh: Mesh, subject: str) -> None:
@@ -87,14 +143,9 @@ def check_mesh(mesh: Mesh, subject: str) -> None:
     check_extent(mesh.vertices, subject)
 
 
-def vertex_materials(mesh: Mesh) -> Array:
-    """(n, 5) albedo, roughness and metallic of the vertices of `mesh`, within [0, 1]."""
-    return np.concatenate([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], axis=1).clip(0, 1)
-
-
 def material_loss(mesh: Mesh) -> str:
     """What becomes of the materials of a mesh that `mesh_material` takes, in a sentence for the user."""
-    if _is_uniform(vertex_materials(mesh), mesh.faces):
+    if _is_uniform(vertex_channels(mesh)[0], mesh.faces):
         return "one material of one colour, without UV map or textures: those of the source are lost"
     size = _side(len(mesh.faces))
     return (

@@ -15,6 +15,8 @@ from .glb import Glb
 from .mesh_groups import FaceGroup, ImageMaterial, Picture, corner_normals, face_groups, joined_corners
 
 _WRAP = {"repeat": 10497, "extend": 33071, "mirror": 33648}
+#: Of all coats, see `core.asset.model.MATERIAL_CHANNELS`.
+_COAT_ROUGHNESS = 0.03
 
 
 def write_gltf_mesh(path: Path, mesh: Mesh) -> None:
@@ -81,19 +83,19 @@ class _Materials:
         self._images: dict[bytes, int] = {}
         self._textures: dict[tuple[int, str], int] = {}
 
-    def add(self, material: UniformMaterial | TexturedMaterial | ImageMaterial) -> None:
+    def add(self, material: UniformMaterial | TexturedMaterial) -> None:
         """Add one."""
         if isinstance(material, TexturedMaterial):
             colour, surface = (self._texture(data, "extend") for data in (material.colour, material.surface))
             pbr: dict[str, Any] = {"baseColorTexture": colour, "metallicRoughnessTexture": surface}
         else:
-            pbr = {"baseColorFactor": [*material.colour, 1.0]}
+            pbr = {"baseColorFactor": [*material.colour, material.opacity]}
             pbr |= {"roughnessFactor": material.roughness, "metallicFactor": material.metallic}
         entry: dict[str, Any] = {"name": self._name, "pbrMetallicRoughness": pbr, "doubleSided": True}
         if isinstance(material, ImageMaterial):
             entry["name"] = material.name
             # Factors of glTF are 1 at most.
-            pbr["baseColorFactor"] = [*(min(max(v, 0.0), 1.0) for v in material.colour), 1.0]
+            pbr["baseColorFactor"] = [min(max(v, 0.0), 1.0) for v in pbr["baseColorFactor"]]
             pbr |= {k: min(max(pbr[k], 0.0), 1.0) for k in ("roughnessFactor", "metallicFactor")}
             if material.colour_picture is not None:
                 pbr["baseColorTexture"] = self._of(material.colour_picture)
@@ -101,7 +103,46 @@ class _Materials:
                 pbr["metallicRoughnessTexture"] = self._of(material.surface_picture)
             if material.normal_picture is not None:
                 entry["normalTexture"] = self._of(material.normal_picture) | {"scale": material.normal_strength}
+        entry |= self._optional_channels(material)
+        used = {*self._glb.json.get("extensionsUsed", ()), *entry.get("extensions", ())}
+        if used:
+            self._glb.json["extensionsUsed"] = sorted(used)
         self.materials.append(entry)
+
+    def _optional_channels(self, material: UniformMaterial | TexturedMaterial) -> dict[str, Any]:
+        """Opacity, emission, specular level and coat as glTF has them; nothing where they are neutral."""
+        found: dict[str, Any] = {}
+        extensions: dict[str, Any] = {}
+        specular: dict[str, Any] = {}
+        coat: dict[str, Any] = {}
+        if isinstance(material, UniformMaterial):
+            translucent, radiance, level = material.opacity < 1, max(material.emission), material.specular
+            if radiance > 0:
+                found["emissiveFactor"] = [value / max(radiance, 1.0) for value in material.emission]
+            if material.coat > 0:
+                coat = {"clearcoatFactor": material.coat}
+            if level != 0.5:
+                specular = {"specularFactor": min(2 * level, 1.0)}
+        else:
+            translucent, radiance, level = material.translucent, material.strength, material.level
+            if material.emission is not None:
+                texture = self._texture(material.emission, "extend")
+                found |= {"emissiveFactor": [min(radiance, 1.0)] * 3, "emissiveTexture": texture}
+            if material.layers is not None:
+                texture = self._texture(material.layers, "extend")
+                specular = {"specularFactor": min(2 * level, 1.0), "specularTexture": texture}
+                coat = {"clearcoatFactor": 1.0, "clearcoatTexture": texture}
+        if translucent:
+            found["alphaMode"] = "BLEND"
+        if radiance > 1:
+            extensions["KHR_materials_emissive_strength"] = {"emissiveStrength": radiance}
+        if level > 0.5:  # a factor of 1 is a level of 0.5; the colour goes beyond
+            specular["specularColorFactor"] = [2 * level] * 3
+        if specular:
+            extensions["KHR_materials_specular"] = specular
+        if coat:
+            extensions["KHR_materials_clearcoat"] = coat | {"clearcoatRoughnessFactor": _COAT_ROUGHNESS}
+        return found | ({"extensions": extensions} if extensions else {})
 
     def _of(self, picture: Picture) -> dict[str, int]:
         return self._texture(picture.data, picture.extension)

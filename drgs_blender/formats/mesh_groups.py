@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from PIL import Image as Pillow
 
 from ..core.asset import Mesh
 from ..core.asset.textures import ALBEDO, METALLIC, NORMAL, ROUGHNESS, MeshTextures
 from ..geometry.normals import VertexNormals, unit
-from .atlas import SAME, TexturedMaterial, UniformMaterial, check_mesh, mesh_material, vertex_materials
+from .atlas import (
+    SAME,
+    TexturedMaterial,
+    UniformMaterial,
+    check_mesh,
+    mesh_material,
+    uniform_channels,
+    vertex_channels,
+)
 
 Array = np.ndarray
+
+#: Where factors of textures are.
+_FACTORS = {"albedo": slice(0, 3), "roughness": slice(3, 4), "metallic": slice(4, 5)}
 
 
 class Picture(NamedTuple):
@@ -33,15 +46,13 @@ class Picture(NamedTuple):
 
 
 @dataclass(slots=True)
-class ImageMaterial:
-    """A material with images; factors multiply them, and stand alone where there is none.
+class ImageMaterial(UniformMaterial):
+    """A material with images, which multiply its colour, roughness and metallic.
 
     Attributes
     ----------
     name : str
-    colour : tuple of float
-        Linear Rec.709.
-    roughness, metallic, normal_strength : float
+    normal_strength : float
     colour_picture : Picture, optional
         sRGB.
     surface_picture : Picture, optional
@@ -50,11 +61,8 @@ class ImageMaterial:
         Tangent space, green upwards.
     """
 
-    name: str
-    colour: tuple[float, float, float]
-    roughness: float
-    metallic: float
-    normal_strength: float
+    name: str = ""
+    normal_strength: float = 1.0
     colour_picture: Picture | None = None
     surface_picture: Picture | None = None
     normal_picture: Picture | None = None
@@ -68,13 +76,14 @@ class FaceGroup:
     ----------
     faces : (k,) int64 array
         Rows of the mesh's.
-    material : UniformMaterial, TexturedMaterial or ImageMaterial
+    material : UniformMaterial or TexturedMaterial
+        The first perhaps an `ImageMaterial`.
     uvs : (k, 3, 2) float32 array, optional
         Of the corners, the origin at the upper left (glTF).
     """
 
     faces: Array
-    material: UniformMaterial | TexturedMaterial | ImageMaterial
+    material: UniformMaterial | TexturedMaterial
     uvs: Array | None = None
 
 
@@ -152,7 +161,7 @@ def _image_material(mesh: Mesh, textures: MeshTextures, k: int, rows: Array) -> 
 
     That is where a channel varies from vertex to vertex, or images lie on the surface in different ways.
     """
-    slots, factors = textures.slots[k], textures.factors[k].astype(np.float64).copy()
+    slots, factors = textures.slots[k], textures.factors[k].astype(np.float64)
     used = slots >= 0
     first = int(np.flatnonzero(used)[0])
     alike = (textures.transforms[k, used] == textures.transforms[k, first]).all()
@@ -160,12 +169,15 @@ def _image_material(mesh: Mesh, textures: MeshTextures, k: int, rows: Array) -> 
     together = slots[ROUGHNESS] == slots[METALLIC] or not used[pair].all()
     if not (alike and together):
         return None
-    values = vertex_materials(mesh)[np.unique(mesh.faces[rows])]
-    for slot, own in ((ALBEDO, slice(0, 3)), (ROUGHNESS, slice(3, 4)), (METALLIC, slice(4, 5))):
-        if not used[slot]:
-            if np.ptp(values[:, own], axis=0).max() >= SAME:
-                return None
-            factors[own] = np.median(values[:, own], axis=0)
+    values, columns = vertex_channels(mesh)
+    values = values[np.unique(mesh.faces[rows])]
+    middle = np.median(values, axis=0)
+    pictured = {"albedo": ALBEDO, "roughness": ROUGHNESS, "metallic": METALLIC}
+    for name, own in columns.items():
+        if name in pictured and used[pictured[name]]:
+            middle[own] = factors[_FACTORS[name]]
+        elif np.ptp(values[:, own], axis=0).max() >= SAME:
+            return None
     if used[pair].any() and not used[pair].all():
         return None  # the image would multiply what is at the vertices
     files = textures.files
@@ -177,9 +189,24 @@ def _image_material(mesh: Mesh, textures: MeshTextures, k: int, rows: Array) -> 
         extension = ("repeat", "extend", "mirror")[textures.extensions[k, slot]]
         return Picture(f"{number}_{_plain(files[number][0])}", files[number][1].tobytes(), extension)
 
-    red, green, blue, roughness, metallic, strength = factors.tolist()
-    pictures = picture(ALBEDO), picture(ROUGHNESS), picture(NORMAL)
-    return ImageMaterial(textures.names[k], (red, green, blue), roughness, metallic, strength, *pictures)
+    own_channels = uniform_channels(middle, columns)
+    colour = picture(ALBEDO)
+    if colour is not None and own_channels.get("opacity", 1.0) < 1:
+        colour = colour._replace(data=_opaque(colour.data))
+    return ImageMaterial(
+        **own_channels, name=textures.names[k], normal_strength=float(factors[5]),
+        colour_picture=colour, surface_picture=picture(ROUGHNESS), normal_picture=picture(NORMAL),
+    )  # fmt: skip
+
+
+def _opaque(data: bytes) -> bytes:
+    """An image file without alpha, which would count a second time where its material has opacity."""
+    picture = Pillow.open(io.BytesIO(data))
+    if not picture.has_transparency_data:
+        return data
+    made = io.BytesIO()
+    picture.convert("RGBA").convert("RGB").save(made, "PNG", compress_level=6)
+    return made.getvalue()
 
 
 def _plain(name: str) -> str:

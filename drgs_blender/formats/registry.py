@@ -169,13 +169,14 @@ FORMATS: tuple[Format, ...] = (
         "glTF 2.0",
         _sniff_gltf,
         _read_gltf,
-        "metallic-roughness materials; instances; skins in Blender's rest pose; turned to Z up; not Draco or meshopt",
+        "metallic-roughness materials, with alpha, emission, specular and clearcoat; instances; skins in Blender's "
+        "rest pose; turned to Z up; not Draco or meshopt",
     ),
     Format(
         "Wavefront OBJ",
         _sniff_obj,
         lambda path: sanitise(read_obj(path)),
-        "with MTL (Kd, map_Kd, Ns, Pr, Pm)",
+        "with MTL (Kd, map_Kd, Ke, map_Ke, d, map_d, Ns, Pr, Pm, Pc)",
     ),
     Format(
         "3MF",

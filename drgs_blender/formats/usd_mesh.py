@@ -27,6 +27,7 @@ _LOCAL_HEADER = 30
 _DATE = (1980, 1, 1, 0, 0, 0)
 #: Numbers turned into text at once; bounds the memory.
 _BLOCK = 1 << 16
+_COAT_ROUGHNESS = "float inputs:clearcoatRoughness = 0.03"
 
 
 def write_usd_mesh(path: Path, mesh: Mesh) -> None:
@@ -57,11 +58,12 @@ def write_usd_mesh(path: Path, mesh: Mesh) -> None:
 
 def _files(group: FaceGroup) -> list[tuple[str, bytes]]:
     """Name and content of the pictures of a group."""
-    if isinstance(group.material, TexturedMaterial):
-        return [("color.png", group.material.colour), ("surface.png", group.material.surface)]
-    if isinstance(group.material, UniformMaterial):
-        return []
     m = group.material
+    if isinstance(m, TexturedMaterial):
+        baked = {"color": m.colour, "surface": m.surface, "emission": m.emission, "layers": m.layers}
+        return [(f"{name}.png", data) for name, data in baked.items() if data is not None]
+    if not isinstance(m, ImageMaterial):
+        return []
     pictures = (m.colour_picture, m.surface_picture, m.normal_picture)
     return [(picture.name, picture.data) for picture in pictures if picture is not None]
 
@@ -115,7 +117,7 @@ def _subset(material: str, faces: Array) -> list[str]:
     ]
 
 
-def _material(name: str, material: UniformMaterial | TexturedMaterial | ImageMaterial) -> list[str]:
+def _material(name: str, material: UniformMaterial | TexturedMaterial) -> list[str]:
     path = f"/Asset/{name}"
     surface = [
         'def Shader "Surface"\n{',
@@ -131,10 +133,19 @@ def _material(name: str, material: UniformMaterial | TexturedMaterial | ImageMat
     outputs = ["float outputs:g", "float outputs:b"]
     if isinstance(material, TexturedMaterial):
         surface += [colour, *numbers]
-        shaders = [
-            *_texture(path, "Color", "color.png", "sRGB", ["float3 outputs:rgb"]),
-            *_texture(path, "Parameters", "surface.png", "raw", outputs),
-        ]
+        of_colour = ["float3 outputs:rgb"]
+        if material.translucent:
+            surface.append(f"float inputs:opacity.connect = <{path}/Color.outputs:a>")
+            of_colour.append("float outputs:a")
+        shaders += _texture(path, "Color", "color.png", "sRGB", of_colour)
+        shaders += _texture(path, "Parameters", "surface.png", "raw", outputs)
+        if material.emission is not None:
+            surface.append(f"color3f inputs:emissiveColor.connect = <{path}/Emission.outputs:rgb>")
+            brightest = (*[material.strength] * 3, 1.0)
+            shaders += _texture(path, "Emission", "emission.png", "sRGB", ["float3 outputs:rgb"], scale=brightest)
+        if material.layers is not None:
+            surface += [f"float inputs:clearcoat.connect = <{path}/Layers.outputs:r>", _COAT_ROUGHNESS]
+            shaders += _texture(path, "Layers", "layers.png", "raw", ["float outputs:r"])
     else:
         picture = material.colour_picture if isinstance(material, ImageMaterial) else None
         if picture is None:
@@ -158,6 +169,12 @@ def _material(name: str, material: UniformMaterial | TexturedMaterial | ImageMat
             scale = (2 * strength, 2 * strength, 2.0, 1.0)
             placed = picture.extension, scale, bias
             shaders += _texture(path, "Normal", picture.name, "raw", ["float3 outputs:rgb"], *placed)
+        if max(material.emission) > 0:
+            surface.append(f"color3f inputs:emissiveColor = ({', '.join(f'{v:.9g}' for v in material.emission)})")
+        if material.opacity < 1:
+            surface.append(f"float inputs:opacity = {material.opacity:.9g}")
+        if material.coat > 0:
+            surface += [f"float inputs:clearcoat = {material.coat:.9g}", _COAT_ROUGHNESS]
     if shaders:
         shaders = [
             'def Shader "Coordinates"\n{',

@@ -62,8 +62,8 @@ class Writer:
 
 #: What is lost in the pictures of `atlas`.
 _TEXTURES = (
-    "images of materials with painted faces; materials at vertices to 1/510 (base colour as sRGB), halfway between "
-    "vertices as different as can be to 1/4"
+    "images of materials with painted faces, or with opacity, emission, specular or coat that vary; materials at "
+    "vertices to 1/510 (base colour as sRGB), halfway between vertices as different as can be to 1/4"
 )
 
 WRITERS: tuple[Writer, ...] = (
@@ -105,15 +105,16 @@ WRITERS: tuple[Writer, ...] = (
         "glTF mesh",
         write_gltf_mesh,
         "the mesh, posed or not, with images, UV map and normals where it has textures; other materials as "
-        "metallic-roughness textures, a place in them for each triangle",
+        "metallic-roughness textures, a place in them for each triangle; opacity, emission, specular and coat by its "
+        "alpha and KHR extensions",
         f"surfels; {_TEXTURES}; shared vertices, unless the mesh is of one material",
     ),
     Writer(
         "USD mesh",
         write_usd_mesh,
         "the mesh, posed or not, with images, UV map and normals where it has textures; other materials as the "
-        "textures of a UsdPreviewSurface; shared vertices",
-        f"surfels; {_TEXTURES}",
+        "textures of a UsdPreviewSurface; opacity, emission and coat among them; shared vertices",
+        f"surfels; specular; {_TEXTURES}",
     ),
     Writer(
         "OpenEXR",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,40 @@ def test_a_mesh_comes_back_with_its_materials(tmp_path: Path) -> None:
     # Eight bits: of sRGB for the albedo, which is coarser where it is bright.
     np.testing.assert_allclose(found[:, :3], wanted[:, :3], atol=0.005)
     np.testing.assert_allclose(found[:, 3:], wanted[:, 3:], atol=0.003)
+
+
+def layered(mesh: Mesh) -> Mesh:
+    """The mesh with all optional channels, of values that vary."""
+    rng = np.random.default_rng(3)
+    n = len(mesh.vertices)
+    more = {"opacity": rng.uniform(0.2, 0.8, n), "specular": rng.uniform(0.3, 0.9, n), "coat": rng.uniform(0, 1, n)}
+    return replace(mesh, **more, emission=rng.uniform(1, 7, (n, 3)))
+
+
+def test_optional_channels_come_back(tmp_path: Path) -> None:
+    mesh = layered(painted())
+    write_gltf_mesh(tmp_path / "a.glb", replace(mesh, vertices=vectors_from_z_up(mesh.vertices, "y")))
+    file = read_mesh(tmp_path / "a.glb")
+    assert not file.notes
+    materials = Materials(file.materials)
+    uvs = file.corner_uvs.reshape(-1, 2)
+    found = materials.sample(np.zeros(len(uvs), np.int64), uvs, np.zeros((len(uvs), 2)))
+    for name, limit in {"opacity": 0.003, "specular": 0.004, "coat": 0.003, "emission": 0.04}.items():
+        values = found[:, materials.columns[name]].reshape(getattr(mesh, name)[mesh.faces.ravel()].shape)
+        np.testing.assert_allclose(values, getattr(mesh, name)[mesh.faces.ravel()], atol=limit, err_msg=name)
+
+
+def test_optional_channels_of_one_value_come_back(tmp_path: Path) -> None:
+    vertices, faces = sphere_mesh(2)
+    n = len(vertices)
+    mesh = Mesh(vertices, faces, np.full((n, 3), 0.5), np.full(n, 0.3), np.full(n, 1.0))
+    mesh.opacity, mesh.specular, mesh.coat = np.full(n, 0.25), np.full(n, 0.8), np.full(n, 0.5)
+    mesh.emission = np.full((n, 3), [0.0, 2.0, 8.0])
+    write_gltf_mesh(tmp_path / "a.glb", mesh)
+    material = read_mesh(tmp_path / "a.glb").materials[0]
+    np.testing.assert_allclose(material.emission, [0, 2, 8], rtol=1e-6)
+    given = material.alpha, material.specular, material.coat
+    np.testing.assert_allclose(given, [0.25, 0.8, 0.5], rtol=1e-6)
 
 
 def test_another_reader_finds_the_same_object(tmp_path: Path) -> None:

@@ -42,11 +42,16 @@ def test_the_archive_is_what_the_format_wants(tmp_path: Path) -> None:
     assert (tmp_path / "b.usdz").read_bytes() == data
 
 
-def test_usd_finds_the_mesh_and_its_materials(tmp_path: Path) -> None:
+@pytest.mark.parametrize("layered", [False, True])
+def test_usd_finds_the_mesh_and_its_materials(tmp_path: Path, layered: bool) -> None:
     pytest.importorskip("pxr", reason="usd-core is not installed")
     from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 
     mesh = painted()
+    top = mesh.vertices[:, 2] > 0
+    if layered:
+        mesh.opacity, mesh.coat = np.where(top, 0.4, 0.9), np.where(top, 1.0, 0.2)
+        mesh.emission = np.where(top[:, None], [8.0, 4.0, 0.0], [0.5, 0.5, 0.5])
     write_usd_mesh(tmp_path / "a.usdz", mesh)
     stage = Usd.Stage.Open(str(tmp_path / "a.usdz"))
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
@@ -62,6 +67,8 @@ def test_usd_finds_the_mesh_and_its_materials(tmp_path: Path) -> None:
     assert surface.GetIdAttr().Get() == "UsdPreviewSurface"
     uvs = np.array(UsdGeom.PrimvarsAPI(shape).GetPrimvar("st").ComputeFlattened()).reshape(-1, 3, 2)
     wanted = {"diffuseColor": mesh.albedo, "roughness": mesh.roughness, "metallic": mesh.metallic}
+    if layered:
+        wanted |= {"opacity": mesh.opacity, "clearcoat": mesh.coat, "emissiveColor": mesh.emission}
     for name, values in wanted.items():
         source, output, _ = surface.GetInput(name).GetConnectedSource()
         shader = UsdShade.Shader(source)
@@ -70,11 +77,12 @@ def test_usd_finds_the_mesh_and_its_materials(tmp_path: Path) -> None:
             picture = np.asarray(Image.open(io.BytesIO(archive.read(file.split("[")[1].rstrip("]"))))) / 255
         texel = np.floor(uvs * [1, -1] * len(picture) + [0, len(picture)]).astype(int)
         found = picture[texel[..., 1], texel[..., 0]]
-        if shader.GetInput("sourceColorSpace").Get() == "sRGB":
-            found = srgb_to_linear(found)
+        if output == "rgb":
+            found = srgb_to_linear(found[..., :3])
         else:
-            found = found[..., "rgb".index(output)]
-        np.testing.assert_allclose(found, values[mesh.faces], atol=0.006)
+            found = found[..., "rgba".index(output)]
+        scale = 1.0 if not shader.GetInput("scale") else shader.GetInput("scale").Get()[0]
+        np.testing.assert_allclose(scale * found, values[mesh.faces], atol=0.006 * scale)
 
 
 def test_a_mesh_of_one_material_needs_no_textures(tmp_path: Path) -> None:
