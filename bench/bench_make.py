@@ -12,13 +12,18 @@ from pathlib import Path
 
 import numpy as np
 from judge import blender_python, decibels, environments, foreground, frame_camera, systematic_error
+from lantern import write_lantern
 from ours import relight
 from report import OUT, ROOT, table, write_section
-from subjects import asset_path
+from subjects import SOURCES, asset_path
 
 from drgs_blender.core.asset.container import read_asset
 
-FILES = {"cat": "cat/egyptian_cat.glb", "helmet": "helmet/FlightHelmet.gltf"}
+FILES = {
+    "cat": "cat/egyptian_cat.glb",
+    "helmet": "helmet/FlightHelmet.gltf",
+    "lantern": str(OUT / "lantern.glb"),
+}
 BOUNCES, STRENGTH = 2, 0.35
 #: Budgets of surfels: none beyond those that density asks for, and the default.
 BUDGETS = {"of the mesh's vertices' detail": {"max_surfels": 1}, "default": {}}
@@ -34,6 +39,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=512, help="of ours, per pixel and picture")
     options = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
+    SOURCES["lantern"] = str(write_lantern(OUT / "lantern.glb")), {}
     light = str(environments() / "city.exr")
     jobs, cameras = [], {}
     for name, file in FILES.items():

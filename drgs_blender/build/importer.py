@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.asset.model import Asset, Mesh, Surfels
+from ..core.asset.model import SURFEL_CHANNELS, Asset, Mesh, Surfels
 from ..core.errors import AssetError
 from ..deform.binding import bind, project
 from ..deform.face_frames import Faces
@@ -112,6 +112,7 @@ def import_asset(
         vertices_to_surfels(surface, captured, binding)
         origin = "of the mesh, carried to the surfels"
     elif surface_known:
+        vertices_to_surfels(surface, captured, binding, SURFEL_CHANNELS)  # files of surfels have none of these
         origin = "of the surfels and of the mesh, as they are"
     else:
         report["vertices_without_surfels"] = surfels_to_vertices(surface, captured, binding)

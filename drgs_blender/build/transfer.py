@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -105,11 +106,13 @@ class _SurfelNeighbours(NamedTuple):
         return weight / weight.sum(axis=1, keepdims=True), lonely
 
 
-def vertices_to_surfels(mesh: Mesh, surfels: Surfels, binding: Binding) -> None:
-    """Give the surfels the materials of the points that they hang on; edit `surfels` in place."""
+def vertices_to_surfels(
+    mesh: Mesh, surfels: Surfels, binding: Binding, names: Collection[str] = (*BASE_CHANNELS, *SURFEL_CHANNELS)
+) -> None:
+    """Give the surfels the channels `names`, those that `mesh` has, of the points that they hang on; edit in place."""
     weights = clamp_weights(binding.barycentric.astype(np.float64))
     corners = mesh.faces[binding.face]
     for name in mesh.channels:
-        if name in BASE_CHANNELS or name in SURFEL_CHANNELS:
+        if name in names:
             values = np.einsum("nk,nk...->n...", weights, getattr(mesh, name)[corners]).astype(np.float32)
             setattr(surfels, name, values.clip(0, MATERIAL_CHANNELS[name].limit))

@@ -15,9 +15,10 @@ from drgs_blender.core.asset.container import read_asset, write_asset
 from drgs_blender.core.asset.model import Asset, Mesh, neutral_values
 from drgs_blender.core.cryptomatte import name_hash
 from drgs_blender.core.errors import AssetError
-from drgs_blender.core.frame import Adjustment, Frame, Material, ObjectState, Visibility, World
+from drgs_blender.core.frame import Adjustment, Frame, Light, Material, ObjectState, Visibility, World
 from drgs_blender.deform.attach import attach
 from drgs_blender.engine.session import Session
+from drgs_blender.render.progressive import thinned_scene
 
 RADIANCE = (3.0, 1.5, 0.25)
 
@@ -231,3 +232,59 @@ def test_neutral_values() -> None:
     assert neutral_values("emission", 2).tolist() == [[0, 0, 0], [0, 0, 0]]
     assert neutral_values("opacity", 2).tolist() == [1, 1]
     assert ObjectState("a", "b").emission is None
+
+
+def test_a_device_draws_the_same(save, make_frame, monkeypatch) -> None:
+    """Warp's processor as the card."""
+    pytest.importorskip("warp", reason="warp-lang is not installed")
+    monkeypatch.setattr("drgs_blender.render.gpu.select_backend.name_of", lambda device: "cpu")
+    for path in (save(emission=RADIANCE), save(emission=RADIANCE, opacity=0.5)):
+        pictures = []
+        for device in ("cpu", "cuda"):
+            frame = make_frame(size=(24, 18), device=device)
+            frame.passes = ("Combined", "Emit")
+            pictures.append(use(frame, path).render(frame))
+        np.testing.assert_allclose(pictures[1]["Emit"], pictures[0]["Emit"], atol=0.02)
+        assert np.abs(pictures[1]["Combined"] - pictures[0]["Combined"]).mean() < 0.01
+
+
+def test_surfels_without_a_mesh_emit_to_the_camera_alone(asset_path, make_frame, tmp_path) -> None:
+    asset = read_asset(asset_path)
+    own = replace(asset.surfels, emission=np.tile(np.float32(RADIANCE), (len(asset.surfels), 1)))
+    write_asset(tmp_path / "bare.drgs", Asset(own, Mesh.empty()))
+    frame = make_frame(rays_see="surfels")
+    frame.objects[0].vertices = None
+    frame.passes = ("Emit", "Coverage")
+    picture = use(frame, tmp_path / "bare.drgs").render(frame)
+    np.testing.assert_allclose(picture["Emit"], picture["Coverage"] * RADIANCE, rtol=1e-4, atol=1e-5)
+    assert any("seen by the camera alone" in text for text in picture.warnings)
+
+
+def test_a_coarse_view_thins_emission_with_its_surfels(glowing_path, make_frame) -> None:
+    frame = make_frame()
+    prepared, _ = use(frame, glowing_path).prepare(frame)
+    assert len(prepared.emission) == len(prepared.surfels)
+    for pixels in (1, 7, 50, 10**6):
+        few = thinned_scene(prepared, pixels)
+        assert len(few.emission) == len(few.surfels)
+    assert len(thinned_scene(prepared, 1).surfels) < len(prepared.surfels)
+
+
+def test_linked_lights_know_the_object_behind_its_mesh(glowing_path, make_frame) -> None:
+    """A lamp that shines on nothing but the floor lights no object that emits."""
+    frame = with_meshes(make_frame(size=(24, 18)))
+    lamp = Light("Lamp", "area", np.eye(4), power=200.0, size_x=1.0, size_y=1.0, receivers=0)
+    lamp.matrix_world[2, 3] = 3.0
+    frame.lights, frame.world = [lamp], World(strength=0.0)
+    frame.meshes[0].visibility.lit_by = 1
+    frame.passes = ("DiffDir", "IndexOB")
+    frame.objects[0].pass_index = 3
+    frame.settings.camera_sees = "mesh"
+    session = use(frame, glowing_path)
+    picture = session.render(frame)
+    index = picture["IndexOB"][..., 0]
+    floor = picture["DiffDir"][index == 5].mean()
+    ball = picture["DiffDir"][index == 3].mean()
+    frame.objects[0].visibility.lit_by = 1
+    lit = session.render(frame)["DiffDir"][index == 3].mean()
+    assert floor > 0.1 and lit > 1.05 * ball
