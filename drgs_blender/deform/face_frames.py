@@ -79,16 +79,26 @@ class Faces:
 
 
 def corner_frames(vertices: Array, faces: Array) -> Array:
-    """Frames (m, 3, 3, 3) float64 with columns (t, b, s) at the corners of faces, as Binding.normal defines them.
+    """Frames (m, 3, 3, 3) float32 with columns (t, b, s) at the corners of faces, as Binding.normal defines them.
 
     Parameters
     ----------
-    vertices : (n, 3) array
-    faces : (m, 3) array
+    vertices : (n, 3) float32 array
+    faces : (m, 3) int32 array
     """
-    measured, face = Faces.of(vertices, faces), np.repeat(np.arange(len(faces)), 3)
-    corners = np.tile(np.eye(3), (len(faces), 1))
-    return shading_frames(measured, faces, vertices, face, corners).reshape(-1, 3, 3, 3)
+    s = VertexNormals(faces, len(vertices))(vertices)[faces]
+    edge = vertices[faces[:, 1]] - vertices[faces[:, 0]]
+    t = edge[:, None] - s * np.einsum("fkc,fc->fk", s, edge)[..., None]
+    length = np.sqrt(np.einsum("fkc,fkc->fk", t, t))
+    usable = (length > 1e-4 * np.sqrt(np.einsum("fc,fc->f", edge, edge))[:, None]).all(axis=1)
+    t /= np.where(usable[:, None], length, 1)[..., None]
+    frames = np.stack([t, np.cross(s, t), s], -1)
+    if not usable.all():  # the first edge stands on the face, or is none
+        rows = np.flatnonzero(~usable)
+        corners = np.tile(np.eye(3), (len(rows), 1))
+        exact = shading_frames(Faces.of(vertices, faces), faces, vertices, np.repeat(rows, 3), corners)
+        frames[rows] = exact.reshape(-1, 3, 3, 3)
+    return frames
 
 
 def local_normals(vertices: Array, faces: Array, normals: Array) -> Array:
