@@ -188,6 +188,9 @@ def convert(args: argparse.Namespace) -> None:
         writer.write(args.output, mesh_from_z_up(mesh, up))
         print(f"{args.output}: {len(mesh.faces)} triangles, {writer.name}, {up} up")
         print(f"  {kept(mesh, str(args.output)) or material_loss(mesh)}")
+        for name in writer.lost_channels:
+            if getattr(mesh, name) is not None:
+                print(f"  {name} is lost: {writer.name} has no place for it")
     else:
         from ..formats.splats import scaled, splats_from_z_up
 

@@ -172,6 +172,9 @@ class SceneCache:
                 item = known
             else:
                 item = begun(kept, loaded, mode, frame.settings)
+                if known is not None and known.loaded is loaded and known.state is kept and known.mode[:2] == mode[:2]:
+                    # Only how the camera sees it is another: its surfels stand where they stood.
+                    item.posed, item.hidden_count, item.emission = known.posed, known.hidden_count, known.emission
             if (seen or met) and item.posed is None:
                 given = item.state, index, loaded.surfels_of(item.state), item.traced
                 item.posed, item.hidden_count = posed_surfels(*given, self._poser(backend))

@@ -32,12 +32,15 @@ class Writer:
         WriteError.
     kept, lost : str
         For the documentation.
+    lost_channels : tuple of str
+        Material channels of a mesh for which the format has no place.
     """
 
     name: str
     write: Callable[[Path, Any], None]
     kept: str
     lost: str
+    lost_channels: tuple[str, ...] = ()
 
     @property
     def extensions(self) -> tuple[str, ...]:
@@ -115,6 +118,7 @@ WRITERS: tuple[Writer, ...] = (
         "the mesh, posed or not, with images, UV map and normals where it has textures; other materials as the "
         "textures of a UsdPreviewSurface; opacity, emission and coat among them; shared vertices",
         f"surfels; specular; {_TEXTURES}",
+        ("specular",),
     ),
     Writer(
         "OpenEXR",

@@ -17,6 +17,7 @@ from drgs_blender.core.cryptomatte import name_hash
 from drgs_blender.core.errors import AssetError
 from drgs_blender.core.frame import Adjustment, Frame, Light, Material, ObjectState, Visibility, World
 from drgs_blender.deform.attach import attach
+from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.engine.session import Session
 from drgs_blender.render.progressive import thinned_scene
 
@@ -288,3 +289,16 @@ def test_linked_lights_know_the_object_behind_its_mesh(glowing_path, make_frame)
     frame.objects[0].visibility.lit_by = 1
     lit = session.render(frame)["DiffDir"][index == 3].mean()
     assert floor > 0.1 and lit > 1.05 * ball
+
+
+def test_surfels_are_not_posed_again_because_the_camera_sees_the_mesh(glowing_path, make_frame, monkeypatch) -> None:
+    """Coarse pictures of viewports show meshes, those after them surfels."""
+    poses, pose = [], MeshDriven.pose
+    monkeypatch.setattr(MeshDriven, "pose", lambda *given, **options: poses.append(1) or pose(*given, **options))
+    frame = make_frame()
+    session = use(frame, glowing_path)
+    first = session.render(frame)
+    session.render(replace(frame, settings=replace(frame.settings, camera_sees="mesh")))
+    again = session.render(frame)
+    assert_same_bits(first, again)
+    assert len(poses) == 1

@@ -417,6 +417,25 @@ def test_convert_names_what_a_file_does_not_hold(tmp_path: Path, capsys: pytest.
     assert "a.glb: has no splats, only a mesh, and cannot be written as .ply." in capsys.readouterr().err
 
 
+def test_splats_are_as_translucent_as_the_mesh_and_emission_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asset = asset_on_a_square()
+    n, k = len(asset.mesh.vertices), len(asset.surfels)
+    asset.mesh.opacity, asset.mesh.specular = np.full(n, 0.5, np.float32), np.full(n, 0.9, np.float32)
+    asset.mesh.emission = np.full((n, 3), 2, np.float32)
+    asset.surfels.emission = np.full((k, 3), 2, np.float32)
+    write_asset(tmp_path / "a.drgs", asset)
+    assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.ply"), "--as", "splats"]) == 0
+    assert "what the surfels emit is left out" in capsys.readouterr().out
+    found = read_surfels(tmp_path / "a.ply").surfels.opacity
+    np.testing.assert_allclose(found, 0.5 * asset.surfels.opacity, atol=1e-5)
+    assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.usdz")]) == 0
+    assert "specular is lost" in capsys.readouterr().out
+    assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.glb")]) == 0
+    assert "specular" not in capsys.readouterr().out
+
+
 def test_convert_says_what_becomes_of_materials(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asset = asset_on_a_square()
     asset.mesh.albedo[:], asset.mesh.roughness[:], asset.mesh.metallic[:] = 0.5, 0.5, 0.0
