@@ -87,6 +87,8 @@ def stand_in(state: ObjectState, traced: TraceObject, channels: dict[str, Array]
     faces, normals = traced.faces, traced.corner_normals
     if traced.torn is not None:
         faces, normals = faces[~traced.torn], None if normals is None else normals[~traced.torn]
+        if not len(faces):
+            return None
     layers = [Layer(_SURFACE, _corners(faces, traced.albedo, traced.roughness))]
     light = np.zeros((len(traced.vertices), 3), np.float32) if emission is None else emission
     layers.append(Layer(_LIGHT, _corners(faces, light, traced.metallic)))

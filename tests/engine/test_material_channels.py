@@ -302,3 +302,20 @@ def test_surfels_are_not_posed_again_because_the_camera_sees_the_mesh(glowing_pa
     again = session.render(frame)
     assert_same_bits(first, again)
     assert len(poses) == 1
+
+
+def test_what_is_torn_neither_emits_nor_hides(save, make_frame) -> None:
+    path = save(emission=RADIANCE, opacity=0.5)
+    frame = make_frame()
+    frame.passes = ("Combined", "Emit")
+    session = use(frame, path)
+    frame.objects[0].vertices[:, 2] *= 40.0
+    frame.objects[0].tear = 1e-3
+    torn = session.render(frame)
+    frame.objects[0].tear = 0.0
+    whole = session.render(frame)
+    assert whole["Emit"].any() and torn["Emit"].sum() < whole["Emit"].sum()
+    assert np.isfinite(torn["Combined"]).all()
+    frame.objects[0].vertices = np.random.default_rng(0).permutation(frame.objects[0].vertices) * np.float32(100)
+    frame.objects[0].tear = 1e-6
+    assert np.isfinite(session.render(frame)["Combined"]).all()
