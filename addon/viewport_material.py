@@ -9,6 +9,8 @@ import bpy
 from ..drgs_blender.core.asset import BASE_CHANNELS, OPTIONAL_CHANNELS
 
 NAME = "DR-GS"
+#: Custom property of images and materials of textures: what they were made of, and the optional channels they show.
+KEY = "drgs_textures"
 #: Material channel -> (output of its attribute, input of the Principled BSDF).
 _INPUTS = {
     "albedo": ("Color", "Base Color"),
@@ -31,21 +33,50 @@ def viewport_material(channels: Collection[str] = ()) -> bpy.types.Material:
     material = bpy.data.materials.new(name)
     if material.node_tree is None:  # before Blender 5.0
         material.use_nodes = True
+    surface = next(n for n in material.node_tree.nodes if n.type == "BSDF_PRINCIPLED")
+    surface.distribution = "GGX"
+    _show(material, [*BASE_CHANNELS, *more])
+    return material
+
+
+def textured_material(material: bpy.types.Material, channels: Collection[str]) -> bpy.types.Material:
+    """`material`, which shows textures, or that with the same textures that shows these optional `channels`."""
+    base, _, shown = material[KEY].partition(" ")
+    more = [name for name in OPTIONAL_CHANNELS if name in channels]
+    if shown.split() == more:
+        return material
+    key = " ".join([base, *more])
+    found = next((m for m in bpy.data.materials if m.get(KEY) == key and not m.library), None)
+    if found is not None:
+        return found
+    made = material.copy()
+    made[KEY] = key
+    for node in [n for n in made.node_tree.nodes if n.type == "ATTRIBUTE" and n.attribute_name in OPTIONAL_CHANNELS]:
+        made.node_tree.nodes.remove(node)
+    _show(made, more)
+    return made
+
+
+def update_viewport_material(mesh: bpy.types.Mesh) -> None:
+    """Have those of these materials that `mesh` has show the channels that it has."""
+    channels = {name for name in OPTIONAL_CHANNELS if name in mesh.attributes}
+    for slot, material in enumerate(mesh.materials):
+        if material is None or material.library:
+            continue
+        if slot == 0 and material.name.split(" ")[0] == NAME:
+            mesh.materials[0] = viewport_material(channels)
+        elif KEY in material:
+            mesh.materials[slot] = textured_material(material, channels)
+
+
+def _show(material: bpy.types.Material, channels: Collection[str]) -> None:
+    """Feed the Principled BSDF of a material with the attributes of channels."""
     nodes, links = material.node_tree.nodes, material.node_tree.links
     surface = next(n for n in nodes if n.type == "BSDF_PRINCIPLED")
-    surface.distribution = "GGX"
-    surface.inputs["Emission Strength"].default_value = 1.0 if "emission" in more else 0.0
-    for row, channel in enumerate([*BASE_CHANNELS, *more]):
+    surface.inputs["Emission Strength"].default_value = 1.0 if "emission" in channels else 0.0
+    for row, channel in enumerate(channels):
         output, target = _INPUTS[channel]
         attribute = nodes.new("ShaderNodeAttribute")
         attribute.attribute_name = attribute.label = channel
         attribute.location = (surface.location.x - 300, surface.location.y - 180 * row)
         links.new(attribute.outputs[output], surface.inputs[target])
-    return material
-
-
-def update_viewport_material(mesh: bpy.types.Mesh) -> None:
-    """Have the first slot of `mesh` show the channels that it has, if one of these materials is there."""
-    material = mesh.materials[0] if mesh.materials else None
-    if material is not None and material.name.split(" ")[0] == NAME and not material.library:
-        mesh.materials[0] = viewport_material({name for name in OPTIONAL_CHANNELS if name in mesh.attributes})

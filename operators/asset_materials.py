@@ -7,10 +7,9 @@ import hashlib
 import bpy
 import numpy as np
 
+from ..addon.viewport_material import KEY, update_viewport_material
 from ..drgs_blender.core.asset.textures import ALBEDO, METALLIC, NORMAL, ROUGHNESS, MeshTextures
 
-#: Custom property of images and materials: what they were made of, so that each is there once.
-KEY = "drgs_textures"
 _EXTENSIONS = ("REPEAT", "EXTEND", "MIRROR")
 _CHANNELS = {ROUGHNESS: "Green", METALLIC: "Blue"}
 _INPUTS = {ALBEDO: "Base Color", ROUGHNESS: "Roughness", METALLIC: "Metallic", NORMAL: "Normal"}
@@ -28,6 +27,7 @@ def show_textures(mesh: bpy.types.Mesh, textures: MeshTextures) -> None:
     index = np.where(textures.material < 0, 0, first + textures.material).astype(np.int32)
     mesh.polygons.foreach_set("material_index", index)
     mesh.update()
+    update_viewport_material(mesh)
 
 
 def _material(textures: MeshTextures, k: int, uv_map: str) -> bpy.types.Material:

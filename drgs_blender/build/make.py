@@ -149,7 +149,7 @@ def detailed_mesh(
     net, (source, corners), frames = _net(file, name, report, materials.width)
     faces = len(net.faces)
     net, values, report["rounds"], report["unresolved_edges"] = refine(net, materials, tolerance, max_triangles)
-    columns = {
+    columns: dict[str, Any] = {
         n: values[:, own] if own.stop - own.start > 1 else values[:, own.start] for n, own in materials.columns.items()
     }
     alpha = columns.pop(CUT, None)

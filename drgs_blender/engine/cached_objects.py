@@ -1,4 +1,4 @@
-"""Objects of the last frame and their assets, with what was made of them."""
+"""Objects of the last frame, with what was made of them."""
 
 from __future__ import annotations
 
@@ -8,84 +8,54 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..core.arrays import Array
-from ..core.asset.model import Asset, PosedSurfels, Surfels
-from ..core.errors import AssetError
-from ..core.frame import MeshState, ObjectState, RenderSettings
-from ..deform.mesh_driven import MeshDriven
+from ..core.asset.model import PosedSurfels
+from ..core.frame import Image, MeshState, ObjectState
 from ..render.scene.ray_masks import CAMERA, group_mask
-from ..render.scene.trace_scene import TraceObject
+from ..render.scene.trace_scene import ObjectMesh, TraceObject
 from ..render.surfels.captured import CapturedObject
-from .captured_objects import Glow, glow_of, glowing_mesh
+from .captured_objects import glowing_mesh
+from .loaded_assets import LoadedAsset
+from .object_meshes import object_mesh, stub
+from .optional_channels import optional_channels
 from .scene_objects import material_faults, traced_object
-from .stand_ins import optional_channels, stand_in, tie_only
-
-
-@dataclass(slots=True)
-class LoadedAsset:
-    """An asset, the state of the file it is mapped from, and its deformation once it was needed."""
-
-    asset: Asset
-    stamp: tuple[int, int, int]
-    driven: MeshDriven | None = None
-    glow: Glow | None = None
-
-    def surfels_of(self, state: ObjectState) -> MeshDriven | Surfels:
-        """The deformation of the asset's surfels, made when an object first needs it; the surfels without a mesh."""
-        if not len(self.asset.mesh.faces):
-            return self.asset.surfels
-        if self.driven is None:
-            asset = self.asset
-            if asset.binding is None:
-                problem = f"the surfels of {state.asset} are not bound to its mesh"
-                raise AssetError(f"object {state.name}", problem, "Bind them, or set Camera Sees to Mesh")
-            self.driven = MeshDriven(asset.mesh, asset.surfels, asset.binding)
-        return self.driven
-
-    def glow_of(self, key: str) -> Glow:
-        """What its faces emit in captured colours, made when an object first needs it."""
-        if self.glow is None:
-            self.glow = glow_of(self.asset, key)
-        return self.glow
 
 
 @dataclass(slots=True)
 class CachedObject:
     """An object as it was in the last frame, and what was made of it.
 
-    One that is shown in captured colours is `captured` for the camera, and for rays `glowing`. One that emits light or
-    lets it pass has a `stand_in`, and `emission` (n, 3) of its surfels.
+    One that is shown in captured colours is `captured` for the camera, and for rays `glowing`. One with materials of
+    its own, or with `channels` that rays meet, has a `mesh` with `images`; `met` is what stands for the object in the
+    scene. Its surfels may have `emission` (n, 3).
     """
 
     state: ObjectState
     loaded: LoadedAsset
     traced: TraceObject
+    met: TraceObject
     posed: PosedSurfels | None = None
     hidden_count: int = 0
     faults: list[str] = field(default_factory=list)
-    mode: tuple[bool, bool, bool] = (False, False, True)
+    mode: tuple[bool, bool, bool] = (False, False, False)
     captured: CapturedObject | None = None
     glowing: MeshState | None = None
-    stand_in: MeshState | None = None
+    mesh: ObjectMesh | None = None
+    images: list[Image] = field(default_factory=list)
     emission: Array | None = None
     channels: dict[str, Array] = field(default_factory=dict)
 
     @property
-    def other_mesh(self) -> MeshState | None:
-        """What rays meet instead of the object itself."""
-        return self.glowing or self.stand_in
-
-    @property
     def seen_by_mesh(self) -> bool:
-        """Whether the camera sees the mesh that stands for it, not its surfels."""
-        return self.stand_in is not None and self.stand_in.visibility.camera
+        """Whether the camera sees its mesh, not its surfels."""
+        return self.mesh is not None and self.mesh.clear
 
 
 def surfel_mask(item: CachedObject) -> int:
-    """Which rays meet an object's surfels; where something else stands for it, the camera's at most."""
+    """Which rays meet an object's surfels; where they meet a mesh of it, the camera's at most."""
+    if item.glowing is not None or item.seen_by_mesh:
+        return 0
     mask = group_mask(item.state.visibility, True)
-    if item.other_mesh is None:
-        return mask
-    return 0 if item.glowing is not None or item.seen_by_mesh else mask & CAMERA
+    return mask if item.mesh is None or item.mesh.seen_only else mask & CAMERA
 
 
 def emission_of(objects: Sequence[CachedObject]) -> Array | None:
@@ -97,18 +67,33 @@ def emission_of(objects: Sequence[CachedObject]) -> Array | None:
     return np.concatenate(rows)
 
 
-def begun(
-    state: ObjectState, loaded: LoadedAsset, mode: tuple[bool, bool, bool], settings: RenderSettings
-) -> CachedObject:
-    """An object that is new or has changed, without its surfels."""
-    met, shown, _ = mode
-    item = CachedObject(state, loaded, traced_object(state, loaded.asset, met or shown), mode=mode)
-    item.faults = material_faults(state)
-    if shown and len(loaded.asset.mesh.faces):
-        item.glowing = glowing_mesh(state, item.traced, loaded.glow_of(state.asset))
-    if not shown:
-        item.channels = optional_channels(state, loaded.asset)
-        item.stand_in = stand_in(state, item.traced, item.channels, settings.camera_sees == "mesh")
-        if item.stand_in is not None:
-            item.traced = tie_only(item.traced)
+def begun(state: ObjectState, loaded: LoadedAsset, mode: tuple[bool, bool, bool], index: int) -> CachedObject:
+    """An object that is new or has changed, without its surfels.
+
+    Parameters
+    ----------
+    state : ObjectState
+    loaded : LoadedAsset
+    mode : tuple of bool
+        Whether rays meet surfels, whether it is shown in captured colours, and whether its textures are met.
+    index : int
+        Of the object in the frame.
+    """
+    met, shown, textured = mode
+    asset = loaded.asset
+    traced = traced_object(state, asset, met or shown)
+    item = CachedObject(state, loaded, traced, traced, mode=mode)
+    item.faults = [*(f"{state.name}: {fault}" for fault in loaded.faults), *material_faults(state)]
+    if shown:
+        if len(asset.mesh.faces):
+            item.glowing = glowing_mesh(state, traced, loaded.glow_of(state.asset))
+        return item
+    item.channels = optional_channels(state, asset)
+    lit = "emission" in item.channels or "opacity" in item.channels
+    has_textures = asset.mesh.textures is not None
+    images = loaded.textured_of(state.asset) if has_textures and (textured or lit) else None
+    item.mesh, item.images, faults = object_mesh(state, traced, asset, index, item.channels, images)
+    item.faults += faults
+    if item.mesh is not None:
+        item.met = stub(traced)
     return item

@@ -8,8 +8,8 @@ from ..core.asset.model import Asset, Surfels
 from ..core.errors import AssetError
 from ..core.frame import ObjectState
 from ..deform.mesh_driven import MeshDriven
+from .asset_textures import TexturedAsset
 from .captured_objects import Glow, glow_of
-from .textured_objects import TexturedAsset
 
 
 @dataclass(slots=True)

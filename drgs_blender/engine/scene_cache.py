@@ -30,10 +30,11 @@ from ..render.scene.see_through import MOST
 from ..render.scene.trace_scene import TraceScene
 from ..render.surfels.captured import CapturedObject
 from ..render.surfels.surfel_bvh import SurfelBVH
-from .cached_objects import CachedObject, LoadedAsset, begun, emission_of, surfel_mask
+from .cached_objects import CachedObject, begun, emission_of, surfel_mask
 from .captured_objects import captured_faults, captured_object, shows_captured
+from .loaded_assets import LoadedAsset
+from .optional_channels import channel_faults, may_need, surfel_emission
 from .scene_objects import in_asset_order, join, moved_vertices, posed_surfels
-from .stand_ins import has_channels, may_need, stand_in_faults, stand_in_pose, surfel_emission
 
 Array = np.ndarray
 
@@ -117,7 +118,8 @@ class SceneCache:
         stamp = status.st_ino, status.st_mtime_ns, status.st_size
         known = self._assets.get(key)
         if known is None or known.stamp != stamp:
-            self._assets[key] = LoadedAsset(read_asset(key), stamp)
+            faults: list[str] = []
+            self._assets[key] = LoadedAsset(read_asset(key, faults=faults), stamp, faults=faults)
         return key
 
     def asset(self, key: str) -> Asset:
@@ -166,12 +168,11 @@ class SceneCache:
             state = in_asset_order(state, loaded.asset)
             known = self.objects[index] if index < len(self.objects) else None
             kept = reuse_equal(state, None if known is None else known.state)
-            # What may have a stand-in depends on how it is seen.
-            mode = met, shown, seen or not has_channels(state, loaded.asset)
+            mode = met, shown, loaded.asset.mesh.textures is not None and not shown and not (seen and met)
             if known is not None and known.loaded is loaded and known.state is kept and known.mode == mode:
                 item = known
             else:
-                item = begun(kept, loaded, mode, frame.settings)
+                item = begun(kept, loaded, mode, index)
                 if known is not None and known.loaded is loaded and known.state is kept and known.mode[:2] == mode[:2]:
                     # Only how the camera sees it is another: its surfels stand where they stood.
                     item.posed, item.hidden_count, item.emission = known.posed, known.hidden_count, known.emission
@@ -186,25 +187,23 @@ class SceneCache:
             objects.append(item)
             faults += captured_faults(kept, loaded.asset, frame)
             if not shown:
-                faults += stand_in_faults(kept, loaded.asset, item.channels, frame.settings)
+                faults += channel_faults(kept, loaded.asset, item.channels, frame.settings)
         meshes, images = reuse_equal(frame.meshes, self.meshes), reuse_equal(frame.images, self.images)
         same = len(objects) == len(self.objects) and all(a is b for a, b in zip(objects, self.objects))
         if not (self._current and same and meshes is self.meshes and images is self.images):
             self._current = False  # an update that fails half way leaves nothing to be taken for current
             glowing = [item for item in objects if item.glowing is not None]
             glows = {item.state.asset: item.loaded.glow_of(item.state.asset).image for item in glowing}
-            others = [*meshes, *(item.other_mesh for item in objects if item.other_mesh is not None)]
-            self.scene.update([item.traced for item in objects], others, [*images, *glows.values()])
-            # What stands for an object is that object, in mattes and for linked lights.
-            own = [index for index, item in enumerate(objects) if item.other_mesh is not None]
-            first = len(objects) + len(meshes)
-            self.scene.source[first : first + len(own)] = own
+            others = [*meshes, *(item.glowing for item in glowing if item.glowing is not None)]
+            others += [item.mesh for item in objects if item.mesh is not None]
+            textures = {image.name: image for item in objects for image in item.images}
+            self.scene.update([item.met for item in objects], others, [*images, *glows.values(), *textures.values()])
             self._current = True
         self.objects, self.meshes, self.images, self._captured_faults = objects, meshes, images, faults
         used = {state.asset for state in frame.objects}
         for key, loaded in self._assets.items():
             if key not in used:
-                loaded.driven = loaded.glow = None
+                loaded.driven = loaded.glow = loaded.textured = None
         along_rays = seen and bool(frame.camera.panorama)
         tree = self._surfel_bvh(objects if met or along_rays else None)
         self.tree, self.seen_tree = tree if met else None, tree if along_rays else None
@@ -270,12 +269,8 @@ class SceneCache:
             None if pose is None else moved_vertices(item.state, item.loaded.asset, pose)
             for pose, item in zip(step.objects, self.objects)
         ]
-        others = [
-            None if item.stand_in is None else stand_in_pose(item.state, item.loaded.asset, pose)
-            for pose, item in zip(step.objects, self.objects)
-            if item.other_mesh is not None
-        ]
-        vertices, instances = self.scene.at(moved, [*step.meshes, *others])
+        others = sum((item.glowing is not None) + (item.mesh is not None) for item in self.objects)
+        vertices, instances = self.scene.at(moved, [*step.meshes, *[None] * others])
         return SceneState(vertices, instances, camera_parameters(step.camera, frame.settings, frame.noise_index))
 
     def warnings(self) -> list[str]:
@@ -318,9 +313,7 @@ class SceneCache:
 
     def _name(self, index: int) -> str:
         """Of an object as the trace scene numbers them."""
-        source = int(self.scene.source[index])
-        count = len(self.objects)
-        return self.objects[source].state.name if source < count else self.meshes[source - count].name
+        return self.scene.faults[int(self.scene.source[index])].name
 
     def environment_of(self, world: World) -> EnvironmentLight:
         """The light of `world`, made again only when something about it changed; a rotation costs nothing."""
@@ -346,7 +339,7 @@ class SceneCache:
         sphere = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
         self.lights = Lights(lights, *sphere, self._emitters)
         shapes: list[ObjectState | MeshState] = [*(item.state for item in self.objects), *self.meshes]
-        shapes += [item.other_mesh for item in self.objects if item.other_mesh is not None]
+        shapes += [item.glowing for item in self.objects if item.glowing is not None]
         link(self.lights, lights, shapes, self.scene, sphere)
         group(self.lights, lights, shapes, frame.world.light_group, groups_of(frame.passes))
         return self.lights

@@ -31,9 +31,9 @@ from ..render.pipeline import Progress, render
 from ..render.prepared_scene import PreparedScene
 from ..render.scene.trace_scene import TraceObject
 from .denoise_history import Histories
+from .optional_channels import surfel_emission
 from .progressive_view import Pace, View
 from .scene_cache import SceneCache
-from .stand_ins import surfel_emission
 
 logger = logging.getLogger(__name__)
 

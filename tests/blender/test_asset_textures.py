@@ -90,6 +90,35 @@ def test_cycles_shows_the_imported_materials_as_drgs_the_asset(scene, ball):
     assert parity.psnr(ours, theirs) > 40
 
 
+@pytest.mark.parametrize("painted", [False, True])
+def test_textured_materials_glow_and_let_light_pass_as_those_of_drgs(scene, tmp_path, painted):
+    """Emission and opacity of an asset with images, from the file or painted later."""
+    asset, arrays = textured_ball(), part("addon.mesh_arrays")
+    height = asset.mesh.vertices[:, 2]
+    channels = {"emission": np.outer(height.clip(0), (2.0, 1.0, 0.5)), "opacity": np.clip(0.6 + height, 0, 1)}
+    channels = {name: values.astype(np.float32) for name, values in channels.items()}
+    if not painted:
+        asset.mesh = replace(asset.mesh, **channels)
+    part("drgs_blender.core.asset.container").write_asset(tmp_path / "veil.drgs", asset)
+    bpy.ops.import_scene.drgs(filepath=str(tmp_path / "veil.drgs"))
+    mesh = bpy.context.active_object.data
+    if painted:
+        for name, values in channels.items():
+            arrays.write_channel(mesh, name, values)
+        part("addon.viewport_material").update_viewport_material(mesh)
+    for material in mesh.materials:
+        names = {n.attribute_name for n in material.node_tree.nodes if n.type == "ATTRIBUTE"}
+        assert {"emission", "opacity"} <= names
+    counts = len(bpy.data.materials)
+    part("addon.viewport_material").update_viewport_material(mesh)
+    assert len(bpy.data.materials) == counts
+    parity.light(scene)
+    parity.set_up(scene, 64, samples=256, bounces=2)
+    scene.camera.location.y = -3.4
+    ours, theirs = parity.pictures(scene, "DRGS"), parity.pictures(scene, "CYCLES")
+    assert parity.psnr(ours, theirs) > 36
+
+
 def test_save_keeps_textures_and_what_factors_can_say(ball, tmp_path):
     before = textured_ball().mesh.textures
     assert bpy.ops.drgs.save_asset(filepath=str(tmp_path / "same.drgs")) == {"FINISHED"}

@@ -291,6 +291,16 @@ def test_linked_lights_know_the_object_behind_its_mesh(glowing_path, make_frame)
     assert floor > 0.1 and lit > 1.05 * ball
 
 
+def test_what_an_object_emits_shines_on_all_beside_linked_lights(glowing_path, make_frame) -> None:
+    frame = make_frame(samples=32, camera_sees="mesh")
+    session = use(frame, glowing_path)
+    alone = lit_floor(frame, session)
+    lamp = Light("Lamp", "area", np.eye(4), power=1e-6, size_x=1.0, size_y=1.0, receivers=0)
+    lamp.matrix_world[2, 3] = 3.0
+    frame.lights = [lamp]
+    np.testing.assert_allclose(lit_floor(frame, session), alone, rtol=0.05)
+
+
 def test_surfels_are_not_posed_again_because_the_camera_sees_the_mesh(glowing_path, make_frame, monkeypatch) -> None:
     """Coarse pictures of viewports show meshes, those after them surfels."""
     poses, pose = [], MeshDriven.pose

@@ -30,8 +30,8 @@ from drgs_blender.core.frame import (
     World,
 )
 from drgs_blender.core.material_adjustments import edited_asset
+from drgs_blender.engine.asset_textures import TexturedAsset
 from drgs_blender.engine.session import Session
-from drgs_blender.engine.textured_objects import TexturedAsset
 from drgs_blender.formats.files import Image, MaterialFile, MeshFile
 from drgs_blender.formats.images import decode_image
 from drgs_blender.formats.registry import read_mesh
@@ -233,14 +233,35 @@ def test_a_saved_edit_looks_as_it_did(seen, adjustment: Adjustment | None) -> No
     np.testing.assert_allclose(after, before, atol=4e-3)
 
 
-@pytest.mark.parametrize("camera_sees", ["mesh", "surfels"])
-def test_a_textured_object_is_the_object_in_every_pass(tmp_path: Path, camera_sees: str) -> None:
+PASSES = (
+    "Combined", "Emit", "DiffDir", "Vector", "IndexOB", "IndexMA", "CryptoObject00", "CryptoMaterial00", "Depth", "UV",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("camera_sees", "rays_see", "names"),
+    [
+        ("mesh", "mesh", ()),
+        ("surfels", "mesh", ()),
+        ("mesh", "mesh", ("emission", "opacity")),
+        ("surfels", "mesh", ("emission", "opacity")),
+        ("surfels", "mesh", ("emission",)),
+        ("surfels", "surfels", ("emission",)),
+    ],
+)
+def test_a_textured_object_is_the_object_in_every_pass(
+    tmp_path: Path, camera_sees: str, rays_see: str, names: tuple[str, ...]
+) -> None:
     """With images of the colours of its vertices, an object has the passes that it has without: light, motion, IDs."""
     colour = np.full((4, 4, 3), (200, 100, 50), np.uint8)
     file = square_file(6, Image(colour, srgb=True))
     asset = make_asset(file, density=40, max_triangles=200)
     assert asset.mesh.textures is not None and len(asset.surfels)
     asset.mesh.textures.normals = None
+    x = asset.mesh.vertices[:, 0]
+    channels = {"emission": np.outer(np.maximum(x, 0), (2.0, 1.0, 0.5)), "opacity": np.clip(0.6 + x, 0, 1)}
+    asset = edited_asset(asset, {name: channels[name].astype(np.float32) for name in names})
+    assert asset.mesh.textures is not None
     bare = replace(asset, mesh=replace(asset.mesh, textures=None))
     session, found = Session(), []
     moved = (asset.mesh.vertices + np.array((0.3, 0, 0.15))).astype(np.float32)
@@ -255,18 +276,54 @@ def test_a_textured_object_is_the_object_in_every_pass(tmp_path: Path, camera_se
         state = ObjectState("thing", key, turned, vertices=asset.mesh.vertices, pass_index=5, material_pass_index=2)
         frame = Frame(
             0, look_along_y(32, focal=45.0), [state], World(),
-            RenderSettings(samples=8, bounces=2, camera_sees=camera_sees, rays_see="mesh"),
-            ("Combined", "Vector", "IndexOB", "IndexMA", "CryptoObject00", "CryptoMaterial00", "Depth", "UV"),
+            RenderSettings(samples=8, bounces=2, camera_sees=camera_sees, rays_see=rays_see),
+            PASSES,
             meshes=[floor],
             previous=MotionStep(look_along_y(32, focal=45.0), [Pose("thing", turned[None], moved)], [None]),
         )  # fmt: skip
         found.append(session.render(frame))
-        assert session._scene_cache.objects[0].textured is not None or name == "bare"
+        mesh = session._scene_cache.objects[0].mesh
+        assert (mesh is not None) == (name == "textured" or bool(names))
+        assert name == "bare" or (mesh is not None and mesh.uvs is not None)
     textured_passes, plain_passes = found
-    assert textured_passes.keys() == plain_passes.keys() and len(plain_passes) >= 8
+    assert textured_passes.keys() == plain_passes.keys() and len(plain_passes) >= 10
+    assert (plain_passes["DiffDir"].max() > 0.1) and (plain_passes["Emit"].max() > 0.1) == ("emission" in names)
     assert np.abs(plain_passes["Vector"]).max() > 1
     for name, expected in plain_passes.items():
         np.testing.assert_allclose(textured_passes[name], expected, rtol=2e-3, atol=2e-3, err_msg=name)
+
+
+@pytest.mark.parametrize("painted", [False, True])
+def test_a_textured_surface_glows_and_lets_light_pass(tmp_path: Path, painted: bool) -> None:
+    """A quarter of it is there, with the colours of its image and the radiance of its vertices."""
+    pixels = np.full((16, 16, 3), (200, 100, 50), np.uint8)
+    pixels[:, 8:] = 40, 120, 220
+    asset = textured({"albedo": pixels}, (0, -1, -1, -1))
+    n = len(asset.mesh.vertices)
+    emission, opacity = np.tile(np.float32([3.0, 1.5, 0.25]), (n, 1)), np.full(n, 0.5, np.float32)
+    own: dict[str, object] = {"emission": emission, "opacity": opacity}
+    if not painted:
+        asset.mesh, own = replace(asset.mesh, **own), {}  # type: ignore[arg-type]
+    write_asset(tmp_path / "a.drgs", asset)
+    assert inspect_asset(tmp_path / "a.drgs")["schema"] == 4
+    session = Session()
+    key = session.load_asset(tmp_path / "a.drgs")
+    change = Adjustment(opacity=0.5, emission=2.0)
+    settings = RenderSettings(
+        samples=16, camera_sees="mesh", rays_see="mesh", subpixel_samples=64, film_transparent=True
+    )
+    camera = replace(look_along_y(24, focal=24 / 1.8), orthographic=True)
+    passes = ("Combined", "DiffCol", "Emit", "CryptoObject00")
+    frame = Frame(0, camera, [ObjectState("thing", key, adjustment=change, **own)], World(), settings, passes)
+    picture = session.render(frame)
+    assert picture["Combined"][..., 3].mean() == pytest.approx(0.25, abs=0.01)
+    np.testing.assert_allclose(picture["Emit"].mean(axis=(0, 1)), 0.25 * np.array((6.0, 3.0, 0.5)), rtol=0.03)
+    for columns, colour in ((slice(0, 11), (200, 100, 50)), (slice(13, 24), (40, 120, 220))):
+        found = picture["DiffCol"][:, columns].mean(axis=(0, 1))
+        whole = srgb_to_linear(np.array(colour) / 255)
+        np.testing.assert_allclose(found, 0.24 * whole, rtol=0.06)  # a coat of varnish reflects the rest
+    shares = picture["CryptoObject00"][..., 1]
+    np.testing.assert_allclose(shares, picture["Combined"][..., 3], atol=1e-5)
 
 
 def test_normals_follow_the_pose() -> None:
@@ -426,6 +483,27 @@ def test_gltf_has_the_images_and_an_atlas_for_the_rest(tmp_path: Path, capsys) -
     again, _ = mesh_with_materials(file, "again", max_triangles=10, max_texture=64)
     assert again.textures is not None
     assert [d.tobytes() for d in again.textures.images.values()][:3] == [d.tobytes() for d in textures.images.values()]
+
+
+def test_gltf_has_images_with_opacity_and_emission_that_are_alike_in_a_material(tmp_path: Path, capsys) -> None:
+    noise_pixels = np.random.default_rng(1).integers(0, 255, (16, 16, 4), np.uint8)
+    n = 169
+    channels = {"emission": np.tile((3.0, 1.5, 0.25), (n, 1)), "opacity": np.full(n, 0.5), "coat": np.full(n, 0.25)}
+    asset = textured({"albedo": noise_pixels}, (0, -1, -1, -1), **channels)
+    assert asset.mesh.textures is not None
+    file = converted(tmp_path, asset, "a.glb")
+    assert "1 materials with the images" in capsys.readouterr().out
+    (paint,) = file.materials
+    image = paint.base_colour_image
+    assert image is not None and image.pixels.shape == (16, 16, 3)  # else its alpha would count, too
+    np.testing.assert_array_equal(image.pixels, noise_pixels[..., :3])
+    again, _ = mesh_with_materials(file, "again", max_triangles=1000, max_texture=64)
+    assert again.textures is not None
+    for name, values in channels.items():
+        np.testing.assert_allclose(again.channel(name), values[: len(again.vertices)], rtol=1e-3, err_msg=name)
+    asset.mesh.opacity = np.linspace(0, 1, n).astype(np.float32)
+    assert len(converted(tmp_path, asset, "b.glb").materials) == 1
+    assert "0 materials with the images" in capsys.readouterr().out
 
 
 def test_gltf_of_channels_that_vary_at_vertices_is_an_atlas(tmp_path: Path, capsys) -> None:

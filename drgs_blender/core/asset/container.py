@@ -20,7 +20,6 @@ from .archive import read_archive, write_archive
 from .model import (
     BASE_CHANNELS,
     MATERIAL_CHANNELS,
-    OPTIONAL_CHANNELS,
     SURFEL_CHANNELS,
     Asset,
     Binding,
@@ -29,61 +28,17 @@ from .model import (
     SourceVertices,
     Surfels,
 )
+from .schema import CONVENTIONS, OPTIONAL_TENSORS, SCHEMA, SINCE, TENSORS, TEXTURES, lowest_schema
 from .tensors import decode, dtype_name, encode, parse_json
 from .textures import check_textures, tensors_of, textures_of
 
 Array = np.ndarray
 PathLike = str | os.PathLike[str]
 
-#: Newest version of the layout. A reader refuses higher ones, because it cannot know what they mean.
-SCHEMA = 4
 MANIFEST = "manifest.json"
-#: Conventions of all numbers in the file; a file that states others is refused.
-CONVENTIONS = {
-    "units": "metre",
-    "up_axis": "+Z",
-    "handedness": "right",
-    "colour_space": "linear Rec.709",
-    "quaternions": "wxyz",
-}
 #: Largest deviation from a limit (range [0, 1], unit length) that is taken for rounding.
 TOLERANCE = 1e-3
-
-#: member -> tensor -> dtype; names that end in "/" are families (extras of any name).
-TENSORS: dict[str, dict[str, str]] = {
-    "surfels.safetensors": {
-        **dict.fromkeys(("centre", "scale", "rotation", "opacity", *BASE_CHANNELS, "sh", *SURFEL_CHANNELS), "F32"),
-        "extras/": "F32",
-    },
-    "mesh.safetensors": {
-        "vertices": "F32",
-        "faces": "I32",
-        **dict.fromkeys((*BASE_CHANNELS, *OPTIONAL_CHANNELS), "F32"),
-        "groups/": "I32",
-    },
-    "binding.safetensors": {"face": "I32", **dict.fromkeys(("barycentric", "offset", "normal"), "F32")},
-    "environment.safetensors": {"radiance": "F32"},
-    "source.safetensors": {"index": "I32", "weights": "F32", "count": "I32", "transform": "F32"},
-    "textures.safetensors": {
-        "uvs": "F32", "material": "I32", "slots": "I32", "factors": "F32", "transforms": "F32", "extensions": "I32",
-        "names": "U8", "normals": "F32", "images/": "U8",
-    },
-}  # fmt: skip
 _REQUIRED = ("surfels.safetensors", "mesh.safetensors")
-_TEXTURES = "textures.safetensors"
-#: (member, tensor) -> the first schema that has it.
-_SINCE = {
-    **{("surfels.safetensors", name): 3 for name in SURFEL_CHANNELS},
-    **{("mesh.safetensors", name): 3 for name in OPTIONAL_CHANNELS},
-    **{("source.safetensors", name): 2 for name in TENSORS["source.safetensors"]},
-    **{(_TEXTURES, name): 4 for name in TENSORS[_TEXTURES]},
-}
-_OPTIONAL_TENSORS = {
-    *[("surfels.safetensors", name) for name in ("sh", *SURFEL_CHANNELS)],
-    *[("mesh.safetensors", name) for name in OPTIONAL_CHANNELS],
-    ("source.safetensors", "transform"),
-    (_TEXTURES, "normals"),
-}
 _RESTORE = "Restore the file from a copy, or import the source files again"
 
 
@@ -114,7 +69,7 @@ def write_asset(path: PathLike, asset: Asset) -> None:
         }
     manifest = {
         "format": "drgs",
-        "schema": _schema(members),
+        "schema": lowest_schema(members),
         "producer": f"drgs-blender {__version__}",
         **CONVENTIONS,
         "members": members,
@@ -164,17 +119,17 @@ def read_asset(path: PathLike, verify: bool = True, faults: list[str] | None = N
     subject = os.fspath(path)
     members = read_archive(path, check=(MANIFEST,))
     manifest = _manifest(members, subject)
-    parts = [name for name in members if name not in (MANIFEST, _TEXTURES)]
+    parts = [name for name in members if name not in (MANIFEST, TEXTURES)]
     tensors = {name: _tensors(name, members, manifest, subject, verify) for name in parts}
     try:
         asset = _asset(tensors, manifest["provenance"])
     except AssetError as error:
         raise AssetError(f"{subject}, {error.subject}", error.problem, error.remedy or _RESTORE) from error
     check_asset(asset, subject, values=verify)
-    if _TEXTURES in members:
+    if TEXTURES in members:
         try:
-            arrays = _tensors(_TEXTURES, members, manifest, subject, verify)
-            asset.mesh.textures = textures_of(arrays, len(asset.mesh.faces), f"{subject}, {_TEXTURES}")
+            arrays = _tensors(TEXTURES, members, manifest, subject, verify)
+            asset.mesh.textures = textures_of(arrays, len(asset.mesh.faces), f"{subject}, {TEXTURES}")
         except AssetError as error:
             if faults is None:
                 raise
@@ -262,7 +217,7 @@ def check_asset(asset: Asset, subject: str, values: bool = True) -> None:
             raise AssetError(where, f"has {len(mesh.source.index)} rows for {len(mesh.vertices)} vertices", _RESTORE)
         _check_indices(mesh.source.index, mesh.source_count, where, "vertices of the source")
     if mesh.textures is not None:
-        check_textures(mesh.textures, len(mesh.faces), f"{subject}, {_TEXTURES}")
+        check_textures(mesh.textures, len(mesh.faces), f"{subject}, {TEXTURES}")
     if values:
         for member, tensors in _tensors_of(asset).items():
             for name, array in tensors.items():
@@ -302,12 +257,6 @@ def _manifest(members: Mapping[str, Array], subject: str) -> dict[str, Any]:
     return manifest
 
 
-def _schema(members: Mapping[str, Any]) -> int:
-    """The lowest schema that has these members and tensors, so that older versions read what they know."""
-    used = [_SINCE.get((member, name), 1) for member, entry in members.items() for name in entry["tensors"]]
-    return max(used, default=1)
-
-
 def _tensors(
     member: str, members: Mapping[str, Array], manifest: dict[str, Any], subject: str, verify: bool
 ) -> dict[str, Array]:
@@ -324,10 +273,10 @@ def _tensors(
     known, schema = TENSORS[member], manifest["schema"]
     for name, array in tensors.items():
         family = name.split("/", 1)[0] + "/" if "/" in name else name
-        if known.get(family) != dtype_name(array) or _SINCE.get((member, name), 1) > schema:
+        if known.get(family) != dtype_name(array) or SINCE.get((member, name), 1) > schema:
             raise AssetError(f"{where}, {name}", f"with type {array.dtype} is not part of schema {schema}", _RESTORE)
     for name in known:
-        if name not in tensors and not name.endswith("/") and (member, name) not in _OPTIONAL_TENSORS:
+        if name not in tensors and not name.endswith("/") and (member, name) not in OPTIONAL_TENSORS:
             raise AssetError(f"{where}, {name}", "is missing", _RESTORE)
     return tensors
 
@@ -345,7 +294,7 @@ def _tensors_of(asset: Asset) -> dict[str, dict[str, Array]]:
     if asset.environment is not None:
         parts["environment.safetensors"] = _fields(asset.environment)
     if asset.mesh.textures is not None:
-        parts[_TEXTURES] = tensors_of(asset.mesh.textures)
+        parts[TEXTURES] = tensors_of(asset.mesh.textures)
     return parts
 
 

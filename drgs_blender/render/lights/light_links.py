@@ -118,10 +118,10 @@ def link(
         emitters.append(own.emitters.address)
     emission, emission_blockers = np.zeros(len(shapes), np.int64), np.zeros(len(shapes), np.int32)
     for i, shape in enumerate(shapes):
-        if isinstance(shape, MeshState):
-            emission_blockers[i] = ray_masks.blocker_mask(shape.blockers)
-            for k, value in enumerate(values):
-                emission[i] |= int(shape.receivers < 0 or value >> shape.receivers & 1) << k
+        receivers, blockers = (shape.receivers, shape.blockers) if isinstance(shape, MeshState) else (-1, -1)
+        emission_blockers[i] = ray_masks.blocker_mask(blockers)
+        for k, value in enumerate(values):
+            emission[i] |= int(receivers < 0 or value >> receivers & 1) << k
     lights.linked_order = np.concatenate(orders)
     lights.linked = LinkedTables(
         plain(np.concatenate(tables)), plain(np.concatenate(picks)), np.array(spans, np.int64),

@@ -15,7 +15,7 @@ from ...core.frame import Image, Material, MeshState
 from ..memory import AddressOf, address
 from .mesh_layers import MeshLayers, Placements
 from .textures import MaterialTable
-from .trace_mesh import Part, TexturedObject, TraceObject
+from .trace_mesh import ObjectMesh, Part, TraceObject
 
 
 @dataclass(slots=True)
@@ -70,7 +70,7 @@ class MeshMaterials:
         self._tables: tuple[Array, Array] = self.layers.tables(0)
         self.addresses: Array = self.addresses_at(address)
         self._given: list[Any] = []  # lists of materials, images
-        self._ordinary = 0  # meshes; those of DR-GS objects with textures follow
+        self._ordinary = 0  # meshes; an `ObjectMesh` each of DR-GS objects follows
         self._first: list[int] = []  # of each mesh, in `table`
         self._names: list[Any] = []  # of the layers of each mesh
         self._shapes: list[tuple[slice, MeshState]] = []  # and the faces of each
@@ -142,7 +142,7 @@ class MeshMaterials:
         """
         first_source, first_face = sources
         given: list[Any] = [mesh.materials for mesh in meshes]
-        self._ordinary = sum(not isinstance(mesh, TexturedObject) for mesh in meshes)
+        self._ordinary = sum(not isinstance(mesh, ObjectMesh) for mesh in meshes)
         first = [int(n) for n in np.cumsum([0, *(len(own) for own in given)])]
         given += images
         # Which layers there are, not what is in them.

@@ -70,8 +70,8 @@ class TraceObject:
 
 
 @dataclass(slots=True)
-class TexturedObject(MeshState):
-    """The mesh of a DR-GS object with textures: laid out as an ordinary mesh of one instance, seen as the object.
+class ObjectMesh(MeshState):
+    """The mesh of a DR-GS object with materials of its own: an ordinary mesh of one instance, yet the object.
 
     Attributes
     ----------
@@ -83,6 +83,11 @@ class TexturedObject(MeshState):
 
     owner: int = 0
     seen_only: bool = False
+
+    @property
+    def clear(self) -> bool:
+        """Whether light may pass it; no surfels are tied to it then, and the camera sees it next to those of others."""
+        return any(material.clear for material in self.materials)
 
 
 @dataclass(slots=True)
@@ -147,7 +152,7 @@ class Part:
     @property
     def owner(self) -> int:
         """Which of the objects, or behind them of the meshes, its faces are of."""
-        return self.item.owner if isinstance(self.item, TexturedObject) else self.source
+        return self.item.owner if isinstance(self.item, ObjectMesh) else self.source
 
     @property
     def traced_faces(self) -> Array:
@@ -202,7 +207,7 @@ class Part:
 
 def mask_of(item: TraceObject | MeshState) -> int:
     """Group mask of an object or a mesh."""
-    if isinstance(item, TraceObject | TexturedObject):
+    if isinstance(item, TraceObject) or (isinstance(item, ObjectMesh) and not item.clear):
         return group_mask(item.visibility, True, item.seen_only)
     return group_mask(item.visibility, False, clear=any(material.clear for material in item.materials))
 

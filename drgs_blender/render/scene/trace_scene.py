@@ -22,12 +22,12 @@ from .mesh_layers import Placements
 from .mesh_materials import EmissiveMesh, MeshMaterials
 from .ray_masks import object_flags
 from .terminator import TerminatorOffsets
-from .trace_mesh import Part, TexturedObject, TraceObject, mask_of, own_faces, place_vertices, take_mesh, take_object
+from .trace_mesh import ObjectMesh, Part, TraceObject, mask_of, own_faces, place_vertices, take_mesh, take_object
 from .triangle_bvh import Group, TriangleBVH
 
 Array = np.ndarray
 
-__all__ = ["ObjectFaults", "TexturedObject", "TraceObject", "TraceScene"]
+__all__ = ["ObjectFaults", "ObjectMesh", "TraceObject", "TraceScene"]
 
 
 @dataclass(slots=True)
@@ -45,7 +45,7 @@ class TraceScene:
     """All objects and meshes of a frame.
 
     Objects are numbered: DR-GS objects as given, then meshes as given, then the instances of meshes that have
-    several, in the order of the meshes. A `TexturedObject` is one of the meshes, yet its faces are of its owner.
+    several, in the order of the meshes. A `ObjectMesh` is one of the meshes, yet its faces are of its owner.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class TraceScene:
     normals : (r, 3) float32 array
         Of meshes; object space where these have several instances.
     vertex_faces : int
-        How many faces are of DR-GS objects without textures; those come first.
+        How many faces are of DR-GS objects without an `ObjectMesh`; those come first.
     any_drgs : bool
         Whether any faces are of DR-GS objects.
     instances : (p, 3, 4) float32 array
@@ -269,7 +269,7 @@ class TraceScene:
         first = np.cumsum([0, *(len(p.matrices) if p.instanced else 0 for _, p in self._known)])
         for part in self._parts:
             own = vertices[part.vertex]
-            if isinstance(part.item, TraceObject | TexturedObject):
+            if isinstance(part.item, TraceObject | ObjectMesh):
                 place_vertices(objects[part.owner], None, own)
                 continue
             index = part.source - len(objects)
@@ -303,7 +303,7 @@ class TraceScene:
             # Corners with normals of their own get a row each.
             corner = own if smooth else np.arange(3 * m, dtype=np.int32).reshape(m, 3)
             faces.append(corner + np.int32(row))
-            owners.append(np.full(m, item.owner if isinstance(item, TexturedObject) else source, np.int32))
+            owners.append(np.full(m, item.owner if isinstance(item, ObjectMesh) else source, np.int32))
             rows[surfels] += n if smooth else 3 * m
             spans = slice(vertex, vertex + n), slice(face, face + m), slice(row, rows[surfels])
             instanced = where is not None and where.instanced
@@ -311,7 +311,7 @@ class TraceScene:
             vertex, face = vertex + n, face + m
             self.vertex_faces += m if surfels else 0
         self._vertex_count, self.layout = vertex, object()
-        self.any_drgs = any(isinstance(items[source], TraceObject | TexturedObject) for source in order)
+        self.any_drgs = any(isinstance(items[source], TraceObject | ObjectMesh) for source in order)
         self.shading_faces, self.face_object = np.concatenate(faces), np.concatenate(owners)
         self.shading = np.zeros((rows[True], VERTEX), np.float32)
         self.normals = np.zeros((rows[False], 3), np.float32)
@@ -342,7 +342,7 @@ class TraceScene:
         self.object_flags = flags[self.source]
         self._offsets.take(objects, meshes, self.source)
         visible = [len(p.matrices) > 0 and m.visibility.camera for m, p in zip(meshes, where)]
-        self.any_ordinary = any(v and not isinstance(m, TexturedObject) for v, m in zip(visible, meshes))
+        self.any_ordinary = any(v and (not isinstance(m, ObjectMesh) or m.clear) for v, m in zip(visible, meshes))
 
     def _commit(
         self,

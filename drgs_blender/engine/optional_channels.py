@@ -1,0 +1,82 @@
+"""Optional material channels of objects in a frame: emission, opacity and others that assets need not have.
+
+Where its surface emits light or lets it pass, rays meet an object by its `object_meshes.object_mesh`. Where light
+passes, the camera does, too: surfels overlap, so that a share of each is no share of the surface.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..core.asset.model import MATERIAL_CHANNELS, OPTIONAL_CHANNELS, Asset
+from ..core.frame import Frame, ObjectState, RenderSettings
+from ..core.material_adjustments import scaled
+from ..deform.mesh_driven import MeshDriven
+from .scene_objects import material
+
+Array = np.ndarray
+
+#: Channels that are kept in assets, painted and saved, and have no effect on the picture yet.
+NOT_RENDERED = ("specular", "coat")
+
+
+def has_channels(state: ObjectState, asset: Asset) -> bool:
+    """Whether an object or its asset has optional channels at all."""
+    fades = state.adjustment is not None and state.adjustment.opacity != 1
+    return fades or any(getattr(part, name) is not None for part in (state, asset.mesh) for name in OPTIONAL_CHANNELS)
+
+
+def optional_channels(state: ObjectState, asset: Asset) -> dict[str, Array]:
+    """Optional channels of the object's vertices in this frame, those that are not neutral everywhere.
+
+    Raises
+    ------
+    AssetError
+        An array that does not fit the asset; names the object.
+    """
+    found = {}
+    for name in OPTIONAL_CHANNELS:
+        factor = getattr(state.adjustment, name, 1.0)
+        if getattr(state, name) is None and getattr(asset.mesh, name) is None and factor == 1:
+            continue
+        values = material(state, name, asset.mesh.channel(name), f"{len(asset.mesh.vertices)} vertices")
+        if state.adjustment is not None:
+            values = scaled(name, values, factor, state.adjustment.mask)
+        if (values != MATERIAL_CHANNELS[name].neutral).any():
+            found[name] = values
+    return found
+
+
+def surfel_emission(state: ObjectState, asset: Asset, driven: MeshDriven | None) -> Array | None:
+    """(n, 3) float32 radiance of the object's surfels in this frame; None where none emits."""
+    own = asset.surfels.emission
+    if driven is not None and state.emission is not None:
+        painted = material(state, "emission", asset.mesh.channel("emission"), "a mesh")
+        own = driven.channel("emission", painted)
+    if own is not None and state.adjustment is not None and state.adjustment.emission != 1:
+        mask = state.adjustment.mask
+        if mask is not None and driven is not None:
+            mask = np.einsum("nk,nk->n", driven.binding.barycentric, mask[driven.mesh.faces[driven.binding.face]])
+        own = scaled("emission", own, state.adjustment.emission, mask)
+    return own if own is not None and own.any() else None
+
+
+def channel_faults(state: ObjectState, asset: Asset, channels: dict[str, Array], settings: RenderSettings) -> list[str]:
+    """What of the object's optional channels is not shown, or otherwise than its surfels, in words for the user."""
+    name, found = state.name, []
+    kept = [channel for channel in NOT_RENDERED if channel in channels]
+    if kept:
+        found.append(f"{name}: its {' and '.join(kept)} are kept in the asset, but not rendered")
+    passes, emits = "opacity" in channels, "emission" in channels
+    if passes and settings.camera_sees == "surfels":
+        found.append(f"{name}: light passes it, so the camera sees its mesh, not its surfels")
+    if (passes or emits) and settings.rays_see == "surfels":
+        found.append(f"{name}: it emits light or lets light pass, so rays meet its mesh, not its surfels")
+    if not len(asset.mesh.faces) and asset.surfels.emission is not None:
+        found.append(f"{name}: has no mesh, so what it emits is seen by the camera alone")
+    return found
+
+
+def may_need(frame: Frame, assets: list[Asset]) -> bool:
+    """Whether a frame with these assets of its objects may have meshes that emit, whose kernels are others."""
+    return any(has_channels(state, asset) for state, asset in zip(frame.objects, assets))
