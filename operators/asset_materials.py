@@ -134,7 +134,7 @@ def _image(textures: MeshTextures, number: int, slot: int) -> bpy.types.Image:
     """An image with its file packed, the one that is there or a new one."""
     name, data = textures.files[number]
     space = "sRGB" if slot == ALBEDO else "Non-Color"
-    key = f"{hashlib.sha256(data).hexdigest()} {space}"
+    key = f"{hashlib.sha256(data.tobytes()).hexdigest()} {space}"
     found = next((i for i in bpy.data.images if i.get(KEY) == key and not i.library), None)
     if found is not None:
         return found
