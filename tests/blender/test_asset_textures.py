@@ -116,7 +116,11 @@ def test_textured_materials_glow_and_let_light_pass_as_those_of_drgs(scene, tmp_
     parity.set_up(scene, 64, samples=256, bounces=2)
     scene.camera.location.y = -3.4
     ours, theirs = parity.pictures(scene, "DRGS"), parity.pictures(scene, "CYCLES")
-    assert parity.psnr(ours, theirs) > 36
+    assert parity.psnr(ours, theirs) > 50
+    veil = np.zeros((64, 64), bool)
+    veil[32:] = True
+    assert parity.psnr(ours, theirs, veil) > 44
+    assert np.abs((ours - theirs)[..., 3].mean()) < 1e-3 and 0.05 < theirs[:, 32:, :, 3].mean() < 0.3
 
 
 def test_save_keeps_textures_and_what_factors_can_say(ball, tmp_path):
