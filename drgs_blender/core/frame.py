@@ -332,13 +332,13 @@ class Material:
         Name of a layer whose directions highlights follow: of two numbers, texture coordinates, along whose u; of four,
         the direction itself in object space, of any length, blended over the face. "" are the coordinates `uvs`.
     coat, coat_roughness, coat_ior : float
-        Weight of a clear layer above all others, in [0, 1]; its roughness; its IOR, at least 1.
+        Weight of a clear layer above all others but the sheen, in [0, 1]; its roughness; its IOR, at least 1.
     coat_tint : tuple of float
         Linear Rec.709, what the layer lets through at normal incidence.
     coat_details : bool
         Whether `details` change the normal of the coat, too.
     sheen, sheen_roughness : float
-        Weight of a layer of fibres below the coat; their roughness.
+        Weight of a layer of fibres above all others, the coat, too; their roughness.
     sheen_tint : tuple of float
         Linear Rec.709.
     transmission : float

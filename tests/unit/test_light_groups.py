@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_light_links import Scene, at, scene, slab  # noqa: F401  a fixture
 
-from drgs_blender.core.frame import Light, World
+from drgs_blender.core.frame import Light, Material, World
 
 GROUPS = ("Combined_lamps", "Combined_sky", "Combined_glow", "Combined_rest")
 
@@ -46,7 +46,7 @@ def test_groups_add_up_and_change_no_sample(grouped: Scene) -> None:
     assert all(np.array_equal(some[name], found[name]) for name in GROUPS[1:3])
 
 
-@pytest.mark.parametrize("parts", ["linked", "adaptive", "surfels", "transparent"])
+@pytest.mark.parametrize("parts", ["linked", "adaptive", "surfels", "transparent", "glass"])
 def test_groups_add_up_everywhere(grouped: Scene, parts: str) -> None:
     settings, changes = grouped[1].settings, {}
     if parts == "linked":
@@ -54,6 +54,11 @@ def test_groups_add_up_everywhere(grouped: Scene, parts: str) -> None:
         bits = [replace(mesh.visibility, lit_by=k, blocks=k) for k, mesh in enumerate(grouped[1].meshes)]
         meshes = [replace(mesh, visibility=own) for mesh, own in zip(grouped[1].meshes, bits, strict=True)]
         changes = {"lights": linked, "meshes": meshes}
+    elif parts == "glass":
+        clear = Material("glass", (0.9, 0.9, 0.9), 0.2, transmission=0.9)
+        meshes = [*grouped[1].meshes]
+        meshes[0] = replace(meshes[0], materials=[clear])
+        changes = {"meshes": [*meshes, replace(slab("pane", 0, 0, 1.5, 1.0), materials=[clear])]}
     elif parts == "adaptive":
         settings = replace(settings, noise_threshold=0.05)
     elif parts == "surfels":

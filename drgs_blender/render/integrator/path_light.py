@@ -8,6 +8,7 @@ import numpy as np
 
 from ...compute.jit import njit
 from ..lights.environment import cell_at, cell_end, direction_in_cell, envmap_pdf, envmap_radiance, first_cell, map_at
+from ..lights.light_groups import group_of_environment, group_of_hit, group_of_sample
 from ..lights.light_links import emits_to, lights_of
 from ..lights.light_sampler import emission_along, lights_along, sample_light
 from ..lights.light_shapes import DIFFUSE, GLOSSY
@@ -17,6 +18,7 @@ from ..scene import ray_masks
 from . import wavefront as w
 from .bsdf.lobes import evaluate
 from .bsdf.surface_lobes import bump_shadow
+from .group_sums import credit_lamps_of_path, credit_path
 from .indirect import lifted
 from .intersect import FAR, light_radiance, passed
 
@@ -40,6 +42,9 @@ class Scratch(NamedTuple):
         Light that the shading point sends to the viewer, found straight from it.
     indirect : (3,) float32 array
         Light that its path brings.
+    grouped : (2, columns) float32 array
+        Light of light groups, laid out as that of paths in `group_sums`: row 0 is of `direct`, all classes together,
+        row 1 of `indirect`.
     """
 
     rays: w.Batch
@@ -49,10 +54,11 @@ class Scratch(NamedTuple):
     carried: Array
     direct: Array
     indirect: Array
+    grouped: Array
 
 
 @njit
-def gather(light, glossy, throughput, first, scratch):  # type: ignore[no-untyped-def]
+def gather(light, glossy, throughput, first, group, lights, scratch):  # type: ignore[no-untyped-def]
     """Add light that comes along a direction, times the BSDF there: diffuse lobes get `light`, others `glossy`.
 
     Parameters
@@ -63,17 +69,28 @@ def gather(light, glossy, throughput, first, scratch):  # type: ignore[no-untype
         Of the path, linear Rec.709.
     first : bool
         Whether the vertex is the shading point.
+    group : int64
+        Light group, see `light_groups`; -1: credited elsewhere.
+    lights : LightTables, LinkedTables or GroupedTables
     scratch : Scratch
     """
     value, direct, indirect = scratch.value, scratch.direct, scratch.indirect
-    for c in range(3):
-        if first:
+    (lr, lg, lb), (gr, gg, gb) = light, glossy
+    r = value[0] * lr + (value[3] + value[6]) * gr
+    g = value[1] * lg + (value[4] + value[7]) * gg
+    b = value[2] * lb + (value[5] + value[8]) * gb
+    if first:
+        for c in range(3):
             direct[c] += value[c] * light[c]
             direct[3 + c] += value[3 + c] * glossy[c]
             direct[6 + c] += value[6 + c] * glossy[c]
-        else:
-            own = value[c] * light[c] + (value[3 + c] + value[6 + c]) * glossy[c]
-            indirect[c] += throughput[c] * own
+    else:
+        r, g, b = throughput[0] * r, throughput[1] * g, throughput[2] * b
+        indirect[0] += r
+        indirect[1] += g
+        indirect[2] += b
+    if group >= 0:
+        credit_path(lights, scratch.grouped, 0 if first else 1, group, r, g, b)
 
 
 @njit
@@ -191,7 +208,7 @@ def towards_envmap(numbers, at, row, throughput, first, scratch, count, scene, s
     if through > ZERO:
         k = through / (own + pdf)
         light = (r * k, g * k, b * k)
-        gather(light, light, throughput, first, scratch)
+        gather(light, light, throughput, first, group_of_environment(scene.lights), scene.lights, scratch)
 
 
 @njit
@@ -234,22 +251,19 @@ def towards_lights(numbers, at, receiver, throughput, first, scratch, count, sce
     mask = np.int32(ray_masks.SHADOW << settings.shift)
     dr, dg, db, gr, gg, gb = light_radiance(rays, 0, pdf, pdf, ONE, receiver, scene, mask)
     if dr + dg + db + gr + gg + gb > ZERO:
-        gather((dr, dg, db), (gr, gg, gb), throughput, first, scratch)
+        group = group_of_sample(scene.lights, receiver, np.int64(ints[w.CELL]))
+        gather((dr, dg, db), (gr, gg, gb), throughput, first, group, scene.lights, scratch)
 
 
 @njit
-def light_along(origin, direction, reach, hit, through, densities, receiver, row, diffuse, scene):  # type: ignore[no-untyped-def]
-    """Light along a ray of the BSDF, with MIS weight over pdf; `densities`: that pdf, and 1, or 0 for a delta.
+def light_along(ray, densities, receiver, row, diffuse, throughput, first, scratch, scene):  # type: ignore[no-untyped-def]
+    """Gather the light along a ray of the BSDF; `densities`: its pdf, and 1, or 0 for a delta.
 
     Parameters
     ----------
-    origin, direction : tuple of float32
-        Of the ray, world, m.
-    reach : float32
-        Distance up to which lights are seen, m.
-    hit : MixedHit
-    through : float32
-        Share of light from beyond everything.
+    ray : tuple
+        Origin (m) and unit direction, world; distance (m) up to which lights are seen; the `MixedHit`; the share of
+        light from beyond everything.
     densities : tuple of float32
     receiver : float32
         Set of the surface that the ray leaves.
@@ -257,26 +271,37 @@ def light_along(origin, direction, reach, hit, through, densities, receiver, row
         Of the environment's tables.
     diffuse : bool
         Whether the ray is of a diffuse lobe.
+    throughput : tuple of float32
+        Of the path, linear Rec.709.
+    first : bool
+        Whether the vertex is the shading point.
+    scratch : Scratch
     scene : Scene
-
-    Returns
-    -------
-    r, g, b : float32
-        Linear Rec.709.
     """
+    origin, direction, reach, hit, through = ray
     pdf, share = densities
-    red = green = blue = ZERO
-    own = lights_of(scene.lights, receiver)
+    lights, value = scene.lights, scratch.value
+    own = lights_of(lights, receiver)
     if scene.traits.lights:
         seen_by = DIFFUSE if diffuse else GLOSSY
-        red, green, blue = lights_along(origin, direction, reach, pdf, share, seen_by, own)
-    if scene.traits.emissive and emits_to(scene.lights, receiver, hit, scene.geometry):
-        r, g, b, light, glossy = emission_along(origin, direction, hit, scene.geometry, own)
-        k = ONE / (pdf + share * (light if diffuse else glossy))
-        red, green, blue = red + k * r, green + k * g, blue + k * b
+        light = lights_along(origin, direction, reach, pdf, share, seen_by, own)
+        if light[0] + light[1] + light[2] > ZERO:
+            gather(light, light, throughput, first, np.int64(-1), lights, scratch)
+            r, g, b = value[0] + value[3] + value[6], value[1] + value[4] + value[7], value[2] + value[5] + value[8]
+            if not first:
+                r, g, b = throughput[0] * r, throughput[1] * g, throughput[2] * b
+            seen = origin, direction, reach, pdf, share, seen_by
+            credit_lamps_of_path(lights, own, scratch.grouped, 0 if first else 1, receiver, (r, g, b), seen)
+    if scene.traits.emissive and emits_to(lights, receiver, hit, scene.geometry):
+        r, g, b, density, glossy = emission_along(origin, direction, hit, scene.geometry, own)
+        k = ONE / (pdf + share * (density if diffuse else glossy))
+        light = k * r, k * g, k * b
+        if light[0] + light[1] + light[2] > ZERO:
+            gather(light, light, throughput, first, group_of_hit(lights, hit, scene.geometry), lights, scratch)
     if through > ZERO and scene.traits.environment:
         u, v = map_at(direction[0], direction[1], direction[2], scene.envmap)
         r, g, b = envmap_radiance(u, v, scene.envmap)
         k = through / (pdf + share * envmap_pdf(u, v, row, scene.envmap))
-        red, green, blue = red + k * r, green + k * g, blue + k * b
-    return red, green, blue
+        light = k * r, k * g, k * b
+        if light[0] + light[1] + light[2] > ZERO:
+            gather(light, light, throughput, first, group_of_environment(lights), lights, scratch)

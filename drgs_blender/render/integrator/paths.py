@@ -26,9 +26,10 @@ from .bsdf.albedo_tables import AlbedoTables, albedo_tables
 from .bsdf.lobes import DELTA, GLOSSY_CLASS, LOBE, METAL, MOST_LOBES, TRANSMITTED_CLASS, sample
 from .bsdf.lobes import KIND as LOBE_KIND
 from .bsdf.surface_lobes import put_lobes
+from .group_sums import FOUND, MOMENTS, clear_groups, group_columns
 from .integrate import ShadingKernel
 from .intersect import meet, put_hit, put_start, surface_of
-from .path_light import Scratch, aim, gather, is_bright, light_along, towards_envmap, towards_lights, weigh
+from .path_light import Scratch, aim, is_bright, light_along, towards_envmap, towards_lights, weigh
 from .records import Sampler, Scene, Settings
 
 Array = np.ndarray
@@ -153,10 +154,8 @@ def _follow(start, numbers, receiver, surfaces, scene, settings, scratch):  # ty
         key = mix(U(key + GOLDEN))
         ints[w.KEY] = key
         through, reach, hit = meet(scene, rays, 0, np.int32(mask << settings.shift))
-        r, g, c = light_along(origin, direction, reach, hit, through, (pdf, share), receiver, row, diffuse, scene)
-        if r + g + c > ZERO:
-            light = (r, g, c)
-            gather(light, light, throughput, first, scratch)
+        seen = origin, direction, reach, hit, through
+        light_along(seen, (pdf, share), receiver, row, diffuse, throughput, first, scratch, scene)
         if through_it:
             went += 1
         else:
@@ -188,7 +187,7 @@ def _follow(start, numbers, receiver, surfaces, scene, settings, scratch):  # ty
 
 
 @njit
-def _finish(scratch, scale, limit, components, transmitted, moments, i):  # type: ignore[no-untyped-def]
+def _finish(lights, scratch, scale, limit, components, transmitted, moments, i):  # type: ignore[no-untyped-def]
     """Add a sample's light to a point's sums."""
     direct, carried, indirect = scratch.direct, scratch.carried, scratch.indirect
     mean = ZERO
@@ -197,6 +196,11 @@ def _finish(scratch, scale, limit, components, transmitted, moments, i):  # type
         mean += carried_all * indirect[c]
     mean = mean * scale / F(3.0)
     k = limit / mean if limit > ZERO and mean > limit else ONE
+    for column in range(group_columns(lights)):
+        c = column % 3
+        carried_all = (carried[c] + carried[3 + c] + carried[6 + c]) * k * scale
+        direct_part, path_part = scratch.grouped[0, FOUND + column], scratch.grouped[1, FOUND + column]
+        moments[i, MOMENTS + column] += direct_part * scale + path_part * carried_all
     seen = (ZERO, ZERO)
     for c in range(3):
         bounced = indirect[c] * k * scale
@@ -278,14 +282,16 @@ def shade_points_by_paths(thread, stride, scratch, points, surfaces, scene, sett
                     scratch.direct[c] = scratch.carried[c] = ZERO
                 for c in range(3):
                     scratch.indirect[c] = ZERO
+                clear_groups(scene.lights, scratch.grouped, 0)
+                clear_groups(scene.lights, scratch.grouped, 1)
                 sequence = sampler.sequence[j, 0], sampler.sequence[j, 1], sampler.sequence[j, 2]
                 path = mix(U(key ^ U(U(j + 1) * U(0x85EBCA6B))))
                 _follow(start, (sequence, path, key), receiver, surfaces, scene, settings, scratch)
-                _finish(scratch, scale, settings.clamp, components, transmitted, moments, i)
+                _finish(scene.lights, scratch, scale, settings.clamp, components, transmitted, moments, i)
 
 
 @njit
-def _scratch() -> Any:
+def _scratch(lights: Any) -> Any:
     return Scratch(
         w.batch(1),
         np.zeros(MOST_LOBES * LOBE, np.float32),
@@ -294,11 +300,12 @@ def _scratch() -> Any:
         np.zeros(9, np.float32),
         np.zeros(9, np.float32),
         np.zeros(3, np.float32),
+        np.zeros((2, FOUND + group_columns(lights)), np.float32),
     )
 
 
 @njit
 def _kernel(first, last, stride, points, surfaces, scene, settings, sampler, out):  # type: ignore[no-untyped-def]
-    scratch = _scratch()
+    scratch = _scratch(scene.lights)
     for thread in range(first, last):
         shade_points_by_paths(thread, stride, scratch, points, surfaces, scene, settings, sampler, out)
