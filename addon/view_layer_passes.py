@@ -16,6 +16,9 @@ _FULL_NAMES = {
     "GlossInd": "Glossy Indirect",
     "DiffCol": "Diffuse Color",
     "GlossCol": "Glossy Color",
+    "TransDir": "Transmission Direct",
+    "TransInd": "Transmission Indirect",
+    "TransCol": "Transmission Color",
     "IndexMA": "Material Index",
     "Env": "Environment",
     "Emit": "Emission",
@@ -26,7 +29,6 @@ _FULL_NAMES = {
 _NOT_RENDERED = {
     "use_pass_shadow": "Shadow",
     "use_pass_ambient_occlusion": "Ambient Occlusion",
-    **{f"use_pass_transmission_{part}": f"Transmission {part.title()}" for part in ("direct", "indirect", "color")},
     **{f"use_pass_subsurface_{part}": f"Subsurface {part.title()}" for part in ("direct", "indirect", "color")},
     **{f"use_pass_volume_{part}": f"Volume {part.title()}" for part in ("direct", "indirect")},
     "use_pass_shadow_catcher": "Shadow Catcher",

@@ -130,9 +130,10 @@ def denoise(args: argparse.Namespace) -> int:
 
 def _held(noisy: NoisyFrame) -> tuple[str, ...]:
     """Passes of a noisy frame that a denoised one has as well: all that are not for this step alone."""
-    from ..render.film.film import COMPONENTS
+    from ..render.film.light_passes import COMPONENTS, LIGHT_PASSES
 
-    return tuple(name for name in BY_NAME if name in noisy.passes or name in COMPONENTS)
+    light = COMPONENTS if noisy.transmitted is None else LIGHT_PASSES
+    return tuple(name for name in BY_NAME if name in noisy.passes or name in light)
 
 
 class _Source:
@@ -183,7 +184,7 @@ class _Source:
         """The noisy frame, its denoised passes, and whether a neighbour has the very same noise."""
         from ..render.denoise.svgf_temporal import NoisyPicture
         from ..render.denoise.svgf_window import window
-        from ..render.film.film import COMPONENTS
+        from ..render.film.light_passes import LIGHT_PASSES, light_parts
 
         around = self._window(number)
         for old in [k for k in self._held if k not in around]:
@@ -199,9 +200,14 @@ class _Source:
             linked = before is not None and item.follows(before)
             pictures.append(replace(picture, motion=picture.motion if linked else None))
         wanted = passes or _held(middle)
-        light = window(pictures, split=any(name in COMPONENTS for name in wanted))
+        light = window(pictures, split=any(name in LIGHT_PASSES for name in wanted))
         colours = middle.passes
-        made = {name: without_colour(light[:, :, i], colours[COLOURS[name]]) for i, name in enumerate(COMPONENTS)}
+        parts = light_parts(light, middle.picture.components, middle.transmitted, colours)
+        made = {
+            name: without_colour(part, colours[COLOURS[name]])
+            for name, part in zip(LIGHT_PASSES, parts)
+            if COLOURS[name] in colours
+        }
         made |= middle.passes | {"Combined": middle.beauty(light), "Noisy Image": middle.passes["Combined"]}
         absent = [name for name in wanted if name not in made]
         if absent:

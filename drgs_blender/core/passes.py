@@ -77,7 +77,7 @@ PASSES: tuple[Pass, ...] = (
     Pass("Mist", "Z", "VALUE", "use_pass_mist", "Distance between the limits of the World's Mist Pass, 0 to 1"),
     *(
         Pass(f"{short}{name}", "RGB", "COLOR", f"use_pass_{lobe}_{part}", f"{about} of {lobe} light", colour=colour)
-        for short, lobe in (("Diff", "diffuse"), ("Gloss", "glossy"))
+        for short, lobe in (("Diff", "diffuse"), ("Gloss", "glossy"), ("Trans", "transmission"))
         for name, part, about, colour in (
             ("Dir", "direct", "Direct part, without the surface's colour,", f"{short}Col"),
             ("Ind", "indirect", "Indirect part, without the surface's colour,", f"{short}Col"),
@@ -96,7 +96,7 @@ PASSES: tuple[Pass, ...] = (
 TEMPORAL: tuple[str, ...] = (
     *("Combined", "Depth", "Position", "Normal", "Albedo", "Roughness", "Metallic", "Coverage", "IndexOB"),
     *("DiffDir", "DiffInd", "DiffCol", "GlossDir", "GlossInd", "GlossCol", "Emit", "Env", "Variance"),
-    "Previous Position",
+    *("Previous Position", "TransDir", "TransInd", "TransCol"),
 )
 
 #: name -> Pass
@@ -116,7 +116,7 @@ def pass_of(name: str) -> Pass | None:
     return BY_NAME.get(name)
 
 
-#: Light pass -> colour pass of its surfaces. As in Cycles, (direct + indirect) colour, of both lobes, + Emit + Env
+#: Light pass -> colour pass of its surfaces. As in Cycles, (direct + indirect) colour, of all lobes, + Emit + Env
 #: is Combined.
 COLOURS: dict[str, str] = {p.name: p.colour for p in PASSES if p.colour}
 

@@ -10,7 +10,7 @@ from ..core.frame import Frame
 from ..ipc.change_detection import reuse_equal
 from ..render.camera import camera_parameters
 from ..render.denoise.svgf_temporal import History
-from ..render.film.film import COMPONENTS
+from ..render.film.light_passes import LIGHT_PASSES
 from ..render.film.motion_vectors import SceneState
 from ..render.scene.trace_scene import TraceScene
 
@@ -67,7 +67,7 @@ class Histories:
             settings, seed=0, threads=0, device="cpu", samples=0, strategy_samples=None, noise_threshold=0.0
         )
         situation = reuse_equal(camera, old.situation[0]), reuse_equal(lasting, old.situation[1]), *static_state
-        split = any(name in frame.passes for name in COMPONENTS)
+        split = any(name in frame.passes for name in LIGHT_PASSES)
         fit = (
             scene.layout,
             scene.instances.shape,

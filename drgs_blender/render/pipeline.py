@@ -22,8 +22,9 @@ from .camera import camera_parameters
 from .denoise.oidn import denoise_oidn, require
 from .denoise.svgf_temporal import History, NoisyPicture
 from .film.cryptomatte import CryptoFilm
-from .film.film import COMPONENTS, Film
+from .film.film import Film
 from .film.light_group_film import LightGroupFilm
+from .film.light_passes import LIGHT_PASSES
 from .film.motion_vectors import MotionFilm, SceneState, vector_pass
 from .film.surface_film import SurfaceFilm
 from .gbuffer.gbuffer import GBuffer
@@ -178,7 +179,7 @@ def denoised(film: Film, frame: Frame, check: Check, backend: RenderBackend = CP
 
 def split_light(frame: Frame) -> bool:
     """Whether direct and indirect light are wanted apart."""
-    return any(name in frame.passes for name in COMPONENTS)
+    return any(name in frame.passes for name in LIGHT_PASSES)
 
 
 class VisibleSurfaces:
@@ -269,6 +270,9 @@ def _spread(some: Radiance, rows: Array, points: ShadingPoints) -> Radiance:
     if some.groups is not None:
         out.groups = np.zeros((len(points), *some.groups.shape[1:]), np.float32)
         out.groups[rows] = some.groups
+    if some.transmitted is not None:
+        out.transmitted = np.zeros((len(points), 2, 3), np.float32)
+        out.transmitted[rows] = some.transmitted
     return out
 
 
@@ -315,6 +319,9 @@ class Batches:
             if found.groups is not None:
                 out.groups = np.zeros((n, *found.groups.shape[1:]), np.float32) if out.groups is None else out.groups
                 out.groups[first:last] = found.groups
+            if found.transmitted is not None:
+                out.transmitted = np.zeros((n, 2, 3), np.float32) if out.transmitted is None else out.transmitted
+                out.transmitted[first:last] = found.transmitted
             if found.unshadowed is not None:
                 out.unshadowed = np.zeros(n, np.float32) if out.unshadowed is None else out.unshadowed
                 out.unshadowed[first:last] = found.unshadowed

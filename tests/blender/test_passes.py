@@ -18,19 +18,26 @@ LIGHT = {
     "glossy_indirect": ("GlossInd", "Glossy Indirect"), "glossy_color": ("GlossCol", "Glossy Color"),
     "emit": ("Emit", "Emission"), "environment": ("Env", "Environment"),
 }  # fmt: skip
+THROUGH = {
+    "transmission_direct": ("TransDir", "Transmission Direct"),
+    "transmission_indirect": ("TransInd", "Transmission Indirect"),
+    "transmission_color": ("TransCol", "Transmission Color"),
+}  # fmt: skip
 OTHERS = {"mist": ("Mist",), "uv": ("UV",), "material_index": ("IndexMA", "Material Index")}
 
 
 def recombined(p: dict[str, np.ndarray]) -> np.ndarray:
-    diffuse, glossy = (p[f"{lobe}_direct"] + p[f"{lobe}_indirect"] for lobe in ("diffuse", "glossy"))
-    return diffuse * p["diffuse_color"] + glossy * p["glossy_color"] + p["emit"] + p["environment"]
+    total = p["emit"] + p["environment"]
+    for lobe in ("diffuse", "glossy", "transmission"):
+        total = total + (p[f"{lobe}_direct"] + p[f"{lobe}_indirect"]) * p[f"{lobe}_color"]
+    return total
 
 
 @pytest.fixture
 def passes(room, tmp_path):  # noqa: F811
     """Function that renders the room with an engine and returns its passes by the names of their switches."""
     layer = room.view_layers[0]
-    for name in (*LIGHT, *OTHERS):
+    for name in (*LIGHT, *THROUGH, *OTHERS):
         setattr(layer, f"use_pass_{name}", True)
     for index, material in enumerate(bpy.data.materials):
         material.pass_index = index + 1
@@ -50,16 +57,17 @@ def passes(room, tmp_path):  # noqa: F811
     room.camera.location, room.camera.rotation_euler = (-0.4, -2.6, 0.1), (1.5, 0.0, -0.1)
     room.camera.data.lens = 18
 
-    def render(engine):
+    def render(engine, bounces=1):
         cycles, settings = room.cycles, room.drgs
         cycles.device, cycles.samples, cycles.pixel_filter_type, cycles.filter_width = "CPU", 512, "BOX", 1.0
         cycles.use_adaptive_sampling = cycles.use_denoising = False
-        cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = 1
+        cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = bounces
+        cycles.max_bounces, cycles.transmission_bounces = bounces + 12 * (bounces > 1), 12
         cycles.sample_clamp_indirect = cycles.blur_glossy = 0.0
-        settings.use_strategy_samples, settings.samples, settings.bounces = False, 512, 1
+        settings.use_strategy_samples, settings.samples, settings.bounces = False, 512, bounces
         settings.subpixel_samples, settings.filter_width = 32, 0.0
         found = layers_of(room, engine, tmp_path)
-        names = {**LIGHT, **OTHERS, "combined": ("Combined",)}
+        names = {**LIGHT, **THROUGH, **OTHERS, "combined": ("Combined",)}
         return {k: next(found[n] for n in choices if n in found) for k, choices in names.items()}
 
     return render
@@ -83,6 +91,28 @@ def test_passes_are_those_of_cycles(passes):
     for name in (*LIGHT, "mist", "uv", "combined"):
         assert found[name] > 35, (name, found[name])
         assert abs(found[name + " mean"] - 1) < 0.02, name
+
+
+@pytest.mark.slow
+def test_passes_of_glass_are_those_of_cycles(passes):
+    bpy.ops.mesh.primitive_cube_add(size=0.5, location=(-0.6, -1.0, 0.0), rotation=(0.3, 0.2, 0.5))
+    glass = bpy.data.materials.new("glass")
+    glass.use_nodes = True
+    inputs = next(n for n in glass.node_tree.nodes if n.type == "BSDF_PRINCIPLED").inputs
+    inputs["Base Color"].default_value = (0.5, 0.8, 0.6, 1.0)
+    inputs["Transmission Weight"].default_value, inputs["Roughness"].default_value = 0.8, 0.2
+    bpy.context.object.data.materials.append(glass)
+    theirs, ours = passes("CYCLES", 4), passes("DRGS", 4)
+    for picture in (theirs, ours):
+        assert np.abs(recombined(picture) - picture["combined"][..., :3]).max() < 1e-3
+    found = {}
+    for name in (*LIGHT, *THROUGH):
+        a, b = (p[name][..., :3].astype(float) for p in (ours, theirs))
+        found[name] = a.mean(), b.mean()
+    print({name: tuple(round(float(x), 5) for x in pair) for name, pair in found.items()})
+    for name, (a, b) in found.items():
+        assert abs(a - b) < 0.03 * b + 1e-4, name
+    assert found["transmission_indirect"][0] > 0.01
 
 
 def test_passes_that_are_not_made_are_told(scene, ball, export):

@@ -165,3 +165,31 @@ def test_clamp_limits_what_paths_bring():
     glass = box(Material("glass", roughness=0.1, transmission=1.0), 0.0, 0.4)
     free, cut = (picture([glass], world=sky(), clamp_indirect=c).mean() for c in (0.0, 0.3))
     assert cut < free
+
+
+@pytest.mark.parametrize("denoise", ("none", "svgf"))
+def test_passes_of_light_times_colours_are_combined(denoise):
+    """Glass, a leaf and a plain floor; what the glass lets pass has passes of its own."""
+    names = ("Combined", "Emit", "Env", *(f"{a}{b}" for a in ("Diff", "Gloss", "Trans") for b in ("Dir", "Ind", "Col")))
+    tinted = Material("glass", (0.4, 0.6, 0.9), 0.2, transmission=0.8, sheen=0.3, coat=0.4)
+    meshes = [box(tinted, 0.5, 0.3), card(Material("leaf", (0.5,) * 3, kind="translucent"), 2.0, 0.1), card(SPEC)]
+    found = seen(meshes, names, sky(), lights=[Light("l", "area", at(1.5), size_x=0.5)], denoise=denoise)
+    total = found["Emit"] + found["Env"]
+    for lobe in ("Diff", "Gloss", "Trans"):
+        total = total + (found[f"{lobe}Dir"] + found[f"{lobe}Ind"]) * found[f"{lobe}Col"]
+    np.testing.assert_allclose(total, found["Combined"][..., :3], rtol=1e-3, atol=1e-4)
+    assert found["TransInd"].max() > 0
+    floor = found["TransCol"].sum(axis=2) == 0
+    assert floor.any() and not found["TransInd"][floor].any()
+
+
+def test_colour_passes_add_up_the_lobes():
+    glass = Material("glass", (0.25, 0.5, 1.0), 0.0, transmission=1.0, ior=1.5)
+    found = seen([card(glass)], ("DiffCol", "GlossCol", "TransCol"), size=2)
+    np.testing.assert_allclose(found["GlossCol"], 0.04, rtol=1e-3)
+    np.testing.assert_allclose(found["TransCol"], 0.96 * np.sqrt([[[0.25, 0.5, 1.0]]]) * np.ones((2, 2, 1)), rtol=1e-3)
+    assert not found["DiffCol"].any()
+    leaf = Material("leaf", (0.5, 0.25, 0.125), kind="translucent")
+    found = seen([card(leaf)], ("DiffCol", "GlossCol", "TransCol"), size=2)
+    np.testing.assert_allclose(found["DiffCol"], np.broadcast_to([0.5, 0.25, 0.125], (2, 2, 3)), rtol=1e-5)
+    assert not found["GlossCol"].any() and not found["TransCol"].any()

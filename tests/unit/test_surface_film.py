@@ -172,4 +172,6 @@ def test_mean_of_blurred_pictures_recombines(scene: Scene) -> None:
     assert "Depth" not in mean and np.allclose(mean["Variance"], sum(p["Variance"] for p in parts) / 9)
     total = mean["DiffDir"] * mean["DiffCol"] + mean["GlossInd"] * mean["GlossCol"]
     np.testing.assert_allclose(total, mean["Combined"], rtol=1e-5)
-    assert tuple(averaged(parts, names)) == names and set(COLOURS) == {"DiffDir", "DiffInd", "GlossDir", "GlossInd"}
+    assert tuple(averaged(parts, names)) == names and set(COLOURS) == {
+        f"{a}{b}" for a in ("Diff", "Gloss", "Trans") for b in ("Dir", "Ind")
+    }

@@ -88,3 +88,23 @@ def test_offsets_that_are_no_numbers_are_none(balls: Frame) -> None:
         "Combined"
     ]
     assert np.array_equal(plain, odd)
+
+
+def test_paths_start_shadow_rays_where_batches_do(balls: Frame) -> None:
+    """A coat out of sight has the same scene shaded path by path; light of a sun has little noise."""
+    ball = replace(balls.meshes[0], terminator_offset=0.1)
+    far = replace(ball, name="far", materials=[Material("coated", coat=0.5)], visibility=Visibility(camera=False))
+    far.matrices = np.diag([1e-3, 1e-3, 1e-3, 1.0])[None]
+    far.matrices[0, 2, 3], far.pass_indices = -20.0, np.zeros(1, np.int32)
+    for bounces, samples in ((0, 32), (1, 512)):
+        settings = replace(balls.settings, bounces=bounces, samples=samples)
+        batches, paths = (
+            Session().render(replace(balls, meshes=meshes, settings=settings)) for meshes in ([ball], [ball, far])
+        )
+        cosine = batches["Normal"][..., 1]
+        grazing = (batches["IndexOB"][..., 0] > 0) & (cosine > 0) & (cosine < 0.4)
+        one, two = (found["Combined"][grazing][:, 0] for found in (batches, paths))
+        assert two.mean() == pytest.approx(one.mean(), rel=0.005)
+        assert np.abs(one - two).mean() < 0.03 * one.mean()
+        assert not np.array_equal(one, two)
+    assert (error(replace(balls, meshes=[ball, far])) < 0.5 * error(balls)).all()

@@ -17,9 +17,10 @@ from ...core.errors import AssetError
 from ...core.frame import Camera, Frame, RenderSettings
 from ...core.passes import COLOURS, TEMPORAL
 from ..camera import camera_parameters
-from ..film.film import COMPONENTS, add_light, footprints
+from ..film.film import footprints
 from ..film.frame_files import read_frame
 from ..film.guides import Guides
+from ..film.light_passes import COMPONENTS, add_light
 from ..film.motion_vectors import Motion, motion
 from .svgf_temporal import NoisyPicture
 
@@ -27,6 +28,8 @@ Array = np.ndarray
 
 #: How far the numbers of two cameras may lie apart (metres, radians, pixels) that are the same one evaluated twice.
 SAME_CAMERA = 1e-4
+#: Passes of newer versions, which add to the others.
+_LATER = ("TransDir", "TransInd", "TransCol")
 _HOW = "Render it with `drgs render --denoise none --passes temporal`, or with Store Denoising Data switched on"
 
 
@@ -46,6 +49,8 @@ class NoisyFrame:
         Parameters of the cameras of this frame and of one frame earlier.
     window : tuple of int
         (width, height, x0, y0, x1, y1) of the full picture and of the part rendered.
+    transmitted : (h, w, 2, 3) float32 array, optional
+        Part of the glossy light that surfaces let pass; None: the file has no such passes.
     """
 
     picture: NoisyPicture
@@ -54,6 +59,7 @@ class NoisyFrame:
     camera: Array
     previous: Array
     window: tuple[int, ...]
+    transmitted: Array | None = None
 
     def follows(self, other: NoisyFrame) -> bool:
         """Whether this frame's motion leads to `other`; not across a cut."""
@@ -80,7 +86,7 @@ def read_noisy(path: str | Path) -> NoisyFrame:
     AssetError: it cannot be read, lacks passes (which are named), or its light is denoised already.
     """
     passes, metadata = read_frame(path)
-    missing = [name for name in TEMPORAL if name not in passes]
+    missing = [name for name in TEMPORAL if name not in passes and name not in _LATER]
     if missing:
         raise AssetError(str(path), f"lacks the passes {', '.join(missing)}", _HOW)
     if metadata.get("denoise", "none") != "none":
@@ -102,9 +108,19 @@ def read_noisy(path: str | Path) -> NoisyFrame:
         footprints(_one(passes, "Depth"), now),
     )
     components = np.stack([passes.pop(name) * passes[COLOURS[name]] for name in COMPONENTS], axis=2)
+    transmitted = None
+    if all(name in passes for name in _LATER):
+        transmitted = np.stack([passes.pop(name) * passes[COLOURS[name]] for name in _LATER[:2]], axis=2)
+        components[:, :, 2:] += transmitted
     moved: Motion = motion(position, passes.pop("Previous Position"), coverage, now, before)
     return NoisyFrame(
-        NoisyPicture(components, passes.pop("Variance"), guides, moved), passes, metadata, now, before, window
+        NoisyPicture(components, passes.pop("Variance"), guides, moved),
+        passes,
+        metadata,
+        now,
+        before,
+        window,
+        transmitted,
     )
 
 

@@ -32,6 +32,8 @@ from ..lights.environment import EnvironmentLight, envmap_radiance, map_at
 from ..sampling import luminance
 from ..shading_points import CATCHER, UNLIT, Radiance
 from .guides import Guides
+from .light_passes import LIGHT_PASSES, add_light, light_parts
+from .surface_film import mean_of_points
 
 Array = np.ndarray
 
@@ -40,8 +42,6 @@ EMPTY_DEPTH = 1e10
 SAME_SURFACE = 8.0
 #: Coverage that is only the rounding of a sum.
 _ROUNDING = np.float32(1e-4)
-
-COMPONENTS = ("DiffDir", "DiffInd", "GlossDir", "GlossInd")
 
 
 class Pixels(NamedTuple):
@@ -110,6 +110,8 @@ class Film:
         The part of ``environment`` that is seen through catchers.
     unlit : (h, w) float32 array, optional
         The part of the coverage that is of unlit objects; None: there are none.
+    transmitted : (h, w, 2, 3) float32 array, optional
+        The part of the glossy components, direct and indirect, that surfaces let pass; None: none does.
     """
 
     def __init__(self, camera: Camera, settings: RenderSettings, parameters: Array) -> None:
@@ -122,6 +124,7 @@ class Film:
         self.pixels = Pixels.empty(size)
         self.environment, self.veiled = (np.zeros((*size, 3), np.float32) for _ in range(2))
         self.unlit: Array | None = None
+        self.transmitted: Array | None = None
 
     def add(self, buffer: GBuffer, radiance: Radiance, pass_index: Array, environment: EnvironmentLight) -> None:
         """Take the strip `buffer` with the light of its points.
@@ -143,6 +146,12 @@ class Film:
             row, column = np.divmod(points.pixel[unlit], int(self.parameters[WIDTH]))
             self.unlit = np.zeros_like(self.pixels.coverage) if self.unlit is None else self.unlit
             np.add.at(self.unlit, (row - top, column - x0), points.weight[unlit])
+        if radiance.transmitted is not None:
+            if self.transmitted is None:
+                self.transmitted = np.zeros((*self.pixels.coverage.shape, 2, 3), np.float32)
+            sums = self.transmitted[rows].reshape(y1 - y0, -1, 6)
+            given = buffer.point_rows(x0, int(self.parameters[WIDTH])), radiance.transmitted.reshape(-1, 6)
+            over_range(mean_of_points, y1 - y0, *given, sums, fewest=ROWS)
         unshadowed = np.zeros(len(points), np.float32) if radiance.unshadowed is None else radiance.unshadowed
         light = radiance.components, radiance.variance, unshadowed
         over_range(
@@ -182,7 +191,7 @@ class Film:
         ----------
         names : tuple of str
         colours : dict of str to array
-            DiffCol and GlossCol (h, w, 3), where passes of light are wanted.
+            DiffCol, GlossCol and TransCol (h, w, 3), where passes of light are wanted.
         components : (h, w, 4, 3) array, optional
             Denoised light; that of the film when None.
         vector, previous : array, optional
@@ -190,9 +199,10 @@ class Film:
         """
         seen = self.pixels
         light = seen.components if components is None else components
+        parts = light_parts(light, seen.components, self.transmitted, colours)
         made = {
-            name: without_colour(light[:, :, i], colours[COLOURS[name]])
-            for i, name in enumerate(COMPONENTS)
+            name: without_colour(part, colours[COLOURS[name]])
+            for name, part in zip(LIGHT_PASSES, parts)
             if name in names
         }
         shadow = self._shadow()
@@ -236,14 +246,6 @@ def footprints(depth: Array, parameters: Array) -> Array:
     """(h, w) float32 metres: width of a pixel at `depth` (h, w) before the camera of `parameters`."""
     per_metre = np.float32(1.0 / min(parameters[FX], parameters[FY]))
     return np.full_like(depth, per_metre) if parameters[ORTHOGRAPHIC] != 0.0 else depth * per_metre
-
-
-def add_light(light: Array, environment: Array, emission: Array, opaque: Array | np.float32) -> Array:
-    """(h, w, 4) float32 Combined of (h, w, 4, 3) light, what is behind it and what surfaces emit."""
-    out = np.empty((*light.shape[:2], 4), np.float32)
-    out[..., :3] = light[:, :, 0] + light[:, :, 1] + light[:, :, 2] + light[:, :, 3] + environment + emission
-    out[..., 3] = opaque
-    return out
 
 
 @njit

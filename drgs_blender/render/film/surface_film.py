@@ -2,7 +2,7 @@
 
 They are those of Cycles. All but the material index, which is that of the nearest sample, are means over a pixel's
 samples premultiplied by coverage: in a pixel half covered, UV is half of what the surface has, with a third channel
-that says so, and Mist is 1 where nothing is. Diffuse and glossy colour are the directional albedos of the lobes,
+that says so, and Mist is 1 where nothing is. Colours are the directional albedos of the lobes of a kind,
 for a viewer as flat to the surface as the camera: colour passes, by which light passes are divided
 (`core.passes.COLOURS`); those of objects that are shown as captured, which emit alone, are 0. Shader AOVs are looked
 up where the ray meets the surface; colours are cut at 0, and have as alpha the coverage of surfaces that give one.
@@ -23,11 +23,14 @@ from ..sampling import ONE, ZERO, F
 from ..scene.shader_aovs import aov_at
 from ..scene.trace_scene import TraceScene
 from ..shading_points import CATCHER, UNLIT
+from .lobe_colours import put_lobe_colours
 
 Array = np.ndarray
 
 #: Name -> channels.
-CHANNELS = {"DiffCol": 3, "GlossCol": 3, "UV": 3, "Mist": 1, "IndexMA": 1}
+CHANNELS = {"DiffCol": 3, "GlossCol": 3, "TransCol": 3, "UV": 3, "Mist": 1, "IndexMA": 1}
+
+_COLOURS = ("DiffCol", "GlossCol", "TransCol")
 
 
 class SurfaceFilm:
@@ -62,8 +65,8 @@ class SurfaceFilm:
         y0, y1 = buffer.rows
         rows = buffer.point_rows(x0, self._frame.camera.width)
         values: dict[str, Array] = {}
-        if "DiffCol" in self.pixels or "GlossCol" in self.pixels:
-            values["DiffCol"], values["GlossCol"] = self._colours(buffer)
+        if not self.pixels.keys().isdisjoint(_COLOURS):
+            values |= {name: v for name, v in zip(_COLOURS, self._colours(buffer)) if name in self.pixels}
         if self._uvs is not None:
             values["UV"] = self._places(buffer, self._uvs)
         if "Mist" in self.pixels:
@@ -79,17 +82,20 @@ class SurfaceFilm:
         """Name -> (h, w, channels) float32."""
         return {name: 1 - pixels if name == "Mist" else pixels for name, pixels in self.pixels.items()}
 
-    def _colours(self, buffer: GBuffer) -> tuple[Array, Array]:
-        """(n, 3) float32 colour of the diffuse and of the glossy lobe at each point."""
+    def _colours(self, buffer: GBuffer) -> tuple[Array, Array, Array]:
+        """(n, 3) float32 colour of diffuse, glossy and transmitting lobes at each point."""
         points = buffer.points
-        diffuse, glossy = (np.empty((len(points), 3), np.float32) for _ in range(2))
+        diffuse, glossy, passed = (np.zeros((len(points), 3), np.float32) for _ in range(3))
         model = brdf.SHADING_MODELS[self._frame.settings.shading_model]
         tables = brdf.layer_table(), brdf.schlick_table()
         over_range(_lobe_colours, len(points), points.arrays, model, tables, diffuse, glossy, fewest=ELEMENTS)
+        rows = self._scene.mesh_materials.table.rows
+        if rows is not None and self._frame.settings.shading_model == "principled":
+            put_lobe_colours(points, self._scene.geometry, rows, (diffuse, glossy, passed))
         unlit = points.flags & UNLIT != 0  # they emit alone
         if unlit.any():
-            diffuse[unlit] = glossy[unlit] = 0.0
-        return diffuse, glossy
+            diffuse[unlit] = glossy[unlit] = passed[unlit] = 0.0
+        return diffuse, glossy, passed
 
     def _places(self, buffer: GBuffer, uvs: Array) -> Array:
         """(n, 3) float32: u, v and 1 at each point; 0 where there is no UV map."""

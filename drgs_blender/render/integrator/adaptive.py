@@ -89,6 +89,7 @@ class Sampling:
         self._variance, self._unshadowed = np.zeros((count, 2), np.float32), np.zeros(count, np.float32)
         self._counted, self._caught = np.zeros(count, np.float32), False
         self._groups: Array | None = None
+        self._transmitted: Array | None = None
 
     def add(self, chosen: Array, found: Radiance) -> None:
         """Take the light of this part for `chosen` of the points that need it; each comes once."""
@@ -99,6 +100,10 @@ class Sampling:
             if self._groups is None:
                 self._groups = np.zeros((len(self.drawn), *found.groups.shape[1:]), np.float32)
             self._groups[chosen] += found.groups
+        if found.transmitted is not None:
+            if self._transmitted is None:
+                self._transmitted = np.zeros((len(self.drawn), 2, 3), np.float32)
+            self._transmitted[chosen] += found.transmitted
         if found.unshadowed is not None:
             self._unshadowed[chosen] += found.unshadowed
             self._caught = True
@@ -135,4 +140,5 @@ class Sampling:
             self._variance * (scale**2)[:, None],
             self._unshadowed * scale if self._caught else None,
             groups=None if self._groups is None else self._groups * scale[:, None, None],
+            transmitted=None if self._transmitted is None else self._transmitted * scale[:, None, None],
         )

@@ -13,10 +13,11 @@ from ..lights.light_links import emits_to, lights_of
 from ..lights.light_sampler import emission_along, lights_along, sample_light
 from ..lights.light_shapes import DIFFUSE, GLOSSY
 from ..lights.product_sampling import block_of, in_cells_order
-from ..sampling import ONE, ZERO, U, mix
+from ..sampling import ONE, TWO, ZERO, U, mix
 from ..scene import ray_masks
+from ..scene.terminator import terminator_at
 from . import wavefront as w
-from .bsdf.lobes import evaluate
+from .bsdf.lobes import evaluate, evaluate_below
 from .bsdf.surface_lobes import bump_shadow
 from .group_sums import credit_lamps_of_path, credit_path
 from .indirect import lifted
@@ -147,6 +148,58 @@ def weigh(scratch, count, view, facing, normals, direction, detailed):  # type: 
 
 
 @njit
+def weigh_lit(at, direction, scratch, count, scene):  # type: ignore[no-untyped-def]
+    """`weigh` along a light sample, with its shadow ray in slot 0, whose start `wavefront.terminate` describes.
+
+    As in Cycles, the start is moved for light that passes the surface, too, on the side where it goes.
+
+    Parameters
+    ----------
+    at : tuple
+        As of `towards_envmap`.
+    direction : tuple of float32
+        Unit, world.
+    scratch : Scratch
+    count : int64
+        Lobes.
+    scene : Scene
+
+    Returns
+    -------
+    float32
+        Pdf of BSDF sampling, sr^-1.
+    """
+    place, position, view, facing, normals = at
+    s, value, extent, geometry = scratch.rays.floats, scratch.value, scene.traits.extent, scene.geometry
+    pdf = weigh(scratch, count, view, facing, normals, direction, scene.traits.detailed)
+    aim(scratch.rays, position, facing, direction, extent)
+    s[w.MOVED] = ZERO
+    if geometry.terminators == 0:
+        return pdf
+    (gx, gy, gz), (dx, dy, dz), (ux, uy, uz) = facing, direction, normals[1]
+    above, flat = ux * dx + uy * dy + uz * dz, gx * dx + gy * dy + gz * dz
+    if above <= ZERO:
+        gx, gy, gz, flat = -gx, -gy, -gz, -flat
+    s[w.HX], s[w.HY], s[w.HZ], limit = terminator_at(place[0], place[1], place[2], place[3], gx, gy, gz, geometry)
+    if not limit > ZERO:
+        return pdf
+    if above <= ZERO and flat <= ZERO:
+        for c in range(9):
+            value[c] = ZERO
+        return pdf
+    if flat <= ZERO:
+        # Below the face, but above the smooth surface.
+        s[w.OX], s[w.OY], s[w.OZ] = lifted(position[0], position[1], position[2], gx, gy, gz, extent)
+        s[w.GX], s[w.GY], s[w.GZ] = gx, gy, gz
+        if not pdf > ZERO:
+            shadow = bump_shadow(normals[0], normals[1], direction) if scene.traits.detailed else ONE
+            evaluate_below(scratch.lobes, count, view, direction, shadow, value)
+    part = TWO - (flat + above) / limit if above < limit else ONE - flat / limit
+    s[w.MOVED] = min(max(part, ZERO), ONE)
+    return pdf
+
+
+@njit
 def is_bright(value):  # type: ignore[no-untyped-def]
     """Whether any light passes.
 
@@ -173,7 +226,8 @@ def towards_envmap(numbers, at, row, throughput, first, scratch, count, scene, s
     numbers : tuple of uint32
         Random numbers.
     at : tuple
-        Position (m), direction to the viewer, geometric normal, shading normal and that without maps, world.
+        Face, instance and barycentric coordinates; position (m), direction to the viewer, geometric normal, shading
+        normal and that without maps, world.
     row : int32
         Of the environment's tables.
     throughput : tuple of float32
@@ -186,7 +240,6 @@ def towards_envmap(numbers, at, row, throughput, first, scratch, count, scene, s
     scene : Scene
     settings : Settings
     """
-    position, view, facing, normals = at
     envmap = scene.envmap
     n0, n1, n2 = numbers
     block = np.int64(block_of(row, n2, envmap))
@@ -196,14 +249,13 @@ def towards_envmap(numbers, at, row, throughput, first, scratch, count, scene, s
         cell += 1
     _, column, upper, lower, density = cell_at(cell, envmap)
     dx, dy, dz, u, v = direction_in_cell(column, upper, lower, n0, n1, envmap)
-    pdf = weigh(scratch, count, view, facing, normals, (dx, dy, dz), scene.traits.detailed)
+    pdf = weigh_lit(at, (dx, dy, dz), scratch, count, scene)
     own = density * ratio
     if not (own > ZERO and is_bright(scratch.value)):
         return
     r, g, b = envmap_radiance(u, v, envmap)
     if not r + g + b > ZERO:
         return
-    aim(scratch.rays, position, facing, (dx, dy, dz), scene.traits.extent)
     through = passed(scene, scratch.rays, 0, FAR, np.int32(ray_masks.SHADOW << settings.shift))
     if through > ZERO:
         k = through / (own + pdf)
@@ -220,7 +272,8 @@ def towards_lights(numbers, at, receiver, throughput, first, scratch, count, sce
     numbers : tuple of uint32
         Random numbers.
     at : tuple
-        Position (m), direction to the viewer, geometric normal, shading normal and that without maps, world.
+        Face, instance and barycentric coordinates; position (m), direction to the viewer, geometric normal, shading
+        normal and that without maps, world.
     receiver : float32
         Set of the surface, see `light_links`.
     throughput : tuple of float32
@@ -233,19 +286,17 @@ def towards_lights(numbers, at, receiver, throughput, first, scratch, count, sce
     scene : Scene
     settings : Settings
     """
-    position, view, facing, normals = at
     rays = scratch.rays
     s, ints = rays
     n0, n1, n2 = numbers
     own = lights_of(scene.lights, receiver)
-    px, py, pz = position
+    px, py, pz = at[1]
     dx, dy, dz, distance, r, g, b, density, light = sample_light(n2, n0, n1, px, py, pz, own)
     if not (density != ZERO and r + g + b > ZERO):
         return
-    pdf = weigh(scratch, count, view, facing, normals, (dx, dy, dz), scene.traits.detailed)
+    pdf = weigh_lit(at, (dx, dy, dz), scratch, count, scene)
     if not is_bright(scratch.value):
         return
-    aim(rays, position, facing, (dx, dy, dz), scene.traits.extent)
     s[w.ER], s[w.EG], s[w.EB], s[w.MU], s[w.MV], s[w.LIVE] = r, g, b, distance, density, ONE
     ints[w.CELL] = U(max(light, 0))
     mask = np.int32(ray_masks.SHADOW << settings.shift)

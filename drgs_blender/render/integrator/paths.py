@@ -116,7 +116,7 @@ def _follow(start, numbers, receiver, surfaces, scene, settings, scratch):  # ty
         row = np.int32(SIDE * SIDE)
         if not passes:
             row = product_row(normal[0], normal[1], normal[2], envmap)
-        at = (position, view, facing, normals)
+        at = (place, position, view, facing, normals)
         throughput = (red, green, blue)
         if scene.traits.environment:
             drawn = _numbers(U(key + _ENVIRONMENT), sequence, U(turn + _ENVIRONMENT), first)

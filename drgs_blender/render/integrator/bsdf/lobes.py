@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 from ....compute.jit import inlined, njit
-from ...sampling import INVERSE_PI, ONE, PI, TWO, ZERO, F, cosine_hemisphere, luminance
+from ...sampling import INVERSE_PI, ONE, PI, TWO, ZERO, F, cosine_hemisphere
 from .microfacet import fresnel, normal_reflectance, reflection, refraction, visible_normal
 
 #: Columns of a lobe: kind, weight, alphas, eta, normal, tangent, F0, slope of F82, tints of reflection and of
@@ -260,6 +260,29 @@ def evaluate(b, count, view, light, facing, out):  # type: ignore[no-untyped-def
 
 
 @njit
+def evaluate_below(b, count, view, light, share, out):  # type: ignore[no-untyped-def]
+    """Add a share of what diffuse lobes make of light below a face that is above their normal.
+
+    Parameters
+    ----------
+    b, count, view, light, out : array, int64 or tuple
+        As of `evaluate`; `sample` draws no such light.
+    share : float32
+    """
+    for lobe in range(count):
+        k = lobe * LOBE
+        if b[k + KIND] == DIFFUSE:
+            r, g, c, _ = _diffuse(b, k, view[0], view[1], view[2], light[0], light[1], light[2])
+        elif b[k + KIND] == SHEEN:
+            r = g = c = _sheen(b, k, light[0], light[1], light[2])
+        else:
+            continue
+        out[0] += share * b[k + WEIGHT] * r
+        out[1] += share * b[k + WEIGHT + 1] * g
+        out[2] += share * b[k + WEIGHT + 2] * c
+
+
+@njit
 def _draw(b, k, i, u0, u1, u2):  # type: ignore[no-untyped-def]
     """A direction of a lobe, in its frame; whether it passes, the cosine at the microfacet, its probability."""
     kind, ax, ay = b[k + KIND], b[k + AX], b[k + AY]
@@ -371,18 +394,3 @@ def share_out(b, count):  # type: ignore[no-untyped-def]
     scale = ONE / total if total > ZERO else ZERO
     for lobe in range(count):
         b[lobe * LOBE + PROBABILITY] *= scale
-
-
-@inlined
-def brightness(r, g, b):  # type: ignore[no-untyped-def]
-    """By which lobes are weighed for sampling: luminance and mean, so that no pure colour counts for nothing.
-
-    Parameters
-    ----------
-    r, g, b : float32
-
-    Returns
-    -------
-    float32
-    """
-    return F(0.5) * luminance(r, g, b) + F(1.0 / 6.0) * (r + g + b)

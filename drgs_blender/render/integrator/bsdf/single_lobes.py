@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from ....compute.jit import njit
-from ...sampling import ONE, PI, TWO, ZERO, F, basis
+from ....compute.jit import inlined, njit
+from ...sampling import ONE, PI, TWO, ZERO, F, basis, luminance
 from .albedo_tables import read_1d, read_2d, read_3d
 from .lobes import (
     AX,
@@ -28,12 +28,26 @@ from .lobes import (
     TANGENT,
     TRANSLUCENT,
     WEIGHT,
-    brightness,
     fujii,
     reflectance,
 )
 
 _LEAST, _TINY = F(1e-5), F(1e-30)
+
+
+@inlined
+def brightness(r, g, b):  # type: ignore[no-untyped-def]
+    """By which lobes are weighed for sampling: luminance and mean, so that no pure colour counts for nothing.
+
+    Parameters
+    ----------
+    r, g, b : float32
+
+    Returns
+    -------
+    float32
+    """
+    return F(0.5) * luminance(r, g, b) + F(1.0 / 6.0) * (r + g + b)
 
 
 @njit
