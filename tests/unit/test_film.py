@@ -16,7 +16,7 @@ from drgs_blender.render.shading_points import Radiance
 
 #: These have films of their own.
 ALL = tuple(name for name in BY_NAME if not name.startswith("Crypto") and name not in CHANNELS)
-WHITE = {name: np.ones((10, 12, 3), np.float32) for name in ("DiffCol", "GlossCol")}
+WHITE = {name: np.ones((10, 12, 3), np.float32) for name in ("DiffCol", "GlossCol", "TransCol")}
 AA = 4
 
 

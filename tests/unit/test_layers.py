@@ -144,9 +144,16 @@ def developed(buffer: GBuffer, scene: TraceScene, radiance: Radiance, transparen
     film = Film(camera, settings, camera_parameters(camera, settings, 1))
     film.add(buffer, radiance, scene.pass_index, EnvironmentLight(World(colour=(1.0, 0.5, 0.25))))
     white = np.ones((*buffer.alpha.shape[:2], 3), np.float32)
-    apart = {"DiffCol", "GlossCol", "Mist", "UV", "IndexMA"}  # these have films of their own, as mattes have
+    apart = {
+        "DiffCol",
+        "GlossCol",
+        "TransCol",
+        "Mist",
+        "UV",
+        "IndexMA",
+    }  # these have films of their own, as mattes have
     names = tuple(name for name in BY_NAME if name not in apart and not name.startswith("Crypto"))
-    return film.passes(names, {"DiffCol": white, "GlossCol": white})
+    return film.passes(names, {"DiffCol": white, "GlossCol": white, "TransCol": white})
 
 
 def uniform_light(buffer: GBuffer, value: float) -> Radiance:
