@@ -58,6 +58,7 @@ def painted(room):  # noqa: F811
     return room
 
 
+@pytest.mark.slow
 def test_passes_are_those_of_cycles(painted, tmp_path):
     theirs, ours = layers_of(painted, "CYCLES", tmp_path), layers_of(painted, "DRGS", tmp_path)
     for name, channels in (("tone", 4), ("wetness", 1)):
@@ -84,6 +85,7 @@ def test_frame_has_the_aovs_that_passes_ask_for(painted, export):
     assert not frame.images
 
 
+@pytest.mark.slow
 def test_procedural_aovs_are_baked(painted, tmp_path):
     """Noise on the ball, by a channel of its own: as Cycles' own."""
     nodes, links = tree_of("ball").nodes, tree_of("ball").links

@@ -90,6 +90,7 @@ def test_cycles_shows_the_imported_materials_as_drgs_the_asset(scene, ball):
     assert parity.psnr(ours, theirs) > 40
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("painted", [False, True])
 def test_textured_materials_glow_and_let_light_pass_as_those_of_drgs(scene, tmp_path, painted):
     """Emission and opacity of an asset with images, from the file or painted later."""

@@ -104,6 +104,14 @@ class Layout:
         self.prop(data, name)
         self.prop(among, names)
 
+    def separator(self, **_):
+        pass
+
+    def template_list(self, kind, _, among, names, current, index, **__):
+        assert hasattr(bpy.types, kind)
+        self.prop(among, names)
+        self.prop(current, index)
+
     def operator(self, name, icon="NONE", **_):
         group, verb = name.split(".")
         known = getattr(getattr(bpy.ops, group), verb).get_rna_type()
@@ -158,7 +166,9 @@ def test_every_panel_draws_and_every_poll_answers(scene, ball_file, loaded):
 @pytest.mark.parametrize("kind", ["POINT", "AREA"])
 def test_panels_of_a_light_draw(scene, kind):
     obj = bpy.data.objects.new("Light", bpy.data.lights.new("Light", kind))
-    context = type("Context", (), {"engine": "DRGS", "object": obj, "light": obj.data})
+    facts = {"engine": "DRGS", "object": obj, "light": obj.data, "world": bpy.data.worlds.new("World")}
+    facts["view_layer"] = bpy.context.view_layer
+    context = type("Context", (), facts)
     rays = part("addon.panels.ray_visibility")
     for cls in rays.CLASSES:
         assert cls.poll(context)
