@@ -14,8 +14,9 @@ from ...core.errors import UsageError
 from ...core.frame import Image, Material, MeshState
 from ..memory import AddressOf, address
 from .mesh_layers import MeshLayers, Placements
+from .object_mesh import ObjectMesh
 from .textures import MaterialTable
-from .trace_mesh import ObjectMesh, Part, TraceObject
+from .trace_mesh import Part, TraceObject
 
 
 @dataclass(slots=True)

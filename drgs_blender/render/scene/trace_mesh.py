@@ -18,6 +18,7 @@ from ...core.frame import MeshState, Visibility
 from ...geometry.normals import VertexNormals
 from ..surfel_columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS
 from .instances import Instances, flattens, normal_matrices
+from .object_mesh import ObjectMesh
 from .ray_masks import group_mask
 
 Array = np.ndarray
@@ -67,27 +68,6 @@ class TraceObject:
     seen_only: bool = False
     torn: Array | None = None
     terminator_offset: float = 0.0
-
-
-@dataclass(slots=True)
-class ObjectMesh(MeshState):
-    """The mesh of a DR-GS object with materials of its own: an ordinary mesh of one instance, yet the object.
-
-    Attributes
-    ----------
-    owner : int
-        Which of the scene's objects it is; that `TraceObject` has no faces.
-    seen_only : bool
-        As of `TraceObject`.
-    """
-
-    owner: int = 0
-    seen_only: bool = False
-
-    @property
-    def clear(self) -> bool:
-        """Whether light may pass it; no surfels are tied to it then, and the camera sees it next to those of others."""
-        return any(material.clear for material in self.materials)
 
 
 @dataclass(slots=True)

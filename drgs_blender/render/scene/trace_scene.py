@@ -20,9 +20,10 @@ from .instances import Instances, normal_matrices, other_matrices, usable_instan
 from .interaction import Geometry, Tracer
 from .mesh_layers import Placements
 from .mesh_materials import EmissiveMesh, MeshMaterials
+from .object_mesh import ObjectMesh
 from .ray_masks import object_flags
 from .terminator import TerminatorOffsets
-from .trace_mesh import ObjectMesh, Part, TraceObject, mask_of, own_faces, place_vertices, take_mesh, take_object
+from .trace_mesh import Part, TraceObject, mask_of, own_faces, place_vertices, take_mesh, take_object
 from .triangle_bvh import Group, TriangleBVH
 
 Array = np.ndarray
