@@ -107,7 +107,7 @@ LOOKS = {
     "glass": {"roughness": 0.6, "transmission": 1.0},
     "sheet": {"roughness": 0.6, "transmission": 1.0, "thin_walled": True},
     "all": {"roughness": 0.6, "transmission": 0.5, "coat": 0.5, "coat_roughness": 0.4, "sheen": 0.5, "metallic": 0.3},
-    "velvet": {"roughness": 0.5, "kind": "sheen"},
+    "velvet": {"sheen_roughness": 0.5, "kind": "sheen"},
     "rough diffuse": {"diffuse_roughness": 1.0, "kind": "diffuse"},
     "translucent": {"kind": "translucent"},
     "glossy": {"roughness": 0.6, "anisotropy": -0.5, "kind": "glossy"},

@@ -148,7 +148,7 @@ def add_material(b, count, p, kind, flags, normals, along, view, side, tables): 
     if kind == _TRANSLUCENT:
         return add_translucent(b, count, (wr * cr, wg * cg, wb * cb), normal)
     if kind == _SHEEN:
-        count, _ = add_sheen(b, count, (wr * cr, wg * cg, wb * cb), p[ROUGHNESS], normal, view)
+        count, _ = add_sheen(b, count, (wr * cr, wg * cg, wb * cb), p[SHEEN_ROUGHNESS], normal, view)
         return count
     # Metals and glass end at white, diffuse colours do not.
     hr, hg, hb = min(cr, ONE), min(cg, ONE), min(cb, ONE)
