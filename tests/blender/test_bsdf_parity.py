@@ -110,6 +110,7 @@ def furnish(scene, shelf: str) -> None:
     camera.location, camera.rotation_euler = (0, -8, 0), (math.pi / 2, 0, 0)
 
 
+@pytest.mark.judged
 @pytest.mark.parametrize("shelf", SHELVES)
 def test_bsdfs_look_as_in_cycles(scene, export, shelf):
     furnish(scene, shelf)

@@ -93,6 +93,7 @@ def test_passes_are_those_of_cycles(passes):
         assert abs(found[name + " mean"] - 1) < 0.02, name
 
 
+@pytest.mark.judged
 @pytest.mark.slow
 def test_passes_of_glass_are_those_of_cycles(passes):
     bpy.ops.mesh.primitive_cube_add(size=0.5, location=(-0.6, -1.0, 0.0), rotation=(0.3, 0.2, 0.5))

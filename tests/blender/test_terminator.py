@@ -73,6 +73,7 @@ LEAST = {
 }  # fmt: skip
 
 
+@pytest.mark.judged
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "lamp"), LEAST)
 def test_pictures_are_those_of_cycles(scene, kind, lamp):
