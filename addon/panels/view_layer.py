@@ -36,40 +36,42 @@ class DRGS_PT_passes(bpy.types.Panel):
             column.prop(owner, name, text=text)
 
 
-class DRGS_PT_aovs(bpy.types.Panel):
-    bl_label = "Shader AOV"
+class _BelowPasses:
+    """A panel below Passes."""
+
     bl_space_type = "PROPERTIES"
     bl_region_type = "WINDOW"
     bl_context = "view_layer"
     bl_parent_id = "DRGS_PT_passes"
     bl_options: ClassVar = {"DEFAULT_CLOSED"}
 
+
+def _draw_list(layout: bpy.types.UILayout, view_layer: bpy.types.ViewLayer, kind: str, item: str) -> bpy.types.UILayout:
+    """Draw the list of `item`s; the column of its buttons."""
+    row = layout.row()
+    given = view_layer, f"{item}s", view_layer, f"active_{item}_index"
+    row.column().template_list(kind, f"{item}s", *given, rows=3)
+    column = row.column(align=True)
+    column.operator(f"scene.view_layer_add_{item}", icon="ADD", text="")
+    column.operator(f"scene.view_layer_remove_{item}", icon="REMOVE", text="")
+    return column
+
+
+class DRGS_PT_aovs(_BelowPasses, bpy.types.Panel):
+    bl_label = "Shader AOV"
+
     def draw(self, context: bpy.types.Context) -> None:
-        view_layer, row = context.view_layer, self.layout.row()
-        given = view_layer, "aovs", view_layer, "active_aov_index"
-        row.column().template_list("VIEWLAYER_UL_aov", "aovs", *given, rows=3)
-        column = row.column(align=True)
-        column.operator("scene.view_layer_add_aov", icon="ADD", text="")
-        column.operator("scene.view_layer_remove_aov", icon="REMOVE", text="")
+        view_layer = context.view_layer
+        _draw_list(self.layout, view_layer, "VIEWLAYER_UL_aov", "aov")
         if view_layer.active_aov and not view_layer.active_aov.is_valid:
             self.layout.label(text="Another render pass has this name", icon="ERROR")
 
 
-class DRGS_PT_light_groups(bpy.types.Panel):
+class DRGS_PT_light_groups(_BelowPasses, bpy.types.Panel):
     bl_label = "Light Groups"
-    bl_space_type = "PROPERTIES"
-    bl_region_type = "WINDOW"
-    bl_context = "view_layer"
-    bl_parent_id = "DRGS_PT_passes"
-    bl_options: ClassVar = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        view_layer, row = context.view_layer, self.layout.row()
-        given = view_layer, "lightgroups", view_layer, "active_lightgroup_index"
-        row.column().template_list("UI_UL_list", "lightgroups", *given, rows=3)
-        column = row.column(align=True)
-        column.operator("scene.view_layer_add_lightgroup", icon="ADD", text="")
-        column.operator("scene.view_layer_remove_lightgroup", icon="REMOVE", text="")
+        column = _draw_list(self.layout, context.view_layer, "UI_UL_list", "lightgroup")
         column.separator()
         column.menu("VIEWLAYER_MT_lightgroup_sync", icon="DOWNARROW_HLT", text="")
 
