@@ -142,9 +142,10 @@ def is_loose(image: bpy.types.Image) -> bool:
 
 def image_identity(image: bpy.types.Image) -> dict[str, Any]:
     """What an image's pixels depend on."""
-    settings = image.source, image.colorspace_settings.name, image.alpha_mode, *image.size
+    settings = image.source, image.colorspace_settings.name, image.alpha_mode
     if is_loose(image):
-        return {"pixels": _digest(pixels_of(image).tobytes()), "settings": settings}
+        return {"pixels": _digest(pixels_of(image).tobytes()), "settings": [*settings, *image.size]}
+    # Not the size of others: to say it, Blender reads the file.
     if image.packed_file is not None:
         return {"pixels": _digest(image.packed_file.data), "settings": settings}
     path = bpy.path.abspath(image.filepath, library=image.library)
