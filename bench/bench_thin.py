@@ -22,7 +22,8 @@ from scipy.ndimage import binary_erosion
 from drgs_blender.build.proxy import mesh_from_surfels
 from drgs_blender.core.asset import Asset, Mesh, Surfels
 from drgs_blender.core.asset.container import write_asset
-from drgs_blender.core.frame import Frame, Material, MeshState, ObjectState, RenderSettings, World
+from drgs_blender.core.frame import Frame, MeshState, ObjectState, RenderSettings, World
+from drgs_blender.core.materials import Material
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.binding import bind
 from drgs_blender.engine.session import Session

@@ -13,15 +13,8 @@ from report import ROOT, table
 from subjects import asset_path
 
 from drgs_blender.core.color import LUMINANCE
-from drgs_blender.core.frame import (
-    Frame,
-    Material,
-    MeshState,
-    ObjectState,
-    RenderSettings,
-    Visibility,
-    World,
-)
+from drgs_blender.core.frame import Frame, MeshState, ObjectState, RenderSettings, Visibility, World
+from drgs_blender.core.materials import Material
 from drgs_blender.formats.registry import read_environment
 
 Array = np.ndarray

@@ -95,18 +95,18 @@ def engine(folder: Path, what: str) -> None:
     import numpy as np
 
     from drgs_blender.core.asset.container import read_asset
-    from drgs_blender.core.frame import (
+    from drgs_blender.core.frame import (  # fmt: skip
         Camera,
         Frame,
         Light,
-        Material,
         MeshState,
         MotionStep,
         ObjectState,
         Pose,
         RenderSettings,
         World,
-    )  # fmt: skip
+    )
+    from drgs_blender.core.materials import Material  # fmt: skip
     from drgs_blender.ipc.client import EngineClient, locate_engine
 
     matrix = np.array([[1, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0], [0, 0, 0, 1]], float)

@@ -25,9 +25,9 @@ class Bsdf:
 
     Attributes
     ----------
-    kind : as of frame.Material
-    values : by field of frame.Material; what is missing is at its default
-    switches : fields of frame.Material that are true
+    kind : as of materials.Material
+    values : by field of materials.Material; what is missing is at its default
+    switches : fields of materials.Material that are true
     tangent : layer that its highlights follow
     leaves : its nodes, as of `bakes.node_trees.leaf_of`
     """

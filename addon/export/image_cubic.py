@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ...drgs_blender.core.frame import Image
+from ...drgs_blender.core.materials import Image
 
 Array = np.ndarray
 

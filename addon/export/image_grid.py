@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from ...drgs_blender.core.color import srgb_to_linear
-from ...drgs_blender.core.frame import Image
+from ...drgs_blender.core.materials import Image
 
 Array = np.ndarray
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...drgs_blender.core.arrays import shareable
 from ...drgs_blender.core.color import srgb_to_linear
-from ...drgs_blender.core.frame import Image
+from ...drgs_blender.core.materials import Image
 
 Array = np.ndarray
 

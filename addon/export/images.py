@@ -12,7 +12,7 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.core.color import linear_to_srgb, srgb_to_linear
-from ...drgs_blender.core.frame import Image
+from ...drgs_blender.core.materials import Image
 from . import image_cubic, image_grid, image_parts, image_pixels
 
 Array = np.ndarray

@@ -10,7 +10,7 @@ from typing import Literal
 import bpy
 import numpy as np
 
-from ...drgs_blender.core.frame import Texture
+from ...drgs_blender.core.materials import Texture
 from .. import mesh_arrays
 from .nodes import LUMINANCE
 

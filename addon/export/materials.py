@@ -1,4 +1,4 @@
-"""A material's nodes -> frame.Material: colours and numbers, each times an image where there is one."""
+"""A material's nodes -> materials.Material: colours and numbers, each times an image where there is one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...drgs_blender.core.frame import TEXTURED, Image, Material, Part, ShaderAOV, SurfaceDetail, Texture
+from ...drgs_blender.core.materials import TEXTURED, Image, Material, Part, ShaderAOV, SurfaceDetail, Texture
 from ...drgs_blender.core.passes import Pass
 from ..bakes.node_trees import COLOURS, Leaves
 from .aov_nodes import aov_values
@@ -160,7 +160,7 @@ class Materials:
         return Material(material.name, **values, **_mean_of(parts), parts=parts)
 
     def _fields(self, tree: SurfaceWalker, values: dict[str, SocketValue], label: Label) -> dict[str, Any]:
-        """Fields of frame.Material with their textures."""
+        """Fields of materials.Material with their textures."""
         fields: dict[str, Any] = {}
         for name, value in values.items():
             fields[name] = _usable(tree, name, value)
@@ -246,7 +246,7 @@ def _name_lost_light(tree: SurfaceWalker, *values: SocketValue) -> None:
 
 
 def _switched(bsdf: Bsdf, label: Label) -> dict[str, Any]:
-    """Fields of frame.Material that are no numbers."""
+    """Fields of materials.Material that are no numbers."""
     fields: dict[str, Any] = dict.fromkeys(bsdf.switches, True)
     if bsdf.tangent is not None:
         fields["tangent"] = label(bsdf.tangent)
@@ -285,7 +285,7 @@ def _finite(tree: SurfaceWalker, name: str, value: SocketValue, default: Any) ->
 
 
 def _usable(tree: SurfaceWalker, name: str, value: SocketValue) -> tuple[float, float, float] | float:
-    """The number or colour of a field of frame.Material, finite and where it can be."""
+    """The number or colour of a field of materials.Material, finite and where it can be."""
     colour = _finite(tree, name, value, getattr(DEFAULT_MATERIAL, name))
     if name in COLOURS:
         return colour

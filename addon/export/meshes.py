@@ -10,7 +10,8 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.core.arrays import shareable
-from ...drgs_blender.core.frame import Image, Layer, MeshState
+from ...drgs_blender.core.frame import Layer, MeshState
+from ...drgs_blender.core.materials import Image
 from .. import mesh_arrays
 from ..bakes.requests import Wanted
 from .export_cache import ExportCache, uid

@@ -18,7 +18,7 @@ Kind = Literal["tangent", "object", "world", "blender_object", "blender_world", 
 
 @dataclass(frozen=True, slots=True)
 class DetailRef:
-    """A normal or bump map; all that frame.SurfaceDetail says.
+    """A normal or bump map; all that materials.SurfaceDetail says.
 
     Attributes
     ----------

@@ -11,7 +11,8 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.core.asset import MATERIAL_CHANNELS, Asset
-from ...drgs_blender.core.frame import Adjustment, ObjectState, ShaderAOV
+from ...drgs_blender.core.frame import Adjustment, ObjectState
+from ...drgs_blender.core.materials import ShaderAOV
 from ...drgs_blender.core.passes import Pass
 from .. import assets, cache_playback, mesh_arrays, point_caches
 from .aov_nodes import aov_values

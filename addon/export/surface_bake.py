@@ -11,7 +11,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...drgs_blender.core.frame import Image, Texture
+from ...drgs_blender.core.materials import Image, Texture
 from .. import mesh_arrays
 from ..bakes import node_trees
 from ..bakes.manager import Request

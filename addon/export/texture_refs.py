@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.core.color import srgb_to_linear
-from ...drgs_blender.core.frame import Image, Texture
+from ...drgs_blender.core.materials import Image, Texture
 from . import images
 from .layers import LayerRef
 from .nodes import LUMINANCE
@@ -30,7 +30,7 @@ _PROBES = np.array(((10, 100, 200), (200, 50, 120), (0, 255, 128)))
 
 @dataclass(frozen=True, slots=True)
 class TextureRef:
-    """An image on a surface; all that frame.Texture says, and the datablock.
+    """An image on a surface; all that materials.Texture says, and the datablock.
 
     Attributes
     ----------

@@ -11,8 +11,9 @@ from ..core.asset.model import Asset
 from ..core.asset.textures import ALBEDO, ROUGHNESS, MeshTextures
 from ..core.color import linear_to_srgb, srgb_to_linear
 from ..core.errors import AssetError
-from ..core.frame import Adjustment, Image
+from ..core.frame import Adjustment
 from ..core.material_adjustments import adjusted_number, recoloured
+from ..core.materials import Image
 from ..deform.face_frames import local_normals, posed_normals
 
 Array = np.ndarray

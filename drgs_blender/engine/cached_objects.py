@@ -9,7 +9,8 @@ import numpy as np
 
 from ..core.arrays import Array
 from ..core.asset.model import PosedSurfels
-from ..core.frame import Image, MeshState, ObjectState
+from ..core.frame import MeshState, ObjectState
+from ..core.materials import Image
 from ..render.scene.ray_masks import CAMERA, group_mask
 from ..render.scene.trace_scene import ObjectMesh, TraceObject
 from ..render.surfels.captured import CapturedObject

@@ -8,7 +8,8 @@ import numpy as np
 
 from ..core.asset.model import Asset, PosedSurfels
 from ..core.color import srgb_to_linear
-from ..core.frame import Frame, Image, Material, MeshState, ObjectState, Texture
+from ..core.frame import Frame, MeshState, ObjectState
+from ..core.materials import Image, Material, Texture
 from ..render.scene.trace_scene import TraceObject
 from ..render.surfels.captured import CapturedObject
 from ..render.surfels.harmonics import CONSTANT

@@ -16,7 +16,8 @@ import numpy as np
 
 from ..core.asset.model import Asset
 from ..core.asset.textures import ALBEDO, EXTENSIONS, METALLIC, NORMAL, ROUGHNESS, MeshTextures
-from ..core.frame import Image, Layer, Material, ObjectState, SurfaceDetail, Texture
+from ..core.frame import Layer, ObjectState
+from ..core.materials import Image, Material, SurfaceDetail, Texture
 from ..core.texture_adjustments import adjusted_textures, painted_faces
 from ..render.scene.trace_scene import ObjectMesh, TraceObject
 from .asset_textures import TexturedAsset

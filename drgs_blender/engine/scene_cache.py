@@ -14,7 +14,8 @@ from ..compute.warp.posed_surfels import DevicePosedSurfels, joined
 from ..core.asset.container import read_asset
 from ..core.asset.model import Asset, PosedSurfels
 from ..core.errors import AssetError, UsageError
-from ..core.frame import Frame, Image, MeshState, MotionStep, ObjectState, RenderSettings, World
+from ..core.frame import Frame, MeshState, MotionStep, ObjectState, RenderSettings, World
+from ..core.materials import Image
 from ..deform.gpu.mesh_driven import Deformer
 from ..deform.mesh_driven import MeshDriven
 from ..ipc.change_detection import reuse_equal

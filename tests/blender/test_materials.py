@@ -196,7 +196,7 @@ def picture(name: str = "Picture", alpha: bool = False, float_buffer: bool = Fal
 
 
 def texel(frame, texture, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """(n, 4) linear: what frame.Texture and frame.Image say of the closest texel, repeated."""
+    """(n, 4) linear: what materials.Texture and materials.Image say of the closest texel, repeated."""
     image = next(i for i in frame.images if i.name == texture.image)
     height, width, _ = image.pixels.shape
     s, t = texture.transform @ np.stack((u, v, np.ones_like(u)))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from drgs_blender.core.frame import Image, Material, MeshState, Texture
+from drgs_blender.core.frame import MeshState
+from drgs_blender.core.materials import Image, Material, Texture
 from drgs_blender.engine.session import Session
 
 

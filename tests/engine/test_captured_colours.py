@@ -15,7 +15,8 @@ from drgs_blender.core.asset.model import Asset, Mesh
 from drgs_blender.core.color import srgb_to_linear
 from drgs_blender.core.cryptomatte import name_hash
 from drgs_blender.core.errors import AssetError
-from drgs_blender.core.frame import Adjustment, Frame, Material, MeshState, MotionStep, ObjectState, Visibility, World
+from drgs_blender.core.frame import Adjustment, Frame, MeshState, MotionStep, ObjectState, Visibility, World
+from drgs_blender.core.materials import Material
 from drgs_blender.deform.attach import attach
 from drgs_blender.engine.session import Session
 

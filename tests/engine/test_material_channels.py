@@ -15,7 +15,8 @@ from drgs_blender.core.asset.container import read_asset, write_asset
 from drgs_blender.core.asset.model import Asset, Mesh, neutral_values
 from drgs_blender.core.cryptomatte import name_hash
 from drgs_blender.core.errors import AssetError
-from drgs_blender.core.frame import Adjustment, Frame, Light, Material, ObjectState, Visibility, World
+from drgs_blender.core.frame import Adjustment, Frame, Light, ObjectState, Visibility, World
+from drgs_blender.core.materials import Material
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.engine.session import Session

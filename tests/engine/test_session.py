@@ -12,7 +12,8 @@ from pictures import assert_same_bits, fresh, with_meshes
 from drgs_blender.core.asset.container import read_asset, write_asset
 from drgs_blender.core.asset.model import Asset, Mesh, Surfels
 from drgs_blender.core.errors import AssetError, Cancelled, UsageError
-from drgs_blender.core.frame import Adjustment, Light, Material, MeshState, ObjectState, Visibility, World
+from drgs_blender.core.frame import Adjustment, Light, MeshState, ObjectState, Visibility, World
+from drgs_blender.core.materials import Material
 from drgs_blender.engine.scene_objects import traced_object
 from drgs_blender.ipc.change_detection import reuse_equal
 

@@ -7,7 +7,8 @@ import pytest
 from test_integrate import points, settings
 from test_light_sampler import light
 
-from drgs_blender.core.frame import Image, Material, Texture, World
+from drgs_blender.core.frame import World
+from drgs_blender.core.materials import Image, Material, Texture
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.lights.light_sampler import Lights

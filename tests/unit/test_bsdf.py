@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drgs_blender.compute.jit import njit
-from drgs_blender.core.frame import Material, Part, Texture
+from drgs_blender.core.materials import Material, Part, Texture
 from drgs_blender.render.integrator.bsdf.albedo_tables import albedo_tables
 from drgs_blender.render.integrator.bsdf.lobes import DELTA, LOBE, MOST_LOBES, evaluate, sample, share_out
 from drgs_blender.render.integrator.bsdf.microfacet import fresnel

@@ -11,7 +11,8 @@ from shapes import look_along_y, sphere_mesh
 
 from drgs_blender.core.asset.model import PosedSurfels
 from drgs_blender.core.cryptomatte import identities, metadata, name_hash
-from drgs_blender.core.frame import Frame, Material, MeshState, ObjectState, RenderSettings, World
+from drgs_blender.core.frame import Frame, MeshState, ObjectState, RenderSettings, World
+from drgs_blender.core.materials import Material
 from drgs_blender.render.film.frame_files import read_frame, write_frame
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.pipeline import render

@@ -11,19 +11,8 @@ import trimesh
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
-from drgs_blender.core.frame import (
-    Image,
-    Layer,
-    Light,
-    Material,
-    MeshState,
-    ObjectState,
-    RenderSettings,
-    SurfaceDetail,
-    Texture,
-    Visibility,
-    World,
-)
+from drgs_blender.core.frame import Layer, Light, MeshState, ObjectState, RenderSettings, Visibility, World
+from drgs_blender.core.materials import Image, Material, SurfaceDetail, Texture
 from drgs_blender.render.backend import CPU
 from drgs_blender.render.gpu.select_backend import Backends
 from drgs_blender.render.gpu.warp_backend import WarpRenderBackend

@@ -12,7 +12,8 @@ from test_light_sampler import irradiance, light
 from test_surface import matrix, mesh_state
 
 from drgs_blender.compute.jit import njit
-from drgs_blender.core.frame import Image, Material, MeshState, Texture, Visibility, World
+from drgs_blender.core.frame import MeshState, Visibility, World
+from drgs_blender.core.materials import Image, Material, Texture
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.lights.light_sampler import Lights, emission_along

@@ -10,7 +10,8 @@ from shapes import look_along_y, sphere_mesh, sphere_surfels
 from test_surface import matrix, mesh_state
 
 from drgs_blender.core.asset.model import PosedSurfels
-from drgs_blender.core.frame import Camera, Frame, Material, ObjectState, RenderSettings, Visibility, World
+from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, Visibility, World
+from drgs_blender.core.materials import Material
 from drgs_blender.core.passes import BY_NAME
 from drgs_blender.render import pipeline
 from drgs_blender.render.camera import camera_parameters

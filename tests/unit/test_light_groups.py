@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from test_light_links import Scene, at, scene, slab  # noqa: F401  a fixture
 
-from drgs_blender.core.frame import Light, Material, World
+from drgs_blender.core.frame import Light, World
+from drgs_blender.core.materials import Material
 
 GROUPS = ("Combined_lamps", "Combined_sky", "Combined_glow", "Combined_rest")
 

@@ -10,17 +10,8 @@ from shapes import sphere_mesh
 
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.asset.model import Asset, Mesh
-from drgs_blender.core.frame import (
-    Camera,
-    Frame,
-    Light,
-    Material,
-    MeshState,
-    ObjectState,
-    RenderSettings,
-    Visibility,
-    World,
-)
+from drgs_blender.core.frame import Camera, Frame, Light, MeshState, ObjectState, RenderSettings, Visibility, World
+from drgs_blender.core.materials import Material
 from drgs_blender.deform.attach import attach
 from drgs_blender.engine.session import Session
 from drgs_blender.render import pipeline

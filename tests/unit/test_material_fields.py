@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drgs_blender.core.frame import TEXTURED, Camera, Frame, Image, Material, MeshState, Part, Texture
+from drgs_blender.core.frame import Camera, Frame, MeshState
+from drgs_blender.core.materials import TEXTURED, Image, Material, Part, Texture
 from drgs_blender.ipc import frame_file
 from drgs_blender.ipc.codec import completed, decode_frame, encode_frame
 from drgs_blender.ipc.frame_file import read_frame_file, write_frame_file

@@ -9,7 +9,8 @@ import pytest
 from test_integrate import points, settings
 from test_surface import mesh_state
 
-from drgs_blender.core.frame import Light, Material, MeshState, World
+from drgs_blender.core.frame import Light, MeshState, World
+from drgs_blender.core.materials import Material
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.lights.light_sampler import Lights

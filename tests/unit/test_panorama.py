@@ -20,7 +20,6 @@ from drgs_blender.core.frame import (
     Camera,
     Frame,
     Light,
-    Material,
     MeshState,
     MotionStep,
     ObjectState,
@@ -29,6 +28,7 @@ from drgs_blender.core.frame import (
     Visibility,
     World,
 )
+from drgs_blender.core.materials import Material
 from drgs_blender.deform.attach import attach
 from drgs_blender.engine.session import Session
 from drgs_blender.ipc.codec import decode_frame, encode_frame

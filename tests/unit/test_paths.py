@@ -9,7 +9,8 @@ import pytest
 from test_surface import mesh_state
 
 from drgs_blender.compute import threads
-from drgs_blender.core.frame import Camera, Frame, Light, Material, Part, RenderSettings, World
+from drgs_blender.core.frame import Camera, Frame, Light, RenderSettings, World
+from drgs_blender.core.materials import Material, Part
 from drgs_blender.engine.session import Session
 
 SQUARE = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])

@@ -9,7 +9,8 @@ import pytest
 from test_surface import mesh_state
 
 from drgs_blender.compute.jit import njit
-from drgs_blender.core.frame import Camera, Frame, Image, Layer, Light, Material, RenderSettings, Texture, World
+from drgs_blender.core.frame import Camera, Frame, Layer, Light, RenderSettings, World
+from drgs_blender.core.materials import Image, Material, Texture
 from drgs_blender.engine.session import Session
 from drgs_blender.render.scene.ray import Ray
 from drgs_blender.render.scene.ray_masks import SHADOW

@@ -10,7 +10,8 @@ import trimesh
 
 from drgs_blender.compute.jit import njit
 from drgs_blender.core.errors import AssetError, UsageError
-from drgs_blender.core.frame import Image, Material, MeshState, Texture, Visibility
+from drgs_blender.core.frame import MeshState, Visibility
+from drgs_blender.core.materials import Image, Material, Texture
 from drgs_blender.render.scene import ray_masks
 from drgs_blender.render.scene.interaction import nearest, position_at, shadowed, surface_at
 from drgs_blender.render.scene.ray import Ray

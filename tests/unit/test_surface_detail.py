@@ -9,7 +9,8 @@ import pytest
 from test_surface import MATRICES, aimed_rays, lumpy, matrix, meet, mesh_state
 
 from drgs_blender.core.errors import AssetError, UsageError
-from drgs_blender.core.frame import Image, Layer, Material, SurfaceDetail, Texture
+from drgs_blender.core.frame import Layer
+from drgs_blender.core.materials import Image, Material, SurfaceDetail, Texture
 from drgs_blender.render.scene.tangents import corner_tangents
 from drgs_blender.render.scene.trace_scene import TraceScene
 

@@ -11,7 +11,8 @@ from shapes import sphere_mesh
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.asset.model import Asset, Mesh
 from drgs_blender.core.errors import AssetError
-from drgs_blender.core.frame import Camera, Frame, Light, Material, MeshState, Mist, ObjectState, RenderSettings, World
+from drgs_blender.core.frame import Camera, Frame, Light, MeshState, Mist, ObjectState, RenderSettings, World
+from drgs_blender.core.materials import Material
 from drgs_blender.core.passes import COLOURS, with_colours, without_colour
 from drgs_blender.deform.attach import attach
 from drgs_blender.engine.session import Session

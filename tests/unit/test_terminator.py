@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from shapes import sphere_mesh
 
-from drgs_blender.core.frame import Camera, Frame, Light, Material, MeshState, RenderSettings, Visibility, World
+from drgs_blender.core.frame import Camera, Frame, Light, MeshState, RenderSettings, Visibility, World
+from drgs_blender.core.materials import Material
 from drgs_blender.engine.session import Session
 from drgs_blender.render.scene.terminator import height
 

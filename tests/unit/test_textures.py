@@ -10,7 +10,7 @@ import pytest
 
 from drgs_blender.core.color import srgb_to_linear
 from drgs_blender.core.errors import UsageError
-from drgs_blender.core.frame import Image, Material, Texture
+from drgs_blender.core.materials import Image, Material, Texture
 from drgs_blender.render.scene.textures import MaterialTable
 
 RNG = np.random.default_rng(7)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image as Picture
 
-from drgs_blender.core.frame import Image, Material, Texture
+from drgs_blender.core.materials import Image, Material, Texture
 from drgs_blender.formats.exr import read_exr
 from drgs_blender.render.scene.textures import MaterialTable
 

@@ -14,17 +14,8 @@ from drgs_blender.compute.jit import njit
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.asset.model import Asset, Mesh, PosedSurfels, Surfels
 from drgs_blender.core.errors import AssetError
-from drgs_blender.core.frame import (
-    Camera,
-    Frame,
-    Light,
-    Material,
-    MeshState,
-    ObjectState,
-    RenderSettings,
-    Visibility,
-    World,
-)
+from drgs_blender.core.frame import Camera, Frame, Light, MeshState, ObjectState, RenderSettings, Visibility, World
+from drgs_blender.core.materials import Material
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.deform.rigid import pose_by_matrix

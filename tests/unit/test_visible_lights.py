@@ -11,7 +11,8 @@ from shapes import look_along_y
 from test_layers import FACES, SIZE, SQUARE, veil, wall
 from test_surface import matrix, mesh_state
 
-from drgs_blender.core.frame import Frame, Light, Material, RenderSettings, Visibility, World
+from drgs_blender.core.frame import Frame, Light, RenderSettings, Visibility, World
+from drgs_blender.core.materials import Material
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.lights.light_sampler import Lights
 from drgs_blender.render.pipeline import render

@@ -15,7 +15,7 @@ Array = np.ndarray
 #: normals are in tangent space (MikkTSpace), 2 RGB - 1, green upwards.
 SLOTS = ("albedo", "roughness", "metallic", "normal")
 ALBEDO, ROUGHNESS, METALLIC, NORMAL = range(4)
-#: How images go on outside [0, 1], in the words of `core.frame.Texture`.
+#: How images go on outside [0, 1], in the words of `core.materials.Texture`.
 EXTENSIONS = ("repeat", "extend", "mirror")
 #: First bytes of the files that images may be.
 _MAGIC = {".png": b"\x89PNG\r\n\x1a\n", ".jpg": b"\xff\xd8\xff"}

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.frame import Material, Part, Texture
+from ...core.materials import Material, Part, Texture
 
 Array = np.ndarray
 

@@ -11,7 +11,8 @@ import numpy as np
 from ...core.arrays import Array
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
-from ...core.frame import Image, Material, MeshState
+from ...core.frame import MeshState
+from ...core.materials import Image, Material
 from ..memory import AddressOf, address
 from .mesh_layers import MeshLayers, Placements
 from .object_mesh import ObjectMesh

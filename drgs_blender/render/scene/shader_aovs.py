@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...compute.jit import njit
-from ...core.frame import Material, Texture
+from ...core.materials import Material, Texture
 from .texture_lookup import BRIGHTEST, colour_at
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from ...compute.jit import njit
 from ...core.arrays import frozen
 from ...core.color import LUMINANCE, srgb_to_linear, to_unit
 from ...core.errors import UsageError
-from ...core.frame import Image, Material, SurfaceDetail, Texture
+from ...core.materials import Image, Material, SurfaceDetail, Texture
 from ..memory import AddressOf, address
 from .detailed_normal import (
     COLOUR,

@@ -12,7 +12,8 @@ from itertools import groupby
 
 import numpy as np
 
-from ...core.frame import Image, MeshState, Pose
+from ...core.frame import MeshState, Pose
+from ...core.materials import Image
 from ..memory import AddressOf, address
 from ..sampling import F
 from ..surfel_columns import VERTEX
