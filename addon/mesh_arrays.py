@@ -209,6 +209,15 @@ def smooth_or_corner_normals(mesh: bpy.types.Mesh) -> Array | None:
     return normals
 
 
+def read_vertex_normals(mesh: bpy.types.Mesh) -> Array | None:
+    """(n, 3) float32 unit normals, object space; None where corners of a vertex may have normals of their own."""
+    if mesh.normals_domain != "POINT" or mesh.has_custom_normals:
+        return None
+    normals = np.empty((len(mesh.vertices), 3), np.float32)
+    mesh.vertex_normals.foreach_get("vector", normals.ravel())
+    return normals
+
+
 def read_loop_triangles(mesh: bpy.types.Mesh) -> tuple[Array, Array]:
     """Triangles of all polygons: their corners (m, 3) int32 and the polygon of each (m,) int32."""
     if read_triangles(mesh) is not None:

@@ -44,17 +44,21 @@ class _Arrays:
     polygons: Array
     corner_vertices: Array
     material_index: Array | None
-    normals: Array | None
+    vertex_normals: Array | None
+    corner_normals: Array | None
 
     @classmethod
     def read(cls, mesh: bpy.types.Mesh) -> _Arrays:
-        """Read them, vertices frozen."""
+        """Read them, vertices and their normals frozen."""
+        corner_normals = mesh_arrays.smooth_or_corner_normals(mesh)
+        vertex_normals = None if corner_normals is None else mesh_arrays.read_vertex_normals(mesh)
         return cls(
             _frozen(mesh_arrays.read_vertices(mesh)),
             *mesh_arrays.read_loop_triangles(mesh),
             mesh_arrays.read_corner_vertices(mesh),
             mesh_arrays.read_material_index(mesh),
-            mesh_arrays.smooth_or_corner_normals(mesh),
+            None if vertex_normals is None else _frozen(vertex_normals),
+            corner_normals if vertex_normals is None else None,
         )
 
 
@@ -162,7 +166,7 @@ class Meshes:
         corners, polygons, index = _seen(corners, polygons, index, exported)
         if len(corners) == 0:
             return None
-        normals = arrays.normals
+        normals = arrays.corner_normals
         return MeshState(
             name=item.object.name,
             vertices=arrays.vertices,
@@ -178,6 +182,7 @@ class Meshes:
             layers=self._layers(item.object.name, mesh, (corners, polygons, arrays.corner_vertices), exported),
             light_group=item.object.lightgroup,
             terminator_offset=terminator_offset(item.object, self._warn),
+            vertex_normals=arrays.vertex_normals,
             **self._links.numbers_of(item),
         )
 

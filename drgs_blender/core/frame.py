@@ -229,7 +229,7 @@ class MeshState:
     pass_indices : (k,) int32 array
         Blender's object index pass of each instance.
     corner_normals : (m, 3, 3) float32 array, optional
-        Unit, object space, or None for smooth angle-weighted vertex normals.
+        Unit, object space, or None: each vertex has one normal.
     uvs : (m, 3, 2) float32 array, optional
         One per face corner, or None without textures.
     layers : list of Layer
@@ -248,6 +248,8 @@ class MeshState:
         To which belongs what it emits; "": none.
     terminator_offset : float
         Blender's Shadow Terminator Geometry Offset, in [0, 1]; 0: off.
+    vertex_normals : (n, 3) float32 array, optional
+        Unit, object space, without `corner_normals`; None: made of the faces, weighted by angle.
     """
 
     name: str
@@ -266,6 +268,7 @@ class MeshState:
     blockers: int = -1
     light_group: str = ""
     terminator_offset: float = 0.0
+    vertex_normals: Array | None = None
 
 
 @dataclass(slots=True)

@@ -52,6 +52,9 @@ def test_arrays_can_be_kept_by_the_client(scene, export):
         (state,) = export()[0].meshes
         for name in ("vertices", "faces", "matrices", "pass_indices", "corner_normals", "uvs"):
             assert frozen(getattr(state, name)), name
+        obj.data.shade_smooth()
+        (state,) = export()[0].meshes
+        assert state.vertex_normals is None or frozen(state.vertex_normals)
         bpy.data.objects.remove(obj)
 
 
@@ -221,7 +224,8 @@ def test_smooth_quads_keep_blenders_normals(scene, export):
     (state,) = export()[0].meshes
     obj.data.calc_loop_triangles()
     expected = [[obj.data.vertices[v].normal[:] for v in t.vertices] for t in obj.data.loop_triangles]
-    np.testing.assert_allclose(state.corner_normals, expected, atol=1e-6)
+    assert state.corner_normals is None
+    np.testing.assert_allclose(state.vertex_normals[state.faces], expected, atol=1e-6)
 
 
 def test_smooth_and_sharp_corners_follow_their_triangles(scene, export):

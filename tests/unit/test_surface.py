@@ -79,6 +79,31 @@ def matrix(shift: tuple, scale: tuple = (1, 1, 1), turn: int = -1) -> np.ndarray
     return out
 
 
+def test_normals_of_vertices_are_those_of_their_corners():
+    """Bit for bit, also turned and stretched, in one place and in two; unusable ones point up."""
+    rng = np.random.default_rng(3)
+    vertices, faces = rng.normal(size=(6, 3)).astype(F), np.array([[0, 1, 2], [2, 3, 0], [3, 4, 5]], np.int32)
+    faces[2, 2] = 3  # without area
+    normals = rng.normal(size=(6, 3)).astype(F)
+    stands = matrix((1, 2, 3), (1, 2, 0.5), turn=1), matrix((0, 0, 1), turn=2)
+    for where in (stands[:1], stands):
+        scenes = TraceScene(), TraceScene()
+        given = {"vertex_normals": normals}, {"corner_normals": normals[faces]}
+        for scene, arrays in zip(scenes, given):
+            scene.update([], [mesh_state(vertices, faces, *where, **arrays)])
+        rows = [scene.normals[scene.shading_faces] for scene in scenes]
+        np.testing.assert_array_equal(rows[0].view(np.uint32), rows[1].view(np.uint32))
+        assert scenes[0].faults[0].empty_faces == scenes[1].faults[0].empty_faces == 1
+        bad = normals.copy()
+        bad[1], bad[4] = np.nan, 0.0
+        scenes[0].update([], [mesh_state(vertices, faces, *where, vertex_normals=bad)])
+        again = scenes[0].normals[scenes[0].shading_faces]
+        assert np.isfinite(again).all() and not np.array_equal(again, rows[0])
+        np.testing.assert_array_equal(again[1, :2].view(np.uint32), rows[0][1, :2].view(np.uint32))
+    with pytest.raises(AssetError, match="vertex normals of mesh"):
+        scenes[0].update([], [mesh_state(vertices, faces, vertex_normals=normals[:4])])
+
+
 MATRICES = (
     matrix((0, 0, 0), turn=0),
     matrix((3, 0, 1), (0.3, 0.7, 0.5), 1),

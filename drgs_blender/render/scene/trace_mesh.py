@@ -10,21 +10,30 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...compute.jit import njit, plain
+from ...compute.jit import plain
 from ...compute.threads import ELEMENTS, over_range
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
 from ...core.frame import MeshState, Visibility
 from ...geometry.normals import VertexNormals
-from ..surfel_columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS
+from ..surfel_columns import NORMAL
 from .instances import Instances, flattens, normal_matrices
 from .object_mesh import ObjectMesh
 from .ray_masks import group_mask
+from .trace_kernels import (
+    FARTHEST,
+    copy_materials,
+    copy_vertices,
+    corner_normals,
+    count_empty,
+    move_vertices,
+    turn_normals,
+    unit_normals,
+)
 
 Array = np.ndarray
 
-#: Coordinates beyond this (metres) are as unusable as NaN: their products overflow.
-FARTHEST = 1e15
+_NORMALS = ("corner_normals", "vertex_normals")
 
 
 @dataclass(slots=True)
@@ -166,9 +175,9 @@ class Part:
 
     def count_empty(self, vertices: Array) -> int:
         """Living faces without area."""
-        a, b, c = np.moveaxis(vertices[self.faces], 1, 0)
-        empty = ~((np.cross(b - a, c - a) ** 2).sum(axis=1) > 0)
-        return int((empty if self.dead is None else empty & ~self.dead).sum())
+        faces = self.traced_faces
+        empty = over_range(count_empty, len(faces), plain(vertices), plain(faces), fewest=ELEMENTS)
+        return sum(empty) - (0 if self.dead is None else int(self.dead.sum()))
 
     def smooth_normals(self, vertices: Array, out: Array) -> None:
         """Normals of `vertices` from the living faces, into (n, 3) `out`."""
@@ -177,11 +186,17 @@ class Part:
         empty = self.smoother.into(vertices, self.traced_faces, out)
         self.empty_faces = empty - (0 if self.dead is None else int(self.dead.sum()))
 
+    def vertex_normals(self, normals: Array, vertices: Array, out: Array) -> None:
+        """Unit normals from those given, one per vertex, into (n, 3) `out`; (0, 0, 1) where they are unusable."""
+        given = as_float(normals, out.shape, f"vertex normals of {self.name}")
+        over_range(unit_normals, len(out), plain(given), out, fewest=ELEMENTS)
+        self.empty_faces = self.count_empty(vertices)
+
     def given_normals(self, normals: Array, vertices: Array, out: Array) -> None:
         """Unit normals from those given, one a corner, into (3 m, 3) `out`; a face's own where they are unusable."""
         given = as_float(normals, (len(self.faces), 3, 3), f"corner normals of {self.name}")
         faces = self.traced_faces
-        empty = over_range(_given_normals, len(faces), plain(given), vertices, faces, out, fewest=ELEMENTS)
+        empty = over_range(corner_normals, len(faces), plain(given), vertices, faces, out, fewest=ELEMENTS)
         self.empty_faces = sum(empty) - (0 if self.dead is None else int(self.dead.sum()))
 
 
@@ -222,7 +237,7 @@ def take_object(part: Part, item: TraceObject, vertices: Array, shading: Array) 
         roughness = as_float(item.roughness, (n,), f"roughness of {item.name}")
         metallic = as_float(item.metallic, (n,), f"metallic of {item.name}")
         values = plain(albedo), plain(roughness), plain(metallic)
-        over_range(_materials, len(of_rows), of_rows, *values, rows, fewest=ELEMENTS)
+        over_range(copy_materials, len(of_rows), of_rows, *values, rows, fewest=ELEMENTS)
     part.item = item
     return moved, died
 
@@ -237,17 +252,20 @@ def take_mesh(part: Part, item: MeshState, instances: Instances, vertices: Array
     other_shape = before is None or before.vertices is not item.vertices
     if other_shape or not part.instanced:
         moved, died = part.take_vertices(given, matrix, own)
-    if other_shape or died or before is None or before.corner_normals is not item.corner_normals:
+    same = before is not None and all(getattr(before, name) is getattr(item, name) for name in _NORMALS)
+    if other_shape or died or not same:
         if part.own_normals is None:
             part.own_normals = rows if part.instanced else np.empty_like(rows)
         # In object space, as Blender makes them: a stretched shape has the normals of the shape, stretched.
-        if item.corner_normals is None:
-            part.smooth_normals(given, part.own_normals)
-        else:
+        if item.corner_normals is not None:
             part.given_normals(item.corner_normals, given, part.own_normals)
+        elif item.vertex_normals is not None:
+            part.vertex_normals(item.vertex_normals, given, part.own_normals)
+        else:
+            part.smooth_normals(given, part.own_normals)
     if matrix is not None:
         turn = normal_matrices(instances.matrices[:1])[0]
-        over_range(_turn_normals, len(rows), part.own_normals, turn, rows, fewest=ELEMENTS)
+        over_range(turn_normals, len(rows), part.own_normals, turn, rows, fewest=ELEMENTS)
         part.flat_faces = part.count_empty(own) if flattens(matrix) else 0
     part.item = item
     return moved, died
@@ -271,111 +289,7 @@ def place_vertices(vertices: Array | None, matrix: Array | None, target: Array) 
 
 def _put_vertices(source: Array, matrix: Array | None, target: Array) -> tuple[int, int, float]:
     """Usable vertices, moved by a matrix; how many are not, how many changed, the largest coordinate."""
-    kernel, arguments = (_copy_vertices, ()) if matrix is None else (_move_vertices, (matrix,))
+    kernel, arguments = (copy_vertices, ()) if matrix is None else (move_vertices, (matrix,))
     found = over_range(kernel, len(source), source, *arguments, target, fewest=ELEMENTS)
     bad, moved, reach = zip(*found, strict=True) if found else ((), (), ())
     return sum(bad), sum(moved), max(reach, default=0.0)
-
-
-@njit
-def _put(x, y, z, target, i):  # type: ignore[no-untyped-def]
-    """Put a vertex, or the origin for an unusable one, to row i: 1 if unusable, 1 if changed, largest coordinate."""
-    zero = np.float32(0.0)
-    size = max(abs(x), max(abs(y), abs(z)))
-    # A NaN may hide in the maximum, yet not in the sum.
-    usable = size < FARTHEST and abs(x + y + z) < 4 * FARTHEST
-    if not usable:
-        x, y, z, size = zero, zero, zero, zero
-    changed = x != target[i, 0] or y != target[i, 1] or z != target[i, 2]
-    if changed:
-        target[i, 0], target[i, 1], target[i, 2] = x, y, z
-    return int(not usable), int(changed), size
-
-
-@njit
-def _copy_vertices(first, last, source, target):  # type: ignore[no-untyped-def]
-    """Copy usable vertices, put the others at the origin: how many those are, how many moved, largest coordinate."""
-    bad = moved = 0
-    reach = np.float32(0.0)
-    for i in range(first, last):
-        unusable, changed, size = _put(source[i, 0], source[i, 1], source[i, 2], target, i)
-        bad, moved, reach = bad + unusable, moved + changed, max(reach, size)
-    return bad, moved, reach
-
-
-@njit
-def _move_vertices(first, last, source, matrix, target):  # type: ignore[no-untyped-def]
-    """As `_copy_vertices`, moved by a (3, 4) float64 matrix."""
-    bad = moved = 0
-    reach = np.float32(0.0)
-    m00, m01, m02, m03 = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]
-    m10, m11, m12, m13 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
-    m20, m21, m22, m23 = matrix[2, 0], matrix[2, 1], matrix[2, 2], matrix[2, 3]
-    for i in range(first, last):
-        a, b, c = source[i, 0], source[i, 1], source[i, 2]
-        x = np.float32(m00 * a + m01 * b + m02 * c + m03)
-        y = np.float32(m10 * a + m11 * b + m12 * c + m13)
-        z = np.float32(m20 * a + m21 * b + m22 * c + m23)
-        unusable, changed, size = _put(x, y, z, target, i)
-        bad, moved, reach = bad + unusable, moved + changed, max(reach, size)
-    return bad, moved, reach
-
-
-@njit
-def _given_normals(first, last, normals, vertices, faces, out):  # type: ignore[no-untyped-def]
-    """Fill (3 m, 3) `out` with the (m, 3, 3) normals made unit; count the faces without area."""
-    empty = 0
-    for f in range(first, last):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
-        vx, vy, vz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
-        gx, gy, gz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        area = np.sqrt(gx * gx + gy * gy + gz * gz)
-        if area > np.float32(0.0):
-            gx, gy, gz = gx / area, gy / area, gz / area
-        else:
-            empty += 1
-            gx, gy, gz = np.float32(0.0), np.float32(0.0), np.float32(1.0)
-        for k in range(3):
-            x, y, z = normals[f, k, 0], normals[f, k, 1], normals[f, k, 2]
-            length = np.sqrt(x * x + y * y + z * z)
-            if length > 1e-12 and length < FARTHEST:
-                scale = np.float32(1.0) / length
-                x, y, z = x * scale, y * scale, z * scale
-            else:
-                x, y, z = gx, gy, gz
-            out[3 * f + k, 0], out[3 * f + k, 1], out[3 * f + k, 2] = x, y, z
-    return empty
-
-
-@njit
-def _turn_normals(first, last, normals, matrix, out):  # type: ignore[no-untyped-def]
-    """Unit normals through a (3, 3) matrix of normals; (0, 0, 1) where they have no direction."""
-    for i in range(first, last):
-        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
-        a = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z
-        b = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z
-        c = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z
-        length = np.sqrt(a * a + b * b + c * c)
-        if length > np.float32(1e-15):
-            scale = np.float32(1.0) / length
-            a, b, c = a * scale, b * scale, c * scale
-        else:
-            a, b, c = np.float32(0.0), np.float32(0.0), np.float32(1.0)
-        out[i, 0], out[i, 1], out[i, 2] = a, b, c
-
-
-@njit
-def _materials(first, last, vertex, albedo, roughness, metallic, rows):  # type: ignore[no-untyped-def]
-    """Copy the material of vertex[i] to shading row i, within [0, 1]; NaN becomes 0."""
-    for i in range(first, last):
-        v = vertex[i]
-        for k in range(3):
-            rows[i, ALBEDO + k] = min(np.float32(1.0), max(np.float32(0.0), albedo[v, k]))
-            if not rows[i, ALBEDO + k] >= 0.0:
-                rows[i, ALBEDO + k] = 0.0
-        rows[i, ROUGHNESS] = min(np.float32(1.0), max(np.float32(0.0), roughness[v]))
-        rows[i, METALLIC] = min(np.float32(1.0), max(np.float32(0.0), metallic[v]))
-        for k in (ROUGHNESS, METALLIC):
-            if not rows[i, k] >= 0.0:
-                rows[i, k] = 0.0
