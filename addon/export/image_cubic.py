@@ -28,7 +28,7 @@ def finer(picture: Image, extension: str) -> Image | None:
     factor = next((f for f in _FINER if f * f * area <= BUDGET), 0)
     if factor == 0:
         return None
-    pixels = picture.pixels.astype(np.float32)
+    pixels = picture.rgba.astype(np.float32)
     for axis in (0, 1):
         pixels = _axis(pixels, axis, factor, border, _BEYOND[extension])
     made = np.rint(pixels).astype(np.uint8) if picture.pixels.dtype == np.uint8 else pixels

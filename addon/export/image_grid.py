@@ -55,7 +55,7 @@ def grid(pictures: Mapping[int, Image], extension: str, closest: bool) -> tuple[
     inner[:] = magenta.astype(kind)
     for number, picture in pictures.items():
         row, column = rows - 1 - ((number - 1001) // 10 - first_row), (number - 1001) % 10 - first_column
-        pixels = picture.pixels if all_bytes else _floats(picture)
+        pixels = picture.rgba if all_bytes else _floats(picture)
         y, x = row * size[0], column * size[1]
         inner[y : y + size[0], x : x + size[1]] = resized(pixels, size, closest)
     edge = np.pad(inner, ((1, 1), (1, 1), (0, 0)), "edge" if extension != "CLIP" else "constant")
@@ -108,7 +108,7 @@ def _floats(picture: Image) -> Array:
     """(h, w, 4) float32 linear."""
     if picture.pixels.dtype != np.uint8:
         return picture.pixels
-    values = picture.pixels.astype(np.float32) / 255
+    values = picture.rgba.astype(np.float32) / 255
     if picture.encoding == "srgb":
         values[..., :3] = srgb_to_linear(values[..., :3])
     return values

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import bpy
 import numpy as np
 
@@ -59,7 +61,7 @@ def associated(image: bpy.types.Image) -> Image | None:
     pixels = _rgba(image)
     if pixels is None:
         return None
-    if not image.is_float and _has_alpha(image):
+    if pixels.shape[2] == 4 and not image.is_float and _has_alpha(image):
         for first in range(0, len(pixels), _STRIP):
             part = pixels[first : first + _STRIP]
             if (part[..., 3] != 255).any():
@@ -74,20 +76,36 @@ def _has_alpha(image: bpy.types.Image) -> bool:
 
 
 def _rgba(image: bpy.types.Image) -> Array | None:
-    """(h, w, 4) uint8 or float32, as Blender has them."""
+    """(h, w, 4) uint8 or float32, as Blender has them; bytes without the channels that say nothing, see `Image`."""
     pixels = _read(image)
     if pixels is None:
         return None
     count = pixels.shape[2]
-    rgba = shareable((*pixels.shape[:2], 4), np.float32 if image.is_float else np.uint8)
-    for first in range(0, len(rgba), _STRIP):
-        part, into = pixels[first : first + _STRIP], rgba[first : first + _STRIP]
+    opaque = count < 4 or image.alpha_mode == "NONE"
+    channels = 4 if image.is_float else _told(pixels, opaque)
+    found = shareable((*pixels.shape[:2], channels), np.float32 if image.is_float else np.uint8)
+    for first in range(0, len(found), _STRIP):
+        part, into = pixels[first : first + _STRIP], found[first : first + _STRIP]
         if not image.is_float:
             part = np.rint(part * 255)
-        into[..., : max(count, 3)] = part if count >= 3 else part[..., :1]
-        if count < 4 or image.alpha_mode == "NONE":
-            into[..., 3] = 1 if image.is_float else 255
-    return rgba
+        into[..., :3] = part[..., : min(channels, 3 if count >= 3 else 1)]
+        if channels == 4:
+            into[..., 3] = (1 if image.is_float else 255) if opaque else part[..., 3]
+    return found
+
+
+def _told(pixels: Array, opaque: bool) -> int:
+    """How many channels of bytes say something: 4; 3 where all is opaque; 1 where it is grey, too."""
+    if not opaque and any((part[..., 3] != 1).any() for part in _strips(pixels)):
+        return 4
+    if pixels.shape[2] < 3:
+        return 1
+    grey = all((p[..., 0] == p[..., 1]).all() and (p[..., 0] == p[..., 2]).all() for p in _strips(pixels))
+    return 1 if grey else 3
+
+
+def _strips(pixels: Array) -> Iterator[Array]:
+    return (pixels[first : first + _STRIP] for first in range(0, len(pixels), _STRIP))
 
 
 def _picture(image: bpy.types.Image, pixels: Array) -> Image:

@@ -206,7 +206,7 @@ def mean_colour(picture: Image) -> Array:
 def _some(picture: Image) -> Array:
     """(n, 4) of its pixels, spread evenly."""
     steps = [max(1, n // 256) for n in picture.pixels.shape[:2]]
-    return picture.pixels[:: steps[0], :: steps[1]].reshape(-1, 4)
+    return replace(picture, pixels=picture.pixels[:: steps[0], :: steps[1]]).rgba.reshape(-1, 4)
 
 
 def export_curved(
@@ -233,9 +233,10 @@ def export_curved(
     table = np.rint(255 * (values if number else linear_to_srgb(values))).astype(np.uint8)
 
     def make(_: bpy.types.Image) -> Image:
-        pixels = plain.pixels.copy()
+        given = plain.rgba
+        pixels = given.copy()
         for i in range(3):
-            pixels[..., i] = table[:, i][plain.pixels[..., i if source == "rgb" else "rgba".index(source)]]
+            pixels[..., i] = table[:, i][given[..., i if source == "rgb" else "rgba".index(source)]]
         pixels.flags.writeable = False
         mark = hashlib.blake2b(source.encode() + b"data" * data + curve, digest_size=6).hexdigest()
         return Image(f"{plain.name} ({mark})", pixels, "linear" if number else "srgb")

@@ -19,8 +19,8 @@ class Image:
 
     Attributes
     ----------
-    pixels : (h, w, 4) uint8 or float32 array
-        Row 0 at the top; alpha is straight and last.
+    pixels : (h, w, 4) uint8 or float32 array, or (h, w, 3) or (h, w, 1) uint8 array
+        Row 0 at the top; alpha is straight and last. One channel is a grey.
     encoding : {"linear", "srgb"}
         "srgb" is decoded by the engine (colour channels only), "linear" is linear Rec.709 or no colour at all.
     """
@@ -28,6 +28,15 @@ class Image:
     name: str
     pixels: Array
     encoding: Literal["linear", "srgb"] = "linear"
+
+    @property
+    def rgba(self) -> Array:
+        """(h, w, 4): its pixels with all channels."""
+        if self.pixels.shape[2] == 4:
+            return self.pixels
+        whole = np.full((*self.pixels.shape[:2], 4), 255, np.uint8)
+        whole[..., :3] = self.pixels
+        return whole
 
 
 @dataclass(slots=True)

@@ -43,6 +43,7 @@ def _load(scalar: Any, kind: Any) -> Any:
 
 load_float = _load(types.float32, ir.FloatType())
 load_double = _load(types.float64, ir.DoubleType())
+load_uint8 = _load(types.uint8, ir.IntType(8))
 load_int32 = _load(types.int32, ir.IntType(32))
 load_uint32 = _load(types.uint32, ir.IntType(32))
 load_int64 = _load(types.int64, ir.IntType(64))

@@ -245,6 +245,27 @@ def test_a_movie_that_cannot_be_read_is_named(scene, export, tmp_path):
     assert frame.meshes[0].materials[0].emission == (1, 0, 1)
 
 
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("alpha_mode", ["STRAIGHT", "NONE"])
+def test_channels_that_say_nothing_are_not_sent(scene, export, channels, alpha_mode):
+    """Of grey and of opaque bytes, and of those whose alpha is ignored; what is sent stands for the same pixels."""
+    rng = np.random.default_rng(channels)
+    given = np.ones((300, 8, 4), np.float32)
+    given[..., :channels] = rng.integers(0, 256, (300, 8, channels)) / 255
+    if channels == 1:
+        given[..., :3] = given[..., :1]
+    image = bpy.data.images.new("Picture", 8, 300, alpha=True)
+    image.alpha_mode = alpha_mode
+    image.colorspace_settings.name = "Non-Color"
+    image.pixels.foreach_set(given.ravel())
+    shown(image)
+    (sent,) = export()[0].images
+    if alpha_mode == "NONE":
+        given[..., 3] = 1
+    assert sent.pixels.shape[2] == (3 if channels == 4 and alpha_mode == "NONE" else channels)
+    np.testing.assert_array_equal(sent.rgba[::-1], np.rint(255 * given))
+
+
 def test_reading_a_file_leaves_nothing_of_it_in_blender(scene, export, tmp_path):
     """What an export reads of a file is given back, and known without being read again; painted pixels stay."""
     path = save(tmp_path / "a.png", 512, 600)
@@ -257,7 +278,7 @@ def test_reading_a_file_leaves_nothing_of_it_in_blender(scene, export, tmp_path)
     assert not image.has_data and again.pixels is first.pixels
     reopened = bpy.data.images.load(str(path))
     pixels = np.array(reopened.pixels[:], np.float32).reshape(512, 600, 4)[::-1]
-    np.testing.assert_array_equal(first.pixels, np.rint(255 * pixels))
+    np.testing.assert_array_equal(first.rgba, np.rint(255 * pixels))
     painted = image.pixels[0] + 0.25 if image.pixels[0] < 0.5 else image.pixels[0] - 0.25
     image.pixels[0] = painted
     assert export()[0].images[0].pixels[-1, 0, 0] == round(255 * image.pixels[0]) and image.has_data

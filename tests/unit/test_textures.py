@@ -69,6 +69,24 @@ def test_lookup_is_the_plain_model(pixels, extension):
         np.testing.assert_allclose(at(texture, [image], uv)[:, 5:], expected, atol=2e-5)
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("encoding", ["linear", "srgb"])
+def test_channels_that_say_nothing_may_be_missing(channels, encoding):
+    """Grey and opaque bytes, the last texel of a page included: bit for bit as with all four channels."""
+    pixels = RNG.integers(0, 256, (64, 64, channels), dtype=np.uint8)
+    fewer = Image("i", pixels, encoding)
+    whole = Image("i", fewer.rgba, encoding)
+    assert whole.pixels.shape == (64, 64, 4)
+    uv = np.concatenate([RNG.uniform(-1.2, 2.1, (400, 2)), [[1 - 1e-4, 1e-4], [1e-4, 1 - 1e-4]]]).astype(np.float32)
+    for interpolation, extension, channel in itertools.product(INTERPOLATIONS, EXTENSIONS, ("rgb", "a", "luminance")):
+        texture = Texture("i", channel, interpolation=interpolation, extension=extension)
+        np.testing.assert_array_equal(at(texture, [fewer], uv), at(texture, [whole], uv))
+    tables = [
+        MaterialTable([Material("m", emission=(1, 1, 1), emission_texture=Texture("i"))], [i]) for i in (fewer, whole)
+    ]
+    np.testing.assert_allclose(tables[0].mean_emission(0), tables[1].mean_emission(0), rtol=1e-12)
+
+
 def test_v_is_upwards_and_texel_centres_are_exact():
     h, w = BYTES.shape[:2]
     column, row = np.meshgrid(np.arange(w), np.arange(h))

@@ -108,6 +108,7 @@ _HIT = Record(Hit, ("float32", "int32", "int32", "float32", "float32", "float32"
 NATIVES: dict[Any, Any] = {
     memory.load_float: _load("load_float", "float32", "float"),
     memory.load_double: _load("load_double", "float64", "double"),
+    memory.load_uint8: _load("load_uint8", "uint8", "unsigned char"),
     memory.load_int32: _load("load_int32", "int32", "int"),
     memory.load_uint32: _load("load_uint32", "uint32", "unsigned int"),
     memory.load_int64: _load("load_int64", "int64", "long long"),

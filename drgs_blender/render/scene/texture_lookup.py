@@ -15,11 +15,12 @@ from __future__ import annotations
 import numpy as np
 
 from ...compute.jit import inlined, njit
-from ..memory import load_float, load_int32, load_int64, load_uint32
+from ..memory import load_float, load_int32, load_int64, load_uint8, load_uint32
 from ..sampling import HALF, ONE, TWO, ZERO, F, luminance
 
-#: Kinds of images.
+#: What the lowest two bits of an image's kind say; those above say how many channels fewer than four it has.
 BYTE, BYTE_SRGB, FLOAT = range(3)
+CODE, FEWER = 3, 2
 CHANNELS = {"r": 0, "g": 1, "b": 2, "a": 3, "luminance": 4, "rgb": 5}
 _A, _LUMINANCE, _RGB = 3, 4, 5
 INTERPOLATIONS = {"closest": 0, "linear": 1}
@@ -55,6 +56,17 @@ def texel(address, kind, index, weight, red, green, blue, alpha):  # type: ignor
             green + weight * load_float(address, index + 1),
             blue + weight * load_float(address, index + 2),
             alpha + weight * load_float(address, index + 3),
+        )
+    fewer = kind >> FEWER
+    if fewer > 0:
+        index *= 4 - fewer
+        second = index + 1 if fewer == 1 else index
+        third = index + 2 if fewer == 1 else index
+        return (
+            red + weight * F(load_uint8(address, index)),
+            green + weight * F(load_uint8(address, second)),
+            blue + weight * F(load_uint8(address, third)),
+            alpha + weight * F(255.0),
         )
     word = np.int64(load_uint32(address, index))
     return (
@@ -199,9 +211,9 @@ def _lookup(row, place, addresses):  # type: ignore[no-untyped-def]
         red, green, blue, alpha = texel(address, kind, low + right, b * c, red, green, blue, alpha)
         red, green, blue, alpha = texel(address, kind, high + left, a * d, red, green, blue, alpha)
         red, green, blue, alpha = texel(address, kind, high + right, b * d, red, green, blue, alpha)
-    if kind == BYTE_SRGB:
+    if kind & CODE == BYTE_SRGB:
         return _decoded(red, decode), _decoded(green, decode), _decoded(blue, decode), alpha * BYTE_SCALE
-    if kind == BYTE:
+    if kind & CODE == BYTE:
         return red * BYTE_SCALE, green * BYTE_SCALE, blue * BYTE_SCALE, alpha * BYTE_SCALE
     return red, green, blue, alpha
 

@@ -7,7 +7,7 @@ import numpy as np
 from ...compute.jit import njit
 from ..memory import load_float, load_int32, load_int64
 from ..sampling import HALF, ONE, TWO, ZERO, F
-from .texture_lookup import BYTE, BYTE_SCALE, BYTE_SRGB, INFINITE, MIRROR, axis, layer_at, one_channel, texel
+from .texture_lookup import BYTE, BYTE_SCALE, BYTE_SRGB, CODE, INFINITE, MIRROR, axis, layer_at, one_channel, texel
 
 
 @njit
@@ -92,12 +92,12 @@ def _gradient(s, t, channel, extension, i, images, decode):  # type: ignore[no-u
     x0, x1, x2, x3 = texel(address, kind, high + left, ONE, *none)
     y0, y1, y2, y3 = texel(address, kind, high + right, ONE, *none)
     m0 = m1 = m2 = m3 = ONE
-    if kind == BYTE_SRGB:
+    if kind & CODE == BYTE_SRGB:
         m0 = _decoded_slope(c * (a * p0 + b * q0) + d * (a * x0 + b * y0), decode)
         m1 = _decoded_slope(c * (a * p1 + b * q1) + d * (a * x1 + b * y1), decode)
         m2 = _decoded_slope(c * (a * p2 + b * q2) + d * (a * x2 + b * y2), decode)
         m3 = BYTE_SCALE
-    elif kind == BYTE:
+    elif kind & CODE == BYTE:
         m0 = m1 = m2 = m3 = BYTE_SCALE
     along_s = one_channel(
         channel, m0 * (c * (q0 - p0) + d * (y0 - x0)), m1 * (c * (q1 - p1) + d * (y1 - x1)),

@@ -48,6 +48,7 @@ from .texture_lookup import (
     BYTE_SRGB,
     CHANNELS,
     EXTENSIONS,
+    FEWER,
     FLOAT,
     INTERPOLATIONS,
     WHITEST,
@@ -82,18 +83,20 @@ class _Texels:
     def mean(self) -> Array:
         """(4,) float64 linear mean, of about a million texels at most."""
         step = max(1, math.isqrt(self.texels.shape[0] * self.texels.shape[1] >> 20))
-        some = self.texels[::step, ::step].reshape(-1, 4)
+        count = self.texels.shape[2]
+        some = self.texels[::step, ::step].reshape(-1, count)
         if self.kind == FLOAT:
             return np.maximum(some, 0.0).mean(axis=0, dtype=np.float64)
         levels = np.arange(256) / 255.0
         decoded = srgb_to_linear(levels) if self.kind == BYTE_SRGB else levels
-        shares = [np.bincount(some[:, k], minlength=256) / len(some) for k in range(4)]
-        return np.array([*(share @ decoded for share in shares[:3]), shares[3] @ levels])
+        shares = [np.bincount(some[:, k], minlength=256) / len(some) for k in range(count)]
+        colour = [share @ decoded for share in shares[:3]]
+        return np.array([*(colour if count >= 3 else 3 * colour), shares[3] @ levels if count == 4 else 1.0])
 
     def row(self, address_of: AddressOf = address) -> tuple[int, int, int, int]:
         """Address, width, height, kind."""
-        height, width = self.texels.shape[:2]
-        return address_of(self.texels), width, height, self.kind
+        height, width, channels = self.texels.shape
+        return address_of(self.texels), width, height, self.kind + (4 - channels << FEWER)
 
 
 class MaterialTable:
@@ -353,7 +356,8 @@ def _read(image: Image) -> _Texels:
     srgb = image.encoding == "srgb"
     pixels = np.asarray(given)
     problem = ""
-    if pixels.ndim != 3 or pixels.shape[2] != 4 or pixels.dtype.kind not in "uf":
+    known = (1, 3, 4) if pixels.dtype == np.uint8 else (4,)
+    if pixels.ndim != 3 or pixels.shape[2] not in known or pixels.dtype.kind not in "uf":
         problem = f"{subject}: shape {pixels.shape} of {pixels.dtype} is not an RGBA picture, taken as missing"
     elif pixels.size == 0:
         problem = f"{subject}: has no pixels, taken as missing"
