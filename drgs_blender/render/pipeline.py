@@ -25,6 +25,7 @@ from .film.cryptomatte import CryptoFilm
 from .film.film import Film
 from .film.light_group_film import LightGroupFilm
 from .film.light_passes import LIGHT_PASSES
+from .film.lobe_colours import put_lobe_colours
 from .film.motion_vectors import MotionFilm, SceneState, vector_pass
 from .film.surface_film import SurfaceFilm
 from .gbuffer.gbuffer import GBuffer
@@ -112,7 +113,8 @@ def render(
         for kind, name in KINDS.items()
         if any(wanted.startswith(name) for wanted in frame.passes)
     ]
-    surfaces, groups = SurfaceFilm(scene, frame, parameters), LightGroupFilm(scene, lights, frame, parameters)
+    surfaces = SurfaceFilm(scene, frame, parameters, put_lobe_colours)
+    groups = LightGroupFilm(scene, lights, frame, parameters)
     if settings.denoise != "svgf":
         history = None
     left, top, right, bottom = camera.window

@@ -23,6 +23,7 @@ from .backend import CPU, RenderBackend
 from .camera import camera_parameters
 from .film.film import Film
 from .film.light_group_film import LightGroupFilm
+from .film.lobe_colours import put_lobe_colours
 from .film.surface_film import SurfaceFilm
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.visible_lights import visible_lights
@@ -259,7 +260,7 @@ class Progressive:
     def _develop(self, prepared: PreparedScene, check: Callable[[], None]) -> dict[str, Array]:
         camera, lights = self.frame.camera, prepared.lights
         film = Film(camera, self.frame.settings, self._parameters)
-        surfaces = SurfaceFilm(prepared.scene, self.frame, self._parameters)
+        surfaces = SurfaceFilm(prepared.scene, self.frame, self._parameters, put_lobe_colours)
         groups = LightGroupFilm(prepared.scene, lights, self.frame, self._parameters)
         for strip in self._strips:
             buffer = self._samples(strip)
