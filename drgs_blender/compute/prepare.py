@@ -203,7 +203,7 @@ def _print_help(text: str) -> int:
     try:
         print(text, end="", flush=True)
     except OSError as error:
-        sys.stdout = None  # type: ignore[assignment]
+        sys.stdout = None
         print(f"prepare: standard output cannot be written: {error.strerror}", file=sys.stderr)
         return EXIT_CANNOT_WRITE
     return 0
