@@ -157,7 +157,7 @@ NONLINEAR = {
 LINEAR = {
     "glossy of GGX": ("BsdfAnisotropic", {"distribution": "GGX"}, {"Color": (TINT, A)}),
     "diffuse": ("BsdfDiffuse", {}, {"Color": (TINT, A)}),
-    "metallic": ("BsdfPrincipled", {"distribution": "GGX"}, {"Metallic": (1.0, 0.25)}),
+    "metallic": ("BsdfPrincipled", {"distribution": "GGX"}, {"Metallic": (0.75, 0.25)}),
     "coat": ("BsdfPrincipled", {}, {"Coat Weight": (1.0, 0.5)}),
     "dielectric": ("BsdfPrincipled", {}, {"Base Color": (TINT, A)}),
 }
