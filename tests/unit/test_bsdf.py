@@ -8,7 +8,7 @@ import pytest
 from drgs_blender.compute.jit import njit
 from drgs_blender.core.materials import Material, Part, Texture
 from drgs_blender.render.integrator.bsdf.albedo_tables import albedo_tables
-from drgs_blender.render.integrator.bsdf.lobes import DELTA, LOBE, MOST_LOBES, evaluate, sample, share_out
+from drgs_blender.render.integrator.bsdf.lobes import DELTA, LOBE, MOST_LOBES, evaluate, normalise_probabilities, sample
 from drgs_blender.render.integrator.bsdf.microfacet import fresnel
 from drgs_blender.render.integrator.bsdf.principled import add_material
 from drgs_blender.render.scene.material_rows import KINDS, material_rows
@@ -23,7 +23,7 @@ def _lobes(values, kind, flags, view, side, tables, b):  # type: ignore[no-untyp
     for part in range(len(values)):
         p, along = values[part].copy(), (F(1.0), F(0.0), F(0.0))
         count = add_material(b, count, p, kind, flags, (up, up, up), along, view, side, tables)
-    share_out(b, count)
+    normalise_probabilities(b, count)
     return count
 
 

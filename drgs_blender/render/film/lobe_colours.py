@@ -8,25 +8,26 @@ import numpy as np
 
 from ...compute.jit import njit
 from ...compute.threads import ELEMENTS, over_range
-from ..integrator.bsdf.albedo_tables import albedo_tables, read_3d
+from ..integrator.bsdf.albedo_tables import albedo_tables, read_2d, read_3d
 from ..integrator.bsdf.lobes import (
     AX,
     AY,
     ETA,
     F0,
+    GLASS,
     KIND,
     LOBE,
     METAL,
-    MIRROR,
     MOST_LOBES,
     NORMAL,
     REFRACTION,
+    THIN_DIELECTRIC,
     WEIGHT,
     reflectance,
 )  # fmt: skip
 from ..integrator.bsdf.surface_lobes import put_lobes
 from ..memory import load_int32
-from ..sampling import ONE, ZERO
+from ..sampling import ONE, TWO, ZERO
 from ..scene.interaction import Geometry
 from ..scene.material_rows import MULTISCATTER, PARAMETER_COUNT, MaterialRows
 from ..shading_points import ShadingPoints
@@ -58,19 +59,31 @@ def put_lobe_colours(
 
 @njit
 def _albedo(b, k, view, tables):  # type: ignore[no-untyped-def]
-    """Reflected and transmitted part of a lobe of microfacets."""
+    """Reflected and transmitted part of a lobe of microfacets.
+
+    As in Cycles, reflection is that of all microfacets: along the normal alone a tint of 0 would reflect nothing, and
+    passes that are divided by it would have no limit.
+    """
     nx, ny, nz = b[k + NORMAL], b[k + NORMAL + 1], b[k + NORMAL + 2]
     cosine = max(nx * view[0] + ny * view[1] + nz * view[2], ZERO)
-    kind = b[k + KIND]
-    if kind == MIRROR:
-        z = math.sqrt(abs((b[k + ETA] - ONE) / (b[k + ETA] + ONE)))
-        s = read_3d(tables.real, z, cosine, math.sqrt(math.sqrt(b[k + AX] * b[k + AY])))
-        r, g, c = b[k + F0], b[k + F0 + 1], b[k + F0 + 2]
-        return r + (ONE - r) * s, g + (ONE - g) * s, c + (ONE - c) * s, ZERO, ZERO, ZERO
-    r, g, c, tr, tg, tb = reflectance(b, k, cosine)
+    kind, eta, r, g, c = b[k + KIND], b[k + ETA], b[k + F0], b[k + F0 + 1], b[k + F0 + 2]
     if kind == REFRACTION:
         # Beyond the critical angle some microfacets still let light pass.
         return ZERO, ZERO, ZERO, ONE, ONE, ONE
+    roughness = math.sqrt(math.sqrt(b[k + AX] * b[k + AY]))
+    if kind == METAL:
+        s = read_2d(tables.schlick, cosine, roughness)
+    else:
+        s = read_3d(tables.real, math.sqrt(abs((eta - ONE) / (eta + ONE))), cosine, roughness)
+    r, g, c = r + (ONE - r) * s, g + (ONE - g) * s, c + (ONE - c) * s
+    if kind < GLASS:
+        return r, g, c, ZERO, ZERO, ZERO
+    if kind == THIN_DIELECTRIC:
+        r, g, c = TWO * r / (ONE + r), TWO * g / (ONE + g), TWO * c / (ONE + c)
+    ar, ag, ab, tr, tg, tb = reflectance(b, k, cosine)
+    if eta < ONE:
+        # The table knows no total internal reflection.
+        r, g, c = max(r, ar), max(g, ag), max(c, ab)
     return r, g, c, tr, tg, tb
 
 

@@ -3,8 +3,8 @@
 Each sample of a shading point is a path. At each of its vertices there is one environment and one light sample (next
 event estimation) and one BSDF sample over all lobes, joined by the balance heuristic (`mis`); smooth glass is drawn by
 the BSDF alone. Shadow rays end at glass, as in Cycles: light behind it is found by paths that go through. A path may be
-reflected as often as the settings' bounces say, and pass surfaces `PASSES` times more. Everything else, random numbers,
-Russian roulette, light linking, surfels and surfaces that are partly there, is as in `indirect`.
+reflected as often as the settings' bounces say, and pass surfaces `TRANSMISSION_BOUNCES` times more. Everything else,
+random numbers, Russian roulette, light linking, surfels and surfaces that are partly there, is as in `indirect`.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from .records import Sampler, Scene, Settings
 
 Array = np.ndarray
 
-#: How often a path may pass a surface: Blender's default for transmission bounces.
-PASSES = 12
+#: How often a path may pass a surface: Blender's default.
+TRANSMISSION_BOUNCES = 12
 #: Reflections and passages after which Russian roulette begins.
 _SURE_BOUNCES = 3
 #: Points of a block.
@@ -106,7 +106,7 @@ def _follow(start, numbers, receiver, surfaces, scene, settings, scratch):  # ty
     s, ints = rays
     geometry, envmap, extent = scene.geometry, scene.envmap, scene.traits.extent
     red = green = blue = ONE
-    reflected = went = 0
+    reflected = transmitted = 0
     first = True
     while True:
         normals = (normal, smooth)
@@ -157,10 +157,10 @@ def _follow(start, numbers, receiver, surfaces, scene, settings, scratch):  # ty
         seen = origin, direction, reach, hit, through
         light_along(seen, (pdf, share), receiver, row, diffuse, throughput, first, scratch, scene)
         if through_it:
-            went += 1
+            transmitted += 1
         else:
             reflected += 1
-        if through == ONE or reflected > settings.bounces or went > PASSES:
+        if through == ONE or reflected > settings.bounces or transmitted > TRANSMISSION_BOUNCES:
             return
         k = (ONE - through) / pdf
         if first:
@@ -170,7 +170,7 @@ def _follow(start, numbers, receiver, surfaces, scene, settings, scratch):  # ty
             red *= (value[0] + value[3] + value[6]) * k
             green *= (value[1] + value[4] + value[7]) * k
             blue *= (value[2] + value[5] + value[8]) * k
-            if reflected + went >= _SURE_BOUNCES:
+            if reflected + transmitted >= _SURE_BOUNCES:
                 survive = min(ONE, max(red, max(green, blue)))
                 if not unit(mix(U(key + U(0x165667B1)))) < survive:
                     return

@@ -16,16 +16,20 @@ from ...sampling import INVERSE_PI, ONE, PI, TWO, ZERO, F, cosine_hemisphere
 from ...scene.material_rows import MOST_PARTS
 from .microfacet import fresnel, normal_reflectance, reflection, refraction, visible_normal
 
-#: Columns of a lobe: kind, weight, alphas, eta, normal, tangent, F0, slope of F82, tints of reflection and of
-#: transmission, scale of the value (energy that microfacets would lose), probability, own numbers, if it is a delta.
-KIND, WEIGHT, AX, AY, ETA, NORMAL, TANGENT, F0, SLOPE, REFLECTED, PASSED = 0, 1, 4, 5, 6, 7, 10, 13, 16, 19, 22
-SCALE, PROBABILITY, OWN, DELTA = 25, 26, 27, 32
-LOBE = 33
+#: Columns of a lobe: kind, weight, alphas, eta, normal, tangent, F0, slope of F82, tint of transmission, scale of the
+#: value (energy that microfacets would lose), probability (until `normalise_probabilities` a weight), if it is a delta.
+KIND, WEIGHT, AX, AY, ETA, NORMAL, TANGENT, F0, SLOPE, TRANSMISSION_TINT = 0, 1, 4, 5, 6, 7, 10, 13, 16, 19
+SCALE, PROBABILITY, DELTA, _OWN = 22, 23, 24, 25
+#: Columns of diffuse lobes: A and B of Oren-Nayar, colour of what is scattered more than once.
+OREN_NAYAR_A, OREN_NAYAR_B, SCATTERED_AGAIN = _OWN, _OWN + 1, _OWN + 2
+#: Columns of sheen: the linear transformation of its cosine.
+SHEEN_A, SHEEN_B = _OWN, _OWN + 1
+LOBE = _OWN + 5
 #: Most lobes of a surface: sheen, coat, metal, glass, dielectric and diffuse lobe of each part.
 MOST_LOBES = 6 * MOST_PARTS
-#: Kinds. Of fibres, diffuse light on this and on the other side; of microfacets, mirrors by F82-tint and by the Fresnel
-#: equations, glass, what it only lets pass, and a sheet of it.
-DIFFUSE, TRANSLUCENT, SHEEN, METAL, MIRROR, GLASS, REFRACTION, SHEET = (F(k) for k in range(8))
+#: Kinds: diffuse light on this and on the other side, and that of fibres; of microfacets, reflection by F82-tint and by
+#: the Fresnel equations, glass, its refraction alone, and a thin-walled dielectric.
+DIFFUSE, TRANSLUCENT, SHEEN, METAL, MIRROR, GLASS, REFRACTION, THIN_DIELECTRIC = (F(k) for k in range(8))
 #: GGX's alpha below this is a delta of glass; mirrors have at least this.
 SMOOTH = F(1e-3)
 #: Classes of light, see `shading_points`.
@@ -109,13 +113,12 @@ def reflectance(b, k, cosine):  # type: ignore[no-untyped-def]
     if kind == MIRROR:
         return r, g, c, ZERO, ZERO, ZERO
     tr, tg, tb = ONE - r, ONE - g, ONE - c
-    if kind == SHEET:
+    if kind == THIN_DIELECTRIC:
         # All reflections between the two faces (PBRT 9.5.1).
         r, g, c = TWO * r / (ONE + r), TWO * g / (ONE + g), TWO * c / (ONE + c)
         tr, tg, tb = ONE - r, ONE - g, ONE - c
     return (
-        r * b[k + REFLECTED], g * b[k + REFLECTED + 1], c * b[k + REFLECTED + 2],
-        tr * b[k + PASSED], tg * b[k + PASSED + 1], tb * b[k + PASSED + 2],
+        r, g, c, tr * b[k + TRANSMISSION_TINT], tg * b[k + TRANSMISSION_TINT + 1], tb * b[k + TRANSMISSION_TINT + 2],
     )  # fmt: skip
 
 
@@ -153,16 +156,16 @@ def _diffuse(b, k, vx, vy, vz, lx, ly, lz):  # type: ignore[no-untyped-def]
     if not nl > ZERO:
         return ZERO, ZERO, ZERO, ZERO
     pdf = nl * INVERSE_PI
-    slope = b[k + OWN + 1]
+    slope = b[k + OREN_NAYAR_B]
     if slope == ZERO:
         return pdf, pdf, pdf, pdf
-    base = b[k + OWN]
+    base = b[k + OREN_NAYAR_A]
     nv = max(_dot(b, k + NORMAL, vx, vy, vz), ZERO)
     t = vx * lx + vy * ly + vz * lz - nl * nv
     t = t / (max(nl, nv) + _TINY) if t > ZERO else t
     single = base + slope * t
     rest = ONE - (base * PI + slope * fujii(nl))
-    many = b[k + OWN + 2], b[k + OWN + 3], b[k + OWN + 4]
+    many = b[k + SCATTERED_AGAIN], b[k + SCATTERED_AGAIN + 1], b[k + SCATTERED_AGAIN + 2]
     return nl * (single + many[0] * rest), nl * (single + many[1] * rest), nl * (single + many[2] * rest), pdf
 
 
@@ -172,7 +175,7 @@ def _sheen(b, k, lx, ly, lz):  # type: ignore[no-untyped-def]
     x, y, z = local(b, k, lx, ly, lz)
     if not z > ZERO:
         return ZERO
-    a, c = b[k + OWN], b[k + OWN + 1]
+    a, c = b[k + SHEEN_A], b[k + SHEEN_B]
     u, v = a * x + c * z, a * y
     length2 = u * u + v * v + z * z
     ratio = a / max(length2, _TINY)
@@ -190,13 +193,13 @@ def _microfacets(b, k, i, o):  # type: ignore[no-untyped-def]
             return ZERO, ZERO, ZERO, ZERO, False
         value, pdf, cosine = reflection(i, o, ax, ay)
         r, g, c, tr, tg, tb = reflectance(b, k, cosine)
-        if kind in (GLASS, SHEET):
+        if kind in (GLASS, THIN_DIELECTRIC):
             pdf = pdf * _mirrored_share(r, g, c, tr, tg, tb)
         value = value * b[k + SCALE]
         return value * r, value * g, value * c, pdf, False
     if kind in (METAL, MIRROR):
         return ZERO, ZERO, ZERO, ZERO, True
-    if kind == SHEET:
+    if kind == THIN_DIELECTRIC:
         value, pdf, cosine = reflection(i, (o[0], o[1], -o[2]), ax, ay)
     else:
         value, pdf, cosine = refraction(i, o, ax, ay, b[k + ETA])
@@ -292,7 +295,7 @@ def _draw(b, k, i, u0, u1, u2):  # type: ignore[no-untyped-def]
         return x, y, (z if kind == DIFFUSE else -z), kind == TRANSLUCENT, ZERO, ONE
     if kind == SHEEN:
         x, y, z = cosine_hemisphere(u0, u1)
-        a, c = b[k + OWN], b[k + OWN + 1]
+        a, c = b[k + SHEEN_A], b[k + SHEEN_B]
         x, y, z = x - z * c, y, z * a
         scale = ONE / math.sqrt(max(x * x + y * y + z * z, _TINY))
         return x * scale, y * scale, z * scale, False, ZERO, ONE
@@ -304,10 +307,10 @@ def _draw(b, k, i, u0, u1, u2):  # type: ignore[no-untyped-def]
     share = ONE
     if kind == REFRACTION:
         share = ZERO
-    elif kind in (GLASS, SHEET):
+    elif kind in (GLASS, THIN_DIELECTRIC):
         r, g, c, tr, tg, tb = reflectance(b, k, cosine)
         share = _mirrored_share(r, g, c, tr, tg, tb)
-    if u2 < share or kind == SHEET:
+    if u2 < share or kind == THIN_DIELECTRIC:
         twice = TWO * cosine
         x, y, z = twice * hx - ix, twice * hy - iy, twice * hz - iz
         if u2 < share:
@@ -381,8 +384,8 @@ def sample(b, count, view, u0, u1, u2):  # type: ignore[no-untyped-def]
 
 
 @njit
-def share_out(b, count):  # type: ignore[no-untyped-def]
-    """Turn the estimates in PROBABILITY into probabilities.
+def normalise_probabilities(b, count):  # type: ignore[no-untyped-def]
+    """Turn the sampling weights in PROBABILITY into probabilities.
 
     Parameters
     ----------

@@ -12,20 +12,22 @@ from .lobes import (
     AY,
     DIFFUSE,
     ETA,
-    GLASS,
     KIND,
     LOBE,
     NORMAL,
-    OWN,
-    PASSED,
+    OREN_NAYAR_A,
+    OREN_NAYAR_B,
     PROBABILITY,
-    REFLECTED,
     REFRACTION,
     SCALE,
+    SCATTERED_AGAIN,
     SHEEN,
+    SHEEN_A,
+    SHEEN_B,
     SMOOTH,
     TANGENT,
     TRANSLUCENT,
+    TRANSMISSION_TINT,
     WEIGHT,
     fujii,
     reflectance,
@@ -76,7 +78,7 @@ def begin_lobe(b, count, kind, weight, normal, tangent):  # type: ignore[no-unty
     b[k + KIND], b[k + SCALE], b[k + ETA] = kind, ONE, ONE
     for i in range(3):
         b[k + WEIGHT + i], b[k + NORMAL + i], b[k + TANGENT + i] = weight[i], normal[i], tangent[i]
-        b[k + REFLECTED + i] = b[k + PASSED + i] = ONE
+        b[k + TRANSMISSION_TINT + i] = ONE
     return k
 
 
@@ -135,8 +137,8 @@ def put_alphas(b, k, roughness, anisotropy, glossy):  # type: ignore[no-untyped-
 
 
 @njit
-def make_up(b, k, mu, mean, tables):  # type: ignore[no-untyped-def]
-    """Multiscatter GGX: scale the lobe's value by what microfacets lose, and colour its weight by Fresnel.
+def compensate_energy(b, k, mu, mean, tables):  # type: ignore[no-untyped-def]
+    """Energy compensation of a mirror (Multiscatter GGX): scale its value by what is lost, colour its weight.
 
     Parameters
     ----------
@@ -151,12 +153,6 @@ def make_up(b, k, mu, mean, tables):  # type: ignore[no-untyped-def]
     tables : AlbedoTables
     """
     rough = math.sqrt(math.sqrt(b[k + AX] * b[k + AY]))
-    if b[k + KIND] == GLASS:
-        eta = b[k + ETA]
-        z = math.sqrt(abs((eta - ONE) / (eta + ONE)))
-        e = read_3d(tables.glass[1 if eta < ONE else 0], z, mu, rough)
-        b[k + SCALE] = ONE / max(e, F(1e-3))
-        return
     e, average = max(read_2d(tables.energy, mu, rough), F(1e-3)), read_1d(tables.mean_energy, rough)
     missing = (ONE - e) / e
     b[k + SCALE] = ONE + missing
@@ -164,6 +160,26 @@ def make_up(b, k, mu, mean, tables):  # type: ignore[no-untyped-def]
         f = min(max(mean[i], ZERO), ONE)
         many = f * average / max(ONE - f * (ONE - average), F(1e-6))
         b[k + WEIGHT + i] *= (ONE + many * missing) / (ONE + missing)
+
+
+@njit
+def compensate_glass(b, k, mu, tables):  # type: ignore[no-untyped-def]
+    """Energy compensation of glass (Multiscatter GGX): its value is scaled by what microfacets lose.
+
+    Parameters
+    ----------
+    b : (MOST_LOBES * LOBE,) float32 array
+        Lobes; written.
+    k : int64
+        Where the lobe starts.
+    mu : float32
+        Cosine between its normal and the viewer.
+    tables : AlbedoTables
+    """
+    eta = b[k + ETA]
+    z = math.sqrt(abs((eta - ONE) / (eta + ONE)))
+    e = read_3d(tables.glass[1 if eta < ONE else 0], z, mu, math.sqrt(math.sqrt(b[k + AX] * b[k + AY])))
+    b[k + SCALE] = ONE / max(e, F(1e-3))
 
 
 @njit
@@ -215,14 +231,14 @@ def add_sheen(b, count, weight, roughness, normal, view):  # type: ignore[no-unt
         return count, ZERO
     k = begin_lobe(b, count, SHEEN, (weight[0] * albedo, weight[1] * albedo, weight[2] * albedo), normal, normal)
     b[k + TANGENT], b[k + TANGENT + 1], b[k + TANGENT + 2] = frame_about(normal, view)
-    b[k + OWN], b[k + OWN + 1] = a, c
+    b[k + SHEEN_A], b[k + SHEEN_B] = a, c
     b[k + PROBABILITY] = brightness(b[k + WEIGHT], b[k + WEIGHT + 1], b[k + WEIGHT + 2])
     return count + 1, albedo
 
 
 @njit
-def settle(b, k, view):  # type: ignore[no-untyped-def]
-    """Estimate what a lobe of microfacets sends to the viewer, for sampling.
+def put_sampling_weight(b, k, view):  # type: ignore[no-untyped-def]
+    """Estimate what a lobe of microfacets sends to the viewer: its weight for sampling.
 
     Parameters
     ----------
@@ -275,11 +291,11 @@ def add_diffuse(b, count, weight, roughness, colour, normal, view):  # type: ign
         slope = sigma * a
         mean = a * PI + (TWO * PI - F(5.6)) / F(3.0) * slope
         rest = ONE - (a * PI + slope * fujii(cosine_to(normal, view)))
-        b[k + OWN], b[k + OWN + 1] = a, slope
+        b[k + OREN_NAYAR_A], b[k + OREN_NAYAR_B] = a, slope
         for i in range(3):
             c = min(max(colour[i], ZERO), ONE)
             many = c * c * (mean / (ONE - mean)) / max(ONE - c * (ONE - mean), _TINY) / PI
-            b[k + OWN + 2 + i] = many * rest
+            b[k + SCATTERED_AGAIN + i] = many * rest
     b[k + PROBABILITY] = brightness(weight[0], weight[1], weight[2])
     return count + 1
 

@@ -15,7 +15,7 @@ from ...scene.material_rows import ALONG, COAT_DETAILS, MULTISCATTER, THIN
 from ...scene.material_rows import KIND as ROW_KIND
 from ...scene.texture_lookup import blend, layer_at
 from .. import brdf
-from .lobes import DIFFUSE, KIND, LOBE, METAL, MIRROR, SHEEN, share_out
+from .lobes import DIFFUSE, KIND, LOBE, METAL, MIRROR, SHEEN, normalise_probabilities
 from .principled import add_material
 from .surface_parameters import parameters_at, plain_parameters
 
@@ -122,7 +122,7 @@ def put_lobes(place, base, normals, facing, view, geometry, rows, tables, p, b):
         all_normals, nowhere = (normal, specular, specular), (ZERO, ZERO, ZERO)
         never = parts < 0  # of the types of the other call, so that one form of `add_material` is compiled
         count = add_material(b, count, p, np.int32(0), (never, never), all_normals, nowhere, view, ONE, tables)
-        share_out(b, count)
+        normalise_probabilities(b, count)
         return count, False
     side = side_of(place, facing, geometry)
     where, addresses = place_of(face, u, v, geometry), tables_of(geometry)
@@ -134,7 +134,7 @@ def put_lobes(place, base, normals, facing, view, geometry, rows, tables, p, b):
         along = _along(row, material, where, instance, rows, geometry)
         kind = rows.ints[row, ROW_KIND]
         count = add_material(b, count, p, kind, flags, (normal, specular, coated), along, view, side, tables)
-    share_out(b, count)
+    normalise_probabilities(b, count)
     passes = False
     for lobe in range(count):
         kind = b[lobe * LOBE + KIND]
