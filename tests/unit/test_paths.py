@@ -6,13 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_integrate import points, settings
 from test_surface import mesh_state
 
 from drgs_blender.compute import manifest, threads
-from drgs_blender.core.frame import Camera, Frame, Light, RenderSettings, World
-from drgs_blender.core.materials import Material, Part
+from drgs_blender.core.frame import Camera, Frame, Layer, Light, RenderSettings, Visibility, World
+from drgs_blender.core.materials import TEXTURED, Image, Material, Part, SurfaceDetail, Texture
 from drgs_blender.engine.session import Session, jobs_of
 from drgs_blender.render.integrator import paths
+from drgs_blender.render.integrator.integrate import integrate
+from drgs_blender.render.lights.environment import EnvironmentLight
+from drgs_blender.render.scene.material_rows import material_rows
+from drgs_blender.render.scene.trace_scene import TraceScene
+from drgs_blender.render.shading_points import SECOND
 
 SQUARE = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 FACES = np.int32([[0, 1, 2], [0, 2, 3]])
@@ -36,8 +42,9 @@ def flat(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.repeat((normal / np.linalg.norm(normal, axis=1, keepdims=True))[:, None], 3, axis=1).astype(np.float32)
 
 
-def card(material: Material, z: float = 0.0, scale: float = 1.0):
-    return mesh_state(SQUARE, FACES, at(z, scale), name=material.name, materials=[material])
+def card(material: Material, z: float = 0.0, scale: float = 1.0, **changes):
+    uvs = np.ascontiguousarray((SQUARE[FACES][..., :2] + 1) / 2)
+    return mesh_state(SQUARE, FACES, at(z, scale), name=material.name, materials=[material], uvs=uvs, **changes)
 
 
 def box(material: Material, z: float = 0.0, scale: float = 1.0):
@@ -45,12 +52,12 @@ def box(material: Material, z: float = 0.0, scale: float = 1.0):
     return mesh_state(BOX, SIDES, at(z, scale), name=material.name, materials=[material], corner_normals=normals)
 
 
-def seen(meshes, passes=("Combined",), world=1.0, size=12, lights=(), **settings):
+def seen(meshes, passes=("Combined",), world=1.0, size=12, lights=(), images=(), height=5.0, **settings):
     """From above, orthographic, one metre wide."""
-    camera = Camera(at(5.0), size, size, size, size, size / 2, size / 2, orthographic=True)
+    camera = Camera(at(height), size, size, size, size, size / 2, size / 2, orthographic=True)
     how = RenderSettings(**{"samples": 64, "bounces": 4, "camera_sees": "mesh"} | settings)
     given = world if isinstance(world, World) else World(strength=world)
-    return Session().render(Frame(0, camera, [], given, how, passes, list(meshes), list(lights)))
+    return Session().render(Frame(0, camera, [], given, how, passes, list(meshes), list(lights), list(images)))
 
 
 def picture(*args, **kwargs) -> np.ndarray:
@@ -179,6 +186,164 @@ def test_parts_add_up_by_weight():
     mixed = Material("mixed", parts=[Part(one, (0.25,) * 3), Part(other, (0.5, 0.75, 0.75))])
     found = picture([card(mixed)], **even).mean(axis=(0, 1))
     np.testing.assert_allclose(found, [0.45, 0.65, 0.65], rtol=0.02)
+
+
+#: Of which every parameter counts.
+ALL = Material(
+    "all", (0.8, 0.6, 0.4), 0.6, 0.3, ior=1.7, specular_level=0.7, specular_tint=(0.9, 0.8, 0.7), anisotropy=0.5,
+    anisotropy_rotation=0.1, coat=0.5, coat_roughness=0.4, coat_ior=1.6, coat_tint=(0.7, 0.8, 0.9), sheen=0.6,
+    sheen_roughness=0.4, sheen_tint=(0.9, 0.7, 0.5), transmission=0.3, diffuse_roughness=0.5,
+)  # fmt: skip
+LEFT, RIGHT = np.float32([0.55, 0.7, 0.85]), np.float32([0.95, 0.65, 0.75])
+PAIR = Image("pair", np.concatenate([[[LEFT, RIGHT]], np.ones((1, 2, 1), np.float32)], axis=2).astype(np.float32))
+
+
+@pytest.mark.parametrize("name", ("base_colour", "roughness", "metallic", *TEXTURED, "weight", "inverted weight"))
+def test_a_texture_of_a_parameter_is_its_value_at_each_place(name):
+    """An image of two texels is what two surfaces without images are, each on its side."""
+    own = ALL if name.endswith("weight") else getattr(ALL, name)
+    texture = Texture("pair", "rgb" if name.endswith("weight") or np.ndim(own) else "r", interpolation="closest")
+    if name.endswith("weight"):
+        inverted = name != "weight"
+        given = Material("m", parts=[Part(ALL, (0.5, 0.6, 0.7), texture, inverted)])
+        sides = [np.multiply(1 - c if inverted else c, (0.5, 0.6, 0.7)) for c in (LEFT, RIGHT)]
+        constant = [Material("m", parts=[Part(ALL, tuple(map(float, side)))]) for side in sides]
+    else:
+        field = {} if name in TEXTURED else {f"{name}_texture": texture}
+        given = replace(ALL, textures={name: texture} if name in TEXTURED else {}, **field)
+        sides = [np.multiply(own, c if np.ndim(own) else c[0]) for c in (LEFT, RIGHT)]
+        constant = [replace(ALL, **{name: tuple(map(float, v)) if np.ndim(v) else float(v)}) for v in sides]
+    settings = {"world": sky(), "size": 2, "samples": 16, "bounces": 0}
+    found = picture([card(given)], images=[PAIR], **settings)
+    left, right = (picture([card(m)], **settings) for m in constant)
+    np.testing.assert_allclose(found[:, 0], left[:, 0], rtol=1e-4)
+    np.testing.assert_allclose(found[:, 1], right[:, 1], rtol=1e-4)
+    assert np.abs(left / right - 1).max() > 3e-3
+
+
+def test_highlights_follow_the_tangent_layer_and_turn_from_it_counterclockwise():
+    """Two bright places of the sky, opposite to each other, halfway between the X and the Y axis."""
+    sky = np.zeros((16, 32, 3), np.float32)
+    sky[3:6, 3:6] = sky[3:6, 19:22] = 10.0
+
+    def brushed(angle: float, rotation: float) -> np.ndarray:
+        along = np.zeros((2, 3, 4), np.float32)
+        along[..., :2] = np.cos(angle), np.sin(angle)
+        metal = Material("m", (1, 1, 1), 0.5, 1.0, anisotropy=0.9, anisotropy_rotation=rotation, tangent="way")
+        return picture([card(metal, layers=[Layer("way", along)])], world=World(sky), size=2, samples=256).mean()
+
+    turned = brushed(0.2 * np.pi, 0.0)
+    assert brushed(0.0, 0.1) == pytest.approx(turned, rel=0.02)
+    assert brushed(0.2 * np.pi, -0.1) == pytest.approx(brushed(0.0, 0.0), rel=0.02)
+    others = brushed(0.0, 0.0), brushed(-0.2 * np.pi, 0.0), brushed(0.4 * np.pi, 0.0)
+    assert all(abs(other / turned - 1) > 0.2 for other in others)
+
+
+def test_the_coat_is_smooth_unless_it_has_the_normal_map_of_what_is_below():
+    tilt = [SurfaceDetail("world", None, tuple(np.array([0.3, 0.1, 0.9]) / 2 + 0.5))]
+    coat = Material("coat", (0, 0, 0), 0.2, coat=1.0, coat_roughness=0.2, coat_ior=1.5, specular_level=0.0)
+    dielectric = Material("dielectric", (0, 0, 0), 0.2, ior=1.5)
+    settings = {"world": sky(), "size": 2, "samples": 256, "bounces": 0}
+    smooth, tilted = (picture([card(replace(dielectric, details=d)), FAR], **settings) for d in ([], tilt))
+    assert np.abs(smooth / tilted - 1).min() > 0.1
+    np.testing.assert_allclose(picture([card(replace(coat, details=tilt))], **settings), smooth, rtol=0.03)
+    own = replace(coat, details=tilt, coat_details=True)
+    np.testing.assert_allclose(picture([card(own)], **settings), tilted, rtol=0.03)
+
+
+def test_a_closed_box_is_as_bright_as_the_geometric_series_of_its_bounces():
+    """Walls that give off light and reflect four fifths: paths that end early by chance count more where they go on."""
+    walls = Material("walls", (0.8,) * 3, kind="diffuse", emission=(1.0,) * 3)
+    found = picture([box(walls)], world=0.0, size=2, height=0.5, samples=2048, bounces=8)
+    assert found.mean() == pytest.approx((1 - 0.8**10) / 0.2, rel=0.015)
+
+
+def test_light_passes_six_panes():
+    pane = Material("pane", (1, 1, 1), 0.0, transmission=1.0, ior=1.001)
+    panes = [box(replace(pane, name=f"pane {i}"), float(i), 0.3) for i in range(-3, 3)]
+    for each in panes:
+        each.matrices[0, 2, 2] *= 0.5
+    ground = card(Material("ground", (0, 0, 0), emission=(1, 1, 1), kind="diffuse"), -5.0, 50.0)
+    found = picture([*panes, ground], world=0.0, size=2, samples=16, bounces=0)
+    np.testing.assert_allclose(found, 1.0, rtol=2e-3)
+
+
+def test_paths_meet_the_light_that_meshes_emit():
+    """The same as in batches, and a thing far away, by which rays start higher above surfaces, changes nothing."""
+    glow = card(Material("glow", (0, 0, 0), emission=(3.0, 2.0, 1.0)), 0.8, 0.5)
+    glow.visibility = Visibility(camera=False)
+    meshes = [card(SPEC), glow, box(Material("red", (0.8, 0.2, 0.1)), 0.4, 0.1)]
+    settings = {"samples": 1024, "size": 4, "bounces": 1, "subpixel_samples": 16, "world": 0.0}
+    batches, found = picture(meshes, **settings), picture([*meshes, FAR], **settings)
+    np.testing.assert_allclose(found.mean(axis=(0, 1)), batches.mean(axis=(0, 1)), rtol=0.01)
+
+
+def test_normal_maps_soften_diffuse_light_as_in_batches():
+    tilt = SurfaceDetail("world", None, tuple(np.array([0.8, 0.0, 0.6]) / 2 + 0.5))
+    meshes = [card(Material("m", (0.8, 0.6, 0.4), 1.0, details=[tilt]))]
+    settings = {"samples": 1024, "size": 4, "bounces": 1, "subpixel_samples": 16, "world": sky()}
+    batches, found = picture(meshes, **settings), picture([*meshes, FAR], **settings)
+    np.testing.assert_allclose(found.mean(axis=(0, 1)), batches.mean(axis=(0, 1)), rtol=0.01)
+
+
+@pytest.mark.parametrize(("kind", "other"), (("diffuse", "glossy"), ("glossy", "diffuse")))
+def test_rays_of_a_lobe_meet_what_its_kind_of_rays_meets(kind, other):
+    """A mesh that gives off light, hidden to one kind of rays, shines by the other kind of lobes alone."""
+    surface = Material("surface", (0.8, 0.6, 0.4), 0.5, kind=kind)
+
+    def lit(**hidden: bool) -> np.ndarray:
+        glow = card(Material("glow", (0, 0, 0), emission=(1.0, 1.0, 1.0)), 0.8, 0.5)
+        glow.visibility = Visibility(camera=False, **hidden)
+        return picture([card(surface), glow], world=0.0, size=2, bounces=0)
+
+    seen_by_all = lit()
+    assert seen_by_all.min() > 0.05 and not lit(**{kind: False}).any()
+    np.testing.assert_allclose(lit(**{other: False}), seen_by_all, rtol=1e-4)
+
+
+def test_lights_shine_on_what_is_linked_at_every_vertex():
+    """The lamp is there for the lid alone, which the mirror below shows."""
+    lid = card(Material("lid", (0.5,) * 3), 0.8, 3.0)
+    lid.visibility = Visibility(camera=False, lit_by=1)
+    mirror = card(Material("mirror", (1, 1, 1), 0.1, 1.0))
+    mirror.visibility = Visibility(lit_by=0)
+    lamp = Light("l", "point", at(0.4), power=20.0, receivers=0)
+    settings = {"world": 0.0, "lights": [lamp], "size": 2, "samples": 256, "bounces": 1}
+    batches, found = (picture([lid, mirror, *more], **settings).mean() for more in ([], [FAR]))
+    assert batches > 0.1 and found == pytest.approx(batches, rel=0.03)
+
+
+def test_moments_are_sums_of_squares_and_second_points_have_numbers_of_their_own():
+    """Of a single sample the one is the square of the other."""
+    rows = material_rows([Material("m", coat=0.5)], None, lambda *_: None, [])
+    kernel, how = paths.PathKernel(rows), settings(1, auto=True, shading_model="principled")
+    given = points(64, albedo=0.5, roughness=0.4)
+    flags = np.full(64, SECOND, np.uint32)
+    first, second = (
+        integrate(TraceScene(), EnvironmentLight(sky()), p, how, 0, kernel=kernel)
+        for p in (given, replace(given, flags=flags))
+    )
+    assert (first.moments[:, 0] == 1).all() and (first.moments[:, 1:] > 0).any()
+    np.testing.assert_allclose(first.moments[:, 2::2], first.moments[:, 1::2] ** 2, rtol=1e-5)
+    assert not np.array_equal(first.components, second.components)
+
+
+@pytest.mark.parametrize(
+    "material",
+    (
+        Material("metal", (0.9, 0.0, 0.0), 1.0, 1.0, anisotropy=0.5),
+        Material("glass", (0.9, 0.9, 0.9), 0.6, transmission=1.0, specular_tint=(1.0, 0.0, 0.0)),
+        Material("thin", (0.9,) * 3, 0.6, transmission=1.0, specular_tint=(1.0, 0.0, 0.0), thin_walled=True),
+    ),
+    ids=lambda material: material.name,
+)
+def test_light_over_a_colour_that_is_almost_black_stays_small(material):
+    """Light of the channel of which the surface has none is in the picture, and its pass is no larger than others."""
+    names = ("Combined", "GlossDir", "GlossInd", "GlossCol", "TransDir", "TransInd", "TransCol")
+    found = seen([card(material)], names, size=2)
+    assert found["GlossCol"][..., 1:].min() > 0 and found["GlossDir"].max() < 2 and found["TransDir"].max() < 2
+    parts = ((found[f"{k}Dir"] + found[f"{k}Ind"]) * found[f"{k}Col"] for k in ("Gloss", "Trans"))
+    np.testing.assert_allclose(sum(parts), found["Combined"][..., :3], rtol=1e-3, atol=1e-6)
 
 
 def test_other_looks_leave_the_paper_and_plain_scenes_alone():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -290,13 +291,18 @@ def towards_lights(numbers, at, receiver, throughput, first, scratch, count, sce
     s, ints = rays
     n0, n1, n2 = numbers
     own = lights_of(scene.lights, receiver)
-    px, py, pz = at[1]
+    (px, py, pz), (gx, gy, gz) = at[1], at[3]
+    # From where rays start: else shadow rays reach surfaces that emit, and pdfs are not those of `light_along`.
+    px, py, pz = lifted(px, py, pz, gx, gy, gz, scene.traits.extent)
     dx, dy, dz, distance, r, g, b, density, light = sample_light(n2, n0, n1, px, py, pz, own)
     if not (density != ZERO and r + g + b > ZERO):
         return
     pdf = weigh_lit(at, (dx, dy, dz), scratch, count, scene)
     if not is_bright(scratch.value):
         return
+    # Of light from below, the ray starts on the other side.
+    mx, my, mz = s[w.OX] - px, s[w.OY] - py, s[w.OZ] - pz
+    distance -= math.sqrt(mx * mx + my * my + mz * mz)
     s[w.ER], s[w.EG], s[w.EB], s[w.MU], s[w.MV], s[w.LIVE] = r, g, b, distance, density, ONE
     ints[w.CELL] = U(max(light, 0))
     mask = np.int32(ray_masks.SHADOW << settings.shift)
