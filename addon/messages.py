@@ -47,6 +47,7 @@ def withdraw(level: str, text: str) -> None:
     for message in [m for m in list(history) if m[1:] == (level, text)]:
         with contextlib.suppress(ValueError):  # another thread was quicker
             history.remove(message)
+    warned.discard(text)
 
 
 def named_in(text: str, known: Container[str]) -> str:

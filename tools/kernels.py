@@ -55,6 +55,8 @@ def commands(folder: Path) -> Iterator[tuple[str, list[object]]]:
     yield "panorama", [*own, "panorama", folder]
     yield "linked lights", [*own, "linked lights", folder]
     yield "light groups", [*own, "light groups", folder]
+    for job in ("paths", "linked paths", "grouped paths", "lobe colours"):
+        yield job, [*own, job, folder]
     yield "surfel rays", [*relight, "--rays-see", "surfels"]
     for solver in ("mpm", "xpbd", "rigid"):
         yield "simulate", [*drgs, "simulate", asset, "--solver", solver, "--resolution", "12", "--frames", "3",
@@ -155,6 +157,16 @@ def engine(folder: Path, what: str) -> None:
         elif what == "light groups":
             lit = [Light("lamp", "point", matrix, light_group="key")]
             client.render(replace(frame, lights=lit, passes=("Combined", "Combined_key")))
+        elif what.endswith("paths") or what == "lobe colours":
+            pane = MeshState(
+                "pane", np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1]], np.float32), np.array([[0, 1, 2]], np.int32),
+                np.eye(4)[None], np.zeros(1, np.int32), materials=[Material("glass", kind="glass")],
+            )  # fmt: skip
+            links = 0 if what == "linked paths" else -1
+            lit = [Light("lamp", "point", matrix, light_group="key", receivers=links, blockers=links)]
+            passes = {"grouped paths": ("Combined", "Combined_key"), "lobe colours": ("Combined", "DiffCol")}
+            given = passes.get(what, ("Combined",))
+            client.render(replace(frame, lights=lit, meshes=[pane], passes=given))
         elif what == "viewport":
             for denoise in ("none", "svgf"):
                 seen = replace(frame, settings=replace(settings, denoise=denoise))

@@ -49,7 +49,8 @@ class Wanted:
         """The result of a request; where it is not there, it is wanted from now on, unless it has `failed`."""
         found = self._manager.find(request.key)
         if found is not None:
-            for text in self._manager.told.pop(request.label, ()):
+            told = self._manager.told
+            for text in told.pop(request.label, set()).difference(*told.values()):
                 messages.withdraw("WARNING", text)
         elif not self.failed(request):
             self.requests.append(request)
@@ -57,8 +58,12 @@ class Wanted:
 
     def tell(self, request: Request, text: str, warn: Callable[[str], None]) -> None:
         """Warn that a request could not be baked; where it is baked later, the message is withdrawn."""
-        self._manager.told.setdefault(request.label, set()).add(text)
+        self.depends(request, text)
         warn(text)
+
+    def depends(self, request: Request, *texts: str) -> None:
+        """Have warnings that others give withdrawn when all requests on which they depend are baked."""
+        self._manager.told.setdefault(request.label, set()).update(texts)
 
     def again(self, requests: Iterable[Request]) -> None:
         """Want what an earlier export has wanted already."""

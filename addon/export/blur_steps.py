@@ -35,20 +35,27 @@ class Step:
     lens: tuple[float, float]
 
 
-def steps(scene: bpy.types.Scene, camera: bpy.types.Object | None, warn: Warn, moving: bool = True) -> list[Step]:
-    """The pictures that make one of a scene; none where nothing is blurred.
+def steps(
+    scene: bpy.types.Scene,
+    layer: bpy.types.ViewLayer,
+    camera: bpy.types.Object | None,
+    warn: Warn,
+    moving: bool = True,
+) -> list[Step]:
+    """The pictures that make one of a scene's view layer; none where nothing is blurred.
 
     Parameters
     ----------
     camera : evaluated; None: no lens, all is in focus
-    moving : whether motion is blurred where the scene says so
+    moving : whether motion is blurred where scene and view layer say so
     """
     render = scene.render
     radius = 0.0 if camera is None else _radius(camera.data)
     if camera is not None and radius and is_panoramic(camera):
         warn(f'Camera "{camera.name}": panoramas have no depth of field in DR-GS; all is sharp')
         radius = 0.0
-    shutter = render.motion_blur_shutter if render.use_motion_blur and moving else 0.0
+    moving = moving and render.use_motion_blur and layer.use_motion_blur
+    shutter = render.motion_blur_shutter if moving else 0.0
     if not (radius or shutter):
         return []
     count = Limited(scene.drgs, f'Scene "{scene.name}"', warn).blur_steps

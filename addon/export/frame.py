@@ -143,7 +143,7 @@ def export_frame(
 
 
 def _mist(world: bpy.types.World | None) -> Mist:
-    """Limits of the pass Mist."""
+    """Limits of the pass Mist: of the scene's world, as in Cycles, also where a view layer has another."""
     if world is None:
         return Mist()
     settings = world.mist_settings

@@ -137,6 +137,7 @@ class SurfaceBakes:
         if failure := self._wanted.failed(made):
             about = f'Material "{material.name}" on "{self._obj.name}": its {_words(name)}'
             self._wanted.tell(made, f"{about} cannot be baked ({failure}); it is approximated", note)
+            self._wanted.depends(made, *value.approximations)
             return value, False
         self.requests.append(made)
         return value, True

@@ -17,7 +17,7 @@ from ...drgs_blender.core.frame import Light, World
 from ..bakes.manager import Request
 from ..bakes.requests import Wanted
 from . import world_bake
-from .images import linear_pixels
+from .images import MISSING, linear_pixels
 from .node_math import rgb
 from .nodes import Walker, euler, vector_rotate
 from .socket_value import SocketValue, once, uniform
@@ -135,10 +135,10 @@ def _readable(world: bpy.types.World, light: SocketValue, warn: Warn) -> World:
         pixels, rotation = linear_pixels(light.texture.image, warn), np.array(light.texture.rotation)
         if pixels is None:
             warn(
-                f'World "{world.name}": image "{light.texture.image.name}" cannot be read; its colour is taken as '
-                "grey. Choose File > External Data > Find Missing Files, or another image"
+                f'World "{world.name}": image "{light.texture.image.name}" cannot be read; as in Cycles it is magenta. '
+                "Choose File > External Data > Find Missing Files, or another image"
             )
-            light = SocketValue(light.colour * FALLBACK)
+            light = SocketValue(light.colour * MISSING)
     colour = _usable(light.colour, rotation, world.name, warn)
     return World(environment=pixels, rotation=rotation, colour=rgb(colour))
 
@@ -189,7 +189,7 @@ class _Tree(Walker):
     def mean(self, texture: Any) -> np.ndarray:
         pixels = linear_pixels(texture.image, self._warn)
         if pixels is None:
-            return np.full(3, FALLBACK)
+            return np.array(MISSING)
         rows = np.where(np.isfinite(pixels), pixels, 0).mean(axis=1, dtype=np.float64)
         height = len(rows)
         return np.average(rows, axis=0, weights=np.sin((np.arange(height) + 0.5) / height * np.pi))
@@ -228,9 +228,11 @@ class _Tree(Walker):
 
     def node_tex_environment(self, output: SocketRef) -> SocketValue:
         node = output.node
-        if node.image is None:
-            self.note(node, "has no image; Blender shows magenta, a dim grey is used. Choose one")
-            return uniform(FALLBACK)
+        if node.image is None or 0 in node.image.size[:]:
+            name = "has no image" if node.image is None else f'image "{node.image.name}" cannot be read'
+            remedy = "Choose one, or File > External Data > Find Missing Files"
+            self.warn(node, f"{name}; as in Cycles it is magenta. {remedy}")
+            return SocketValue(np.array(MISSING))
         if node.type == "TEX_ENVIRONMENT" and node.projection != "EQUIRECTANGULAR":
             self.warn(node, "the Mirror Ball projection is read as Equirectangular")
         if node.interpolation != "Linear":

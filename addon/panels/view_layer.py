@@ -27,6 +27,9 @@ class DRGS_PT_passes(bpy.types.Panel):
         layout.use_property_decorate = False
         view_layer = context.view_layer
         layout.prop(view_layer.drgs, "others")
+        row = layout.row()
+        row.active = context.scene.render.use_motion_blur
+        row.prop(view_layer, "use_motion_blur", text="Motion Blur")
         column = layout.column(heading="Include")
         switches: dict[str, tuple[Any, str]] = {}  # one for all passes of a kind
         for p in PASSES:

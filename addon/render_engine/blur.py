@@ -14,9 +14,7 @@ import bpy
 
 from ...drgs_blender.core.frame import Frame
 from ...drgs_blender.ipc import blur
-from ..export.blur_steps import Step, focus_distance, steps
-
-__all__ = ["Step", "pictures", "steps"]
+from ..export.blur_steps import Step, focus_distance
 
 
 def pictures(

@@ -16,7 +16,7 @@ from ...drgs_blender.core.phases import is_preparing
 from ...drgs_blender.ipc.blur import averaged, sample_frame, sharp_frame
 from ...drgs_blender.ipc.protocol import Passes
 from .. import background_render, engine_link, messages
-from ..export import export_baked
+from ..export import blur_steps, export_baked
 from ..export.instances import uncancelled
 from ..view_layer_passes import blender_name, enabled
 from ..viewport import views
@@ -125,7 +125,7 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
 
         frame = export(True)
         scene = depsgraph.scene_eval
-        steps = blur.steps(scene, scene.camera.evaluated_get(depsgraph), warn)
+        steps = blur_steps.steps(scene, depsgraph.view_layer_eval, scene.camera.evaluated_get(depsgraph), warn)
         if steps:
             passes = self._blurred(frame, steps, depsgraph, lambda: export(False))
         else:
@@ -142,7 +142,7 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
         return self.test_break() or _ending.is_set()
 
     def _blurred(
-        self, frame: Frame, steps: list[blur.Step], depsgraph: bpy.types.Depsgraph, export: Callable[[], Frame]
+        self, frame: Frame, steps: list[blur_steps.Step], depsgraph: bpy.types.Depsgraph, export: Callable[[], Frame]
     ) -> Passes:
         """The mean of the pictures of `steps`, in place of that of `frame`."""
         done = 0

@@ -139,7 +139,7 @@ def of(
     plays = getattr(getattr(context, "screen", None), "is_animation_playing", False)
     lens = camera.evaluated_get(depsgraph) if camera is not None and camera.type == "CAMERA" else None
     moving = scene.drgs.use_viewport_motion_blur and not plays
-    wanted = steps(scene, lens, texts.append, moving)
+    wanted = steps(scene, depsgraph.view_layer, lens, texts.append, moving)
     parts = scenes.parts(depsgraph, local)
     given = tuple(wanted), tuple(texts), lens is not None and lens.name_full, parts.version
     if given == known.given:

@@ -119,6 +119,7 @@ class Exporter:
         self.errors = importlib.import_module(f"{package}.drgs_blender.core.errors")
         self.export = importlib.import_module(f"{package}.addon.export").export_baked
         self.blur = importlib.import_module(f"{package}.addon.render_engine.blur")
+        self.steps = importlib.import_module(f"{package}.addon.export.blur_steps").steps
         self.encode_frame = importlib.import_module(f"{package}.drgs_blender.ipc.codec").encode_frame
         self.sent = importlib.import_module(f"{package}.drgs_blender.ipc.slots").SentSlots()
         self.keys: dict[Path, str] = {}
@@ -167,7 +168,7 @@ class Exporter:
 
         frame = export(True)
         scene = depsgraph.scene_eval
-        steps = self.blur.steps(scene, scene.camera.evaluated_get(depsgraph), warn)
+        steps = self.steps(scene, depsgraph.view_layer_eval, scene.camera.evaluated_get(depsgraph), warn)
         layers = [layer for layer in depsgraph.scene.view_layers if layer.use]
         about = {
             "number": depsgraph.scene.frame_current,

@@ -19,7 +19,7 @@ from ..formats.axes import UP_AXES
 from ..formats.point_cache import SUFFIXES as POINT_CACHES
 from .frame_range import check_template, parse_frames, requested_frames
 from .output import check_writable
-from .pose_file import add_vertex_order, check_vertex_order, in_asset_order, is_point_cache, read_poses
+from .pose_file import add_vertex_order, check_vertex_order, in_asset_order, is_point_cache, open_cache, read_poses
 from .progress import clock
 from .relight import finite, positive
 from .sampling import int_range
@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
 def convert_poses(args: argparse.Namespace) -> int:
     """Write a point cache in the order, axes and unit of an asset; of the frames that are asked for, or of all."""
     from ..core.asset.container import read_asset
-    from ..formats.point_cache import read_point_cache, write_point_cache
+    from ..formats.point_cache import write_point_cache
 
     if not is_point_cache(args.vertices):
         problem = "is written of a point cache"
@@ -119,7 +119,8 @@ def convert_poses(args: argparse.Namespace) -> int:
     check_writable(args.output, (args.input, args.vertices))
     with clock(args, "reading"):
         mesh = read_asset(args.input).mesh
-        poses = read_poses(args.vertices, parse_frames(args.frames) if args.frames else None)
+        cache = open_cache(args.vertices)
+        poses = read_poses(args.vertices, parse_frames(args.frames) if args.frames else None, cache)
     numbers = [frame for frame, _ in poses]
     if numbers != list(range(numbers[0], numbers[0] + len(numbers))):
         raise UsageError(f"--frames {args.frames}", "skips frames, which a point cache cannot", "Write it as 1-24")
@@ -135,8 +136,7 @@ def convert_poses(args: argparse.Namespace) -> int:
         return vertices
 
     moving = (moved(number, pose()) for number, pose in poses)
-    fps = read_point_cache(args.vertices).fps
-    write_point_cache(args.output, moving, len(poses), len(mesh.vertices), numbers[0], fps)
+    write_point_cache(args.output, moving, len(poses), len(mesh.vertices), numbers[0], cache.fps)
     # An MDD has times from its first frame on, and no numbers.
     first = 1 if args.output.suffix.lower() == ".mdd" else numbers[0]
     print(f"{args.output}: {len(poses)} frames from {first} on, {len(mesh.vertices)} vertices each")

@@ -9,12 +9,15 @@ import argparse
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from ..core.asset.model import Mesh
 from ..core.errors import AssetError, UsageError
+
+if TYPE_CHECKING:
+    from ..formats.point_cache import PointCache
 
 
 def add_vertex_order(parser: argparse.ArgumentParser) -> None:
@@ -67,20 +70,38 @@ def is_point_cache(path: Path | None) -> bool:
     return path is not None and path.suffix.lower() in SUFFIXES
 
 
-def read_poses(path: Path, frames: Sequence[int] | None = None) -> Poses:
-    """Poses of a point cache; by default of all its frames.
+def open_cache(path: Path) -> PointCache:
+    """A point cache that is given with --vertices.
 
     Raises
     ------
     AssetError, UsageError
-        The file is damaged, or lacks one of the frames.
+        The file is damaged, or not there.
     """
     from ..formats.point_cache import read_point_cache
 
-    subject = f"--vertices {path}"
     if not path.is_file():
-        raise UsageError(subject, "is not a regular file" if path.exists() else "does not exist", "Check the path")
-    cache = read_point_cache(path)
+        problem = "is not a regular file" if path.exists() else "does not exist"
+        raise UsageError(f"--vertices {path}", problem, "Check the path")
+    return read_point_cache(path)
+
+
+def read_poses(path: Path, frames: Sequence[int] | None = None, cache: PointCache | None = None) -> Poses:
+    """Poses of a point cache; by default of all its frames.
+
+    Parameters
+    ----------
+    path : Path
+    frames : sequence of int, optional
+    cache : PointCache, optional
+        What `open_cache` has read of it.
+
+    Raises
+    ------
+    AssetError, UsageError
+        The file is damaged, not there, or lacks one of the frames.
+    """
+    cache = open_cache(path) if cache is None else cache
     there = range(cache.first, cache.first + len(cache.frames))
     frames = there if frames is None else frames
     if missing := [frame for frame in frames if frame not in there]:

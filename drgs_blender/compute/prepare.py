@@ -198,14 +198,30 @@ def processes(root: Path = _ROOT) -> int:
     return allowed if most >= allowed else max(1, int(most))
 
 
+def _print_help(text: str) -> int:
+    """Print the help, of which argparse would not say that it cannot be written; the exit code."""
+    try:
+        print(text, end="", flush=True)
+    except OSError as error:
+        sys.stdout = None
+        print(f"prepare: standard output cannot be written: {error.strerror}", file=sys.stderr)
+        return EXIT_CANNOT_WRITE
+    return 0
+
+
 def main(argv: list[str] | None = None) -> int:
     """The command line; the return value is the exit code."""
     import argparse  # of no use to an engine, which imports this module when it starts
 
-    parser = argparse.ArgumentParser(prog="python -m drgs_blender.compute.prepare", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m drgs_blender.compute.prepare", description=__doc__.split("\n")[0], add_help=False
+    )
     parser.add_argument("jobs", nargs="*", metavar="JOB", help=f"any of {', '.join(manifest.jobs())}")
+    parser.add_argument("-h", "--help", action="store_true", help="show this help message and exit")
     parser.add_argument("--all", action="store_true", help="of all jobs")
     options = parser.parse_args(argv)
+    if options.help:
+        return _print_help(parser.format_help())
     if unknown := set(options.jobs) - set(manifest.jobs()):
         parser.error(f"unknown job {', '.join(sorted(unknown))}; there are {', '.join(manifest.jobs())}")
     if not options.jobs and not options.all:

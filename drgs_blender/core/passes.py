@@ -72,6 +72,7 @@ PASSES: tuple[Pass, ...] = (
     Pass("Metallic", "X", "VALUE", "", "Metallic"),
     Pass("Coverage", "X", "VALUE", "", "Part of the pixel that surfaces cover"),
     Pass("IndexOB", "X", "VALUE", "use_pass_object_index", "Pass index of the nearest object"),
+    Pass("Object", "X", "VALUE", "", "Number of the nearest object, made of its name, by which denoisers tell objects"),
     Pass("IndexMA", "X", "VALUE", "use_pass_material_index", "Pass index of the nearest surface's material"),
     Pass("UV", "UVA", "VECTOR", "use_pass_uv", "Texture coordinates of meshes by their active UV map, and coverage"),
     Pass("Mist", "Z", "VALUE", "use_pass_mist", "Distance between the limits of the World's Mist Pass, 0 to 1"),
@@ -96,7 +97,7 @@ PASSES: tuple[Pass, ...] = (
 TEMPORAL: tuple[str, ...] = (
     *("Combined", "Depth", "Position", "Normal", "Albedo", "Roughness", "Metallic", "Coverage", "IndexOB"),
     *("DiffDir", "DiffInd", "DiffCol", "GlossDir", "GlossInd", "GlossCol", "Emit", "Env", "Variance"),
-    *("Previous Position", "TransDir", "TransInd", "TransCol"),
+    *("Previous Position", "TransDir", "TransInd", "TransCol", "Object"),
 )
 
 #: name -> Pass

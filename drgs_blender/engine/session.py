@@ -345,7 +345,19 @@ def jobs_of(frame: Frame) -> list[str]:
         jobs.append("linked lights")
     if groups_of(frame.passes):
         jobs.append("light groups")
-    return jobs
+    return jobs + _jobs_of_lobes(frame, jobs)
+
+
+def _jobs_of_lobes(frame: Frame, jobs: list[str]) -> list[str]:
+    """Jobs of surfaces with more lobes than two: the kernel of paths takes some of the longest to compile."""
+    if frame.settings.shading_model != "principled":
+        return []
+    if not any(material.has_more_lobes for mesh in frame.meshes for material in mesh.materials):
+        return []
+    kinds = {"linked lights": "linked paths", "light groups": "grouped paths"}
+    paths = [own for lights, own in kinds.items() if lights in jobs] or ["paths"]
+    coloured = {*COLOURS, *COLOURS.values()}.intersection(frame.passes)
+    return paths + (["lobe colours"] if coloured else [])
 
 
 def _ignored_lobes(settings: RenderSettings, meshes: list[MeshState]) -> list[str]:

@@ -176,14 +176,14 @@ def _read_mtl(path: Path, notes: list[str]) -> dict[str, MaterialFile]:
             elif keyword == "pm":
                 current.metallic = float(words[1])
             elif keyword == "map_kd":
-                current.base_colour_image = _image(line, path, notes)
+                current.base_colour_image = _image(current, line, path, notes)
                 if current.base_colour_image is not None:
                     current.base_colour = (1.0, 1.0, 1.0)
             elif keyword in ("d", "tr"):
                 hides = float(words[-1])
                 current.alpha = float(np.clip(hides if keyword == "d" else 1 - hides, 0, 1))
             elif keyword == "map_d":
-                picture = _image(line, path, notes)
+                picture = _image(current, line, path, notes)
                 if picture is not None:
                     current.alpha_image = picture.alpha or replace(picture, srgb=False)
             elif keyword == "ke":
@@ -192,7 +192,7 @@ def _read_mtl(path: Path, notes: list[str]) -> dict[str, MaterialFile]:
                     raise ValueError
                 current.emission = r, g, b
             elif keyword == "map_ke":
-                current.emission_image = _image(line, path, notes)
+                current.emission_image = _image(current, line, path, notes)
                 if current.emission_image is not None:
                     current.emission = (1.0, 1.0, 1.0)
             elif keyword == "pc":
@@ -208,29 +208,85 @@ def _read_mtl(path: Path, notes: list[str]) -> dict[str, MaterialFile]:
 
 def _read_normal_map(material: MaterialFile, line: str, path: Path, notes: list[str]) -> None:
     """A normal map, as Blender reads these statements; heights, which are grey, are left out with a note."""
-    image = _image(line, path, notes)
+    image = _image(material, line, path, notes, "-bm")
     if image is None:
         return
     if image.pixels.ndim == 2 or image.pixels.shape[2] < 3 or np.ptp(image.pixels[..., :3], axis=2).max() == 0:
         notes.append(f"{material.name}: heights of {line.split()[0]} ignored: only normal maps are read")
         return
-    words = line.split()
-    strength = float(words[words.index("-bm") + 1]) if "-bm" in words[:-1] else 1.0
-    if not np.isfinite(strength):
-        raise ValueError
-    material.normal_image, material.normal_strength = Image(image.pixels, srgb=False, file=image.file), strength
+    (strength,) = _map_options(line)[0].get("-bm", _NUMBERS["-bm"])
+    material.normal_image, material.normal_strength = replace(image, srgb=False), strength
 
 
-def _image(line: str, path: Path, notes: list[str]) -> Image | None:
-    """The image a map statement names (its options come first, the file last); ValueError where it names none."""
-    if len(line.split()) < 2:
+#: Options of map statements: the numbers that follow them, with which they change nothing, or the word.
+_NUMBERS = {
+    "-s": (1.0, 1.0, 1.0), "-o": (0.0, 0.0, 0.0), "-t": (0.0, 0.0, 0.0), "-mm": (0.0, 1.0), "-bm": (1.0,),
+    "-boost": (0.0,), "-texres": (0.0,),
+}  # fmt: skip
+_WORDS = {"-blendu": "on", "-blendv": "on", "-clamp": "off", "-cc": "off", "-imfchan": "", "-type": ""}
+
+
+def _map_options(line: str) -> tuple[dict[str, tuple[float, ...]], list[str], str]:
+    """Of a map statement: its numbers by option, which of its words change something, and the rest, a file's name.
+
+    Numbers that are left out at the end of an option are those that change nothing.
+
+    Raises
+    ------
+    ValueError
+        It names no file, or an option is not followed by what belongs to it.
+    """
+    numbers: dict[str, tuple[float, ...]] = {}
+    words: list[str] = []
+    _, rest = _split(line)
+    while (option := _split(rest)[0]) in _NUMBERS or option in _WORDS:
+        _, rest = _split(rest)
+        if option in _WORDS:
+            word, rest = _split(rest)
+            words += [option] if word != _WORDS[option] else []
+            continue
+        given: list[float] = []
+        while len(given) < len(_NUMBERS[option]) and (number := _number(_split(rest)[0])) is not None:
+            given.append(number)
+            _, rest = _split(rest)
+        if not given or not np.isfinite(given).all():
+            raise ValueError
+        numbers[option] = (*given, *_NUMBERS[option][len(given) :])
+    if not rest:
         raise ValueError
-    name = _text(line.split()[-1])
-    file = beside(path, name)
+    return numbers, words, rest
+
+
+def _split(text: str) -> tuple[str, str]:
+    """The first word, and what follows it."""
+    first, *rest = text.split(None, 1) or ("",)
+    return first, rest[0].strip() if rest else ""
+
+
+def _number(word: str) -> float | None:
+    try:
+        return float(word)
+    except ValueError:
+        return None
+
+
+def _image(material: MaterialFile, line: str, path: Path, notes: list[str], *used: str) -> Image | None:
+    """The image that a map statement names; ValueError where it names none.
+
+    `-s` and `-o` scale and move it, as in Blender; other options, but those `used`, are named.
+    """
+    numbers, words, rest = _map_options(line)
+    file = beside(path, name := _text(rest))
     if file is None or not file.is_file():
-        rest = _text(line.strip().split(None, 1)[1])  # a name with spaces and no options
-        file = beside(path, rest)
-    return load_texture(file, name, notes)
+        file = beside(path, name := _text(rest.split()[-1]))  # after options that are in no standard
+    image = load_texture(file, name, notes)
+    if image is None:
+        return None
+    ignored = [o for o, given in numbers.items() if o not in ("-s", "-o", *used) and given != _NUMBERS[o]] + words
+    if ignored:
+        notes.append(f"{material.name}: {', '.join(ignored)} of {line.split()[0]} ignored")
+    (su, sv, _), (ou, ov, _) = (numbers.get(option, _NUMBERS[option]) for option in ("-s", "-o"))
+    return replace(image, uv_transform=np.array([[su, 0.0, ou], [0.0, sv, ov]]))
 
 
 def load_texture(file: Path | None, name: str, notes: list[str]) -> Image | None:

@@ -106,6 +106,12 @@ def camera_parameters(camera: Camera, settings: RenderSettings, noise_index: int
     return out
 
 
+def footprints(depth: Array, parameters: Array) -> Array:
+    """(h, w) float32 metres: width of a pixel at `depth` (h, w) before the camera of `camera_parameters`."""
+    per_metre = np.float32(1.0 / min(parameters[FX], parameters[FY]))
+    return np.full_like(depth, per_metre) if parameters[ORTHOGRAPHIC] != 0.0 else depth * per_metre
+
+
 @njit
 def pixel_shift(parameters, pixel):  # type: ignore[no-untyped-def]
     """Toroidal shift of the sub-pixel lattice of a pixel.

@@ -25,7 +25,9 @@ from .film.cryptomatte import CryptoFilm
 from .film.film import Film
 from .film.light_group_film import LightGroupFilm
 from .film.light_passes import LIGHT_PASSES
+from .film.lobe_colours import put_lobe_colours
 from .film.motion_vectors import MotionFilm, SceneState, vector_pass
+from .film.object_numbers import object_numbers
 from .film.surface_film import SurfaceFilm
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.mesh import primary_mesh
@@ -106,13 +108,14 @@ def render(
     report(0.0, "Projecting")
     scene, lights = prepared.scene, prepared.lights
     visible = VisibleSurfaces(prepared, frame, parameters, backend)
-    film = Film(camera, settings, parameters)
+    film, numbers = Film(camera, settings, parameters), object_numbers(scene, frame)
     mattes = [
         CryptoFilm(kind, scene, frame)
         for kind, name in KINDS.items()
         if any(wanted.startswith(name) for wanted in frame.passes)
     ]
-    surfaces, groups = SurfaceFilm(scene, frame, parameters), LightGroupFilm(scene, lights, frame, parameters)
+    surfaces = SurfaceFilm(scene, frame, parameters, put_lobe_colours)
+    groups = LightGroupFilm(scene, lights, frame, parameters)
     if settings.denoise != "svgf":
         history = None
     left, top, right, bottom = camera.window
@@ -131,7 +134,7 @@ def render(
         buffer = visible.rows(y0, y1)
         check()
         radiance = batches.light(buffer)
-        film.add(buffer, radiance, scene.pass_index, prepared.seen)
+        film.add(buffer, radiance, numbers, prepared.seen)
         for matte in mattes:
             matte.add(buffer)
         surfaces.add(buffer)

@@ -23,6 +23,8 @@ from .backend import CPU, RenderBackend
 from .camera import camera_parameters
 from .film.film import Film
 from .film.light_group_film import LightGroupFilm
+from .film.lobe_colours import put_lobe_colours
+from .film.object_numbers import object_numbers
 from .film.surface_film import SurfaceFilm
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.visible_lights import visible_lights
@@ -259,7 +261,8 @@ class Progressive:
     def _develop(self, prepared: PreparedScene, check: Callable[[], None]) -> dict[str, Array]:
         camera, lights = self.frame.camera, prepared.lights
         film = Film(camera, self.frame.settings, self._parameters)
-        surfaces = SurfaceFilm(prepared.scene, self.frame, self._parameters)
+        numbers = object_numbers(prepared.scene, self.frame)
+        surfaces = SurfaceFilm(prepared.scene, self.frame, self._parameters, put_lobe_colours)
         groups = LightGroupFilm(prepared.scene, lights, self.frame, self._parameters)
         for strip in self._strips:
             buffer = self._samples(strip)
@@ -268,7 +271,7 @@ class Progressive:
             radiance = strip.radiance(buffer.points, exact)
             if prepared.captured:  # points that have no light yet were given that of their pixel
                 radiance.components[buffer.points.flags & UNLIT != 0] = 0.0
-            film.add(buffer, radiance, prepared.scene.pass_index, prepared.seen)
+            film.add(buffer, radiance, numbers, prepared.seen)
             surfaces.add(buffer)
             groups.add(buffer, radiance)
             if lights is not None and lights.seen:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import bpy
 import numpy as np
 import pytest
@@ -343,6 +345,37 @@ def test_a_failed_bake_is_named_and_the_rest_is_rendered(scene, bake, export, mo
     assert (
         warnings[1:] == before and len(frame.meshes) == 1 and frame.meshes[0].materials[0].base_colour_texture is None
     )
+
+
+def test_an_approximation_is_named_until_it_is_baked(scene, bake, monkeypatch):
+    obj = square()
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    noise(tree, shader.inputs["Base Color"])
+    log, manager = part("addon.messages"), part("addon.bakes").manager
+    with monkeypatch.context() as broken:
+        broken.setattr(part("addon.bakes.blender_process"), "command", lambda: ["/nowhere/blender"])
+        _, warnings = bake()
+    for text in (*warnings, "another"):
+        log.note("WARNING", text)
+    assert len(warnings) == 2 and "Noise Texture" in warnings[1]
+    manager.retry()
+    assert bake()[1] == []
+    assert {m.text for m in log.history}.intersection([*warnings, "another"]) == {"another"}
+
+
+def test_a_message_leaves_with_the_last_bake_that_it_depends_on():
+    """One material on two meshes says once how its node is approximated."""
+    log, requests = part("addon.messages"), part("addon.bakes.requests")
+    source = SimpleNamespace(told={}, failed={}, find=lambda key: {})
+    wanted = requests.Wanted(1, 1, source)
+    first, second = (SimpleNamespace(key=name, label=name) for name in ("first", "second"))
+    log.note("WARNING", "plain")
+    for made in (first, second):
+        wanted.depends(made, "plain")
+    for made, left in ((first, True), (second, False)):
+        wanted.find(made)
+        assert any(m.text == "plain" for m in log.history) == left
 
 
 @pytest.mark.slow

@@ -113,6 +113,18 @@ def test_what_is_in_focus_stays_where_it_is(white, kind):
         assert pixel == pytest.approx((camera.cx + camera.fx * 0.3 / far, camera.cy + camera.fy * 0.2 / far))
 
 
+def test_a_view_layer_without_motion_blur_keeps_its_depth_of_field(white, captured, ball):
+    """As in Cycles: its own switch counts where the scene has motion blur."""
+    white.render.engine, white.render.use_motion_blur = "DRGS", True
+    dof, layer = white.camera.data.dof, white.view_layers[0]
+    pictures = []
+    for layer.use_motion_blur, dof.use_dof in ((True, False), (False, False), (False, True)):
+        captured.clear()
+        bpy.ops.render.render()
+        pictures.append([p.camera.matrix_world[0, 3] for p in captured])
+    assert list(map(len, pictures)) == [16, 1, 16] and len(set(pictures[0])) == 1 and len(set(pictures[2])) == 16
+
+
 def test_rays_are_divided_and_surface_passes_stay_sharp(white, captured, ball):
     white.render.engine = "DRGS"
     white.view_layers[0].use_pass_z = True

@@ -341,7 +341,7 @@ def stored(group):
 
 def test_settings_of_another_version_become_sound_and_are_named(ball, scene, export):
     """A number out of its limits, no number, an entry that this version does not know, another type."""
-    blur = part("addon.render_engine.blur")
+    blur = part("addon.export.blur_steps")
     kept = {
         "samples": 2**31 - 1,
         "camera_sees": 7,
@@ -360,7 +360,7 @@ def test_settings_of_another_version_become_sound_and_are_named(ball, scene, exp
     assert (settings.samples, settings.bounces, settings.clamp_indirect) == (65536, 0, 0)
     assert (settings.camera_sees, settings.shading_model) == ("surfels", "principled")
     assert frame.objects[0].adjustment.roughness[0] == 1 and not frame.objects[0].visibility.holdout
-    assert len(blur.steps(scene, scene.camera, warnings.append)) == 1024
+    assert len(blur.steps(scene, scene.view_layers[0], scene.camera, warnings.append)) == 1024
     named = {w.split(" is ")[0] for w in warnings}
     assert named == {
         'Scene "Scene": Samples', 'Scene "Scene": Camera Sees', 'Scene "Scene": Bounces',

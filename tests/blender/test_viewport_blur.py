@@ -161,12 +161,15 @@ def test_keyframed_motion_is_that_of_f12(lit, views):
     assert asked(views, scene).parts == ()
 
 
-def test_while_it_plays_pictures_are_sharp(lit, views):
+def test_while_it_plays_or_in_a_layer_without_it_pictures_are_sharp(lit, views):
     keyed(lit.ball, "location", (-1, 0, 0), (1, 0, 0))
     lit.scene.frame_set(1)
     lit.scene.render.use_motion_blur = True
     assert len(asked(views, lit.scene).parts) == 8
     assert asked(views, lit.scene, playing=True).parts == ()
+    assert len(asked(views, lit.scene).parts) == 8
+    lit.scene.view_layers[0].use_motion_blur = False
+    assert asked(views, lit.scene).parts == ()
 
 
 def test_other_keyframes_of_the_same_moment_make_another_picture(lit, views):

@@ -100,6 +100,20 @@ def test_byte_image_is_decoded_as_cycles_does(scene, export, tmp_path):
     np.testing.assert_allclose(picture_of(frame.world, frame.camera), cycles_picture(scene), rtol=0.02, atol=5e-3)
 
 
+@pytest.mark.parametrize("name", [None, "/nowhere/sky.exr"])
+def test_a_world_without_its_picture_is_magenta_as_in_cycles(scene, export, name):
+    tree, background = new_world(scene)
+    texture = tree.nodes.new("ShaderNodeTexEnvironment")
+    if name:
+        texture.image = bpy.data.images.new("sky", 4, 4)
+        texture.image.source, texture.image.filepath = "FILE", name
+    tree.links.new(texture.outputs["Color"], background.inputs["Color"])
+    background.inputs["Strength"].default_value = 0.5
+    frame, (warning,) = export()
+    assert '"World"' in warning and "magenta" in warning and ("cannot be read" if name else "has no image") in warning
+    np.testing.assert_allclose(picture_of(frame.world, frame.camera), cycles_picture(scene), atol=1e-3)
+
+
 def test_strength_and_colour_chains(scene, export, sky):
     tree, background, texture, _ = link_sky(scene, sky[0])
     tint, math, value = (tree.nodes.new(n) for n in ("ShaderNodeMix", "ShaderNodeMath", "ShaderNodeValue"))

@@ -236,6 +236,21 @@ def test_the_same_noise_in_every_frame_is_told(denoise, rendered, tmp_path):
     assert sum("same noise" in line for line in lines) == 1
 
 
+def test_objects_without_light_take_no_part(rendered, tmp_path):
+    """What is shown as captured covers pixels, but its colours are 0; the engine leaves it out, too."""
+    from drgs_blender.render.denoise.noisy_frames import read_noisy
+
+    passes, metadata = read_frame(rendered / "noisy" / "0003.exr")
+    for name in ("DiffCol", "GlossCol", "TransCol"):
+        passes[name][:, : passes[name].shape[1] // 2] = 0.0
+    write_frame(tmp_path / "0003.exr", passes, metadata)
+    noisy, whole = read_noisy(tmp_path / "0003.exr"), passes["Coverage"][..., 0]
+    middle = whole.shape[1] // 2
+    assert whole[:, :middle].any() and not noisy.picture.guides.coverage[:, :middle].any()
+    np.testing.assert_array_equal(noisy.picture.guides.coverage[:, middle:], whole[:, middle:])
+    np.testing.assert_array_equal(noisy.passes["Coverage"][..., 0], whole)
+
+
 def test_frames_keep_the_cameras_to_the_bit(rendered):
     """The vectors that are made from a file are those of the engine."""
     from drgs_blender.render.denoise.noisy_frames import camera_metadata, read_noisy

@@ -174,3 +174,11 @@ def test_real_kernels_outlive_changes_elsewhere_and_no_others(tmp_path):
     assert compiled() == 0
     append("compute/jit.py", "\nX = 1\n")
     assert compiled() > 0
+
+
+def test_kernels_of_films_depend_on_no_lobe():
+    """A change of a lobe has only paths and the colours of lobes compiled again."""
+    render = closure.PACKAGE / "render"
+    lobes = set((render / "integrator/bsdf").glob("*.py"))
+    others = *render.glob("film/*.py"), *render.glob("gbuffer/*.py")
+    assert {path for path in others if lobes & closure.closure(path)} == {render / "film/lobe_colours.py"}

@@ -28,7 +28,7 @@ def wall(**changes: object) -> Guides:
         "albedo": np.full((H, W, 3), 0.5),
         "roughness": np.full((H, W), 0.5),
         "metallic": np.zeros((H, W)),
-        "pass_index": np.zeros((H, W)),
+        "object": np.zeros((H, W)),
         "footprint": np.full((H, W), 1e-3),
     }
     arrays |= changes  # type: ignore[arg-type]
@@ -84,7 +84,7 @@ def test_edges_stay_sharp(kind: str) -> None:
     else:
         diffuse = np.broadcast_to(np.where(left[..., 0], 0.5, 2.0), (H, W))
     if kind == "object":
-        changes["pass_index"] = np.broadcast_to(left[..., 0], (H, W))
+        changes["object"] = np.broadcast_to(left[..., 0], (H, W))
     if kind == "normal":
         changes["normal"] = np.broadcast_to(np.where(left, [0, -1.0, 0], [-0.8, -0.6, 0]), (H, W, 3))
     if kind == "depth":

@@ -28,7 +28,7 @@ def picture() -> tuple:
         position=np.stack([x, 2e-3 * np.sin(100 * x), z], -1),
         normal=normal / np.linalg.norm(normal, axis=2, keepdims=True),
         albedo=rng.uniform(0.05, 1, (H, W, 3)), roughness=rng.random((H, W)), metallic=rng.random((H, W)),
-        pass_index=np.arange(W)[None, :] // 20 + np.zeros((H, 1)),
+        object=np.arange(W)[None, :] // 20 + np.zeros((H, 1)),
         coverage=(rng.random((H, W)) < 0.9) * rng.random((H, W)),
     )  # fmt: skip
     guides.coverage[5:8] = 0.0

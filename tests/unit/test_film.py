@@ -9,6 +9,7 @@ from drgs_blender.core.frame import Camera, RenderSettings, World
 from drgs_blender.core.passes import BY_NAME
 from drgs_blender.render.camera import camera_parameters, sample_ray
 from drgs_blender.render.film.film import EMPTY_DEPTH, Film
+from drgs_blender.render.film.object_numbers import ObjectNumbers
 from drgs_blender.render.film.surface_film import CHANNELS
 from drgs_blender.render.gbuffer.gbuffer import GBuffer, compact
 from drgs_blender.render.lights.environment import EnvironmentLight
@@ -43,6 +44,11 @@ def random_light(n: int, seed: int = 1) -> Radiance:
     return Radiance(rng.random((n, 4, 3)).astype(np.float32), rng.random((n, 2)).astype(np.float32))
 
 
+def numbers(*pass_index: int) -> ObjectNumbers:
+    rows = np.arange(len(pass_index), dtype=np.int32)
+    return ObjectNumbers(rows, np.array(pass_index, np.int32), rows + 1)
+
+
 def expose(
     alpha: np.ndarray, transparent: bool, world: World | None = None, view: Camera | None = None
 ) -> tuple[Film, GBuffer, Radiance]:
@@ -51,7 +57,7 @@ def expose(
     film = Film(view, settings, camera_parameters(view, settings, 1))
     buffer = strip(view, settings, (view.window[1], view.window[3]), alpha)
     light = random_light(len(buffer.points))
-    film.add(buffer, light, np.array([7], np.int32), EnvironmentLight(world or World()))
+    film.add(buffer, light, numbers(7), EnvironmentLight(world or World()))
     return film, buffer, light
 
 
@@ -122,9 +128,10 @@ def test_depth_and_index_at_an_edge_are_of_the_nearest_surface() -> None:
     buffer.depth[:] = np.where(near, 2.0, 50.0)
     buffer.position[:] = np.where(near, 1.0, -30.0)[:, None]
     buffer.object_index[:] = np.where(near, 1, 0)
-    film.add(buffer, random_light(len(near)), np.array([7, 9], np.int32), EnvironmentLight(World()))
+    film.add(buffer, random_light(len(near)), numbers(7, 9), EnvironmentLight(World()))
     p = film.passes(ALL, WHITE)
     assert (p["Depth"] == 2).all() and (p["Position"] == 1).all() and (p["IndexOB"] == 9).all()
+    assert (p["Object"] == 2).all()
 
 
 def test_background_is_the_mean_over_the_sub_pixel_rays() -> None:

@@ -499,6 +499,27 @@ def test_obj_with_materials(tmp_path: Path) -> None:
     assert mesh.up_axis == "unknown"
 
 
+def test_options_of_mtl_maps_move_textures_or_are_named(tmp_path: Path) -> None:
+    """Names may hold spaces; numbers that are left out change nothing."""
+    (tmp_path / "a.obj").write_text(OBJ)
+    (tmp_path / "a.mtl").write_text(
+        "newmtl red paint\nmap_Kd -clamp on -o .25 -.5 -s 2 3 1 -mm 0 1 -blendu on my wood.png\n"
+        "map_Ke -s 2 -mm .1 2 -imfchan l my wood.png\nmap_d -boost 1 -s x my wood.png\nnorm -bm .5 -o 0 1 n.png\n"
+    )
+    Pillow.fromarray(np.full((2, 2, 3), 7, np.uint8)).save(tmp_path / "my wood.png")
+    Pillow.fromarray(np.uint8([[[127, 127, 255]]])).save(tmp_path / "n.png")
+    mesh = read_mesh(tmp_path / "a.obj")
+    paint = mesh.materials[0]
+    np.testing.assert_array_equal(paint.base_colour_image.uv_transform, [[2, 0, 0.25], [0, 3, -0.5]])
+    np.testing.assert_array_equal(paint.emission_image.uv_transform, [[2, 0, 0], [0, 1, 0]])
+    np.testing.assert_array_equal(paint.normal_image.uv_transform, [[1, 0, 0], [0, 1, 1]])
+    assert paint.normal_strength == 0.5 and paint.alpha_image is None and not paint.normal_image.srgb
+    assert [note for note in mesh.notes if "glass" not in note and "colours" not in note] == [
+        "red paint: -clamp of map_Kd ignored", "red paint: -mm, -imfchan of map_Ke ignored",
+        "a.mtl: line 'map_d -boost 1 -s x my wood.png' not understood",
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize(
     "line", ["f 1 2 9", "f 1 2 -9", "f 0 1 2", "v 1 2", "v a b c", "f 1//7 2 3", "f /1 /2 /3", "vt"]
 )

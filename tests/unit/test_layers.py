@@ -16,6 +16,7 @@ from drgs_blender.core.passes import BY_NAME
 from drgs_blender.render import pipeline
 from drgs_blender.render.camera import camera_parameters
 from drgs_blender.render.film.film import Film
+from drgs_blender.render.film.object_numbers import ObjectNumbers
 from drgs_blender.render.gbuffer.gbuffer import GBuffer
 from drgs_blender.render.gbuffer.mesh import primary_mesh
 from drgs_blender.render.gbuffer.surfels import primary_surfels, snap_windows
@@ -143,7 +144,8 @@ def developed(buffer: GBuffer, scene: TraceScene, radiance: Radiance, transparen
     camera = look_along_y(SIZE)
     settings = replace(SETTINGS, film_transparent=transparent)
     film = Film(camera, settings, camera_parameters(camera, settings, 1))
-    film.add(buffer, radiance, scene.pass_index, EnvironmentLight(World(colour=(1.0, 0.5, 0.25))))
+    rows = ObjectNumbers(np.arange(len(scene.source), dtype=np.int32), scene.pass_index, scene.pass_index)
+    film.add(buffer, radiance, rows, EnvironmentLight(World(colour=(1.0, 0.5, 0.25))))
     white = np.ones((*buffer.alpha.shape[:2], 3), np.float32)
     apart = {
         "DiffCol",

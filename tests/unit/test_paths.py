@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from test_surface import mesh_state
 
-from drgs_blender.compute import threads
+from drgs_blender.compute import manifest, threads
 from drgs_blender.core.frame import Camera, Frame, Light, RenderSettings, World
 from drgs_blender.core.materials import Material, Part
-from drgs_blender.engine.session import Session
+from drgs_blender.engine.session import Session, jobs_of
+from drgs_blender.render.integrator import paths
 
 SQUARE = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 FACES = np.int32([[0, 1, 2], [0, 2, 3]])
@@ -87,6 +88,30 @@ def test_threads_and_pieces_of_the_picture_change_no_sample():
     how = RenderSettings(samples=16, bounces=4, camera_sees="mesh")
     part = Session().render(Frame(0, camera, [], sky(), how, ("Combined",), meshes))["Combined"]
     np.testing.assert_array_equal(whole[3:8, 2:9], part[..., :3])
+
+
+def test_the_kernel_is_compiled_ahead_where_a_material_needs_it():
+    """The list has it as it is called; frames without such a material, or of another model, do not ask for it."""
+    glass, plain = card(Material("glass", kind="glass")), card(SPEC)
+    picture([glass], size=4, samples=4)
+    lamp = Light("l", "point", at(2.0))
+
+    def jobs(meshes, passes=("Combined",), lights=(), **settings):
+        camera, how = Camera(at(5.0), 4, 4, 4, 4, 2, 2), RenderSettings(**settings)
+        return jobs_of(Frame(0, camera, [], World(), how, passes, meshes, list(lights)))
+
+    def listed(*args, **settings):
+        kernels = manifest.needed(jobs(*args, **settings))
+        return {manifest.signature(k) for k in kernels if k.module == paths.__name__ and k.name == "_kernel"}
+
+    (own,) = listed([glass])
+    assert own in paths._kernel.signatures
+    assert not listed([plain]) and not listed([glass], shading_model="paper")
+    (linked,) = listed([glass], lights=[replace(lamp, receivers=0)])
+    (grouped,) = listed([glass], ("Combined", "Combined_key"), [replace(lamp, light_group="key")])
+    assert set(paths._kernel.signatures) <= {own, linked, grouped} and len({own, linked, grouped}) == 3
+    coloured = ["lobe colours" in jobs([glass], (name,)) for name in ("Combined", "DiffDir", "TransCol")]
+    assert coloured == [False, True, True]
 
 
 def test_smooth_glass_in_an_even_world_cannot_be_seen():

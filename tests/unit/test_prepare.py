@@ -342,3 +342,13 @@ def test_a_signal_ends_preparing_as_an_exit(number: int) -> None:
     finally:
         for n, handler in previous.items():
             signal.signal(n, handler)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux has such a file")
+def test_help_that_cannot_be_written_is_a_failure(monkeypatch, capsys) -> None:
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert prepare.main(["--help"]) == 73
+        with pytest.raises(OSError):
+            full.close()
+    assert capsys.readouterr().err == "prepare: standard output cannot be written: No space left on device\n"

@@ -146,6 +146,20 @@ def test_uv_and_indices(scene: Scene) -> None:
     assert (p["UV"][p["Coverage"][..., 0] == 0] == 0).all()
 
 
+def test_objects_have_the_same_numbers_whatever_is_beside_them(scene: Scene) -> None:
+    """Two of one pass index differ; another object before them changes neither number nor index."""
+    _, frame = scene
+    floor, glow = frame.meshes
+    ball = [replace(frame.objects[0], pass_index=0)]
+    p = rendered(scene, "Object", "IndexMA", objects=ball)
+    numbers = {int(k): np.unique(p["Object"][p["IndexMA"] == k]) for k in (0, 5, 6, 9)}
+    assert numbers[0] == [0] and all(len(found) == 1 for found in numbers.values())
+    assert len({float(found[0]) for found in numbers.values()}) == 4
+    before = replace(glow, name="other", vertices=glow.vertices - np.float32([0, 0, 5]))
+    q = rendered(scene, "Object", "IndexMA", "IndexOB", objects=ball, meshes=[before, floor, glow])
+    assert np.array_equal(q["Object"], p["Object"]) and not q["IndexOB"].any()
+
+
 def test_uv_map_of_another_size_is_named(scene: Scene) -> None:
     bad = replace(scene[1].meshes[0], uv_map=np.zeros((3, 3, 2), np.float32))
     with pytest.raises(AssetError, match="UV map of floor"):

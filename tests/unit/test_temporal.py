@@ -245,14 +245,14 @@ def test_what_comes_into_view_starts_anew() -> None:
     pictures = []
     for k in range(5):
         g = wall(step * k - 8, box=True)
-        on_box = g.pass_index == 1
+        on_box = g.object == 1
         pictures.append(picture(g, np.where(on_box, 0.5, 3.0), 0.2, k, moved(g, step, on_box)))
     last = pictures[-1].guides
     found = diffuse(gathered(pictures))
     x = np.arange(W) + 0.5
     box = np.abs(x - (W / 2 + 8)) < 5
     fresh = (np.abs(x - (W / 2 + 4)) < 5) & ~box
-    assert (last.pass_index[0] == box).all() and fresh.sum() == 4
+    assert (last.object[0] == box).all() and fresh.sum() == 4
     present = prepare(pictures[-1].components, pictures[-1].variance, last, split=False)
     assert (found[:, fresh] == diffuse(present)[:, fresh]).all()
     old = np.abs(x - W / 2) > 20
@@ -264,7 +264,7 @@ def test_what_comes_into_view_starts_anew() -> None:
 def test_surfaces_that_turn_away_or_change_places_are_not_mixed() -> None:
     before, now = wall(), wall()
     now.normal[:, : W // 2] = [0.9, -np.sqrt(1 - 0.81), 0]
-    now.pass_index[: H // 2] = 7
+    now.object[: H // 2] = 7
     now.position[:, -6:, 1] += 0.05  # something else of the same object, behind
     found = diffuse(gathered([picture(before, 5.0, 0.1, 0), picture(now, 1.0, 0.1, 1, still(now))]))
     present = diffuse(gathered([picture(now, 1.0, 0.1, 1)]))
@@ -351,10 +351,10 @@ def test_window_does_not_mix_what_is_hidden_in_other_frames() -> None:
     pictures = []
     for k in range(5):
         g = wall(5.0 * k - 10, box=True)
-        on_box = g.pass_index == 1
+        on_box = g.object == 1
         pictures.append(picture(g, np.where(on_box, 0.5, 3.0), 0.05, k, moved(g, 5.0, on_box)))
     found = window(pictures)[:, :, 0, 0]
-    on_box = pictures[2].guides.pass_index == 1
+    on_box = pictures[2].guides.object == 1
     albedo = pictures[2].guides.albedo[..., 0]
     assert np.abs(found / albedo - np.where(on_box, 0.5, 3.0)).max() < 0.15
 

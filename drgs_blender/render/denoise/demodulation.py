@@ -24,7 +24,7 @@ DIELECTRIC_F0 = 0.04
 LEVELS = 5
 #: Pixels a kernel works on at once; empty columns left and right of a picture (twice the last level's step).
 TILE, PAD = 128, 2 << (LEVELS - 1)
-#: Planes of a guide. ``SURFACE`` is the object's pass index, NaN where nothing is covered; ``SOURCE`` the same, and NaN
+#: Planes of a guide. ``SURFACE`` is the object's number, NaN where nothing is covered; ``SOURCE`` the same, and NaN
 #: where the light is no number, too. ``WIDTH`` is the inverse width of a pixel, 1/m.
 POSITION, NORMAL, ROUGHNESS, SOURCE, SURFACE, WIDTH, GUIDES = 0, 3, 6, 7, 8, 9, 10
 #: Planes of a signal, two lobes each: luminance, its variance, the inverse of the difference that counts; the light.

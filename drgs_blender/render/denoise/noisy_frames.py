@@ -16,8 +16,7 @@ import numpy as np
 from ...core.errors import AssetError
 from ...core.frame import Camera, Frame, RenderSettings
 from ...core.passes import COLOURS, TEMPORAL
-from ..camera import camera_parameters
-from ..film.film import footprints
+from ..camera import camera_parameters, footprints
 from ..film.frame_files import read_frame
 from ..film.guides import Guides
 from ..film.light_passes import COMPONENTS, add_light
@@ -29,7 +28,7 @@ Array = np.ndarray
 #: How far the numbers of two cameras may lie apart (metres, radians, pixels) that are the same one evaluated twice.
 SAME_CAMERA = 1e-4
 #: Passes of newer versions, which add to the others.
-_LATER = ("TransDir", "TransInd", "TransCol")
+_LATER = ("TransDir", "TransInd", "TransCol", "Object")
 _HOW = "Render it with `drgs render --denoise none --passes temporal`, or with Store Denoising Data switched on"
 
 
@@ -97,19 +96,21 @@ def read_noisy(path: str | Path) -> NoisyFrame:
     except (KeyError, ValueError, TypeError) as error:
         raise AssetError(str(path), "does not say through which camera it was seen", _HOW) from error
     position, coverage = passes["Position"], _one(passes, "Coverage")
+    # Where all colours are 0, light is 0: of objects that are shown as captured, which take no part.
+    colours = [passes[name].any(axis=2) for name in ("DiffCol", "GlossCol", "TransCol") if name in passes]
     guides = Guides(
-        coverage,
+        np.where(np.any(colours, axis=0), coverage, np.float32(0.0)),
         position,
         passes["Normal"],
         passes["Albedo"],
         _one(passes, "Roughness"),
         _one(passes, "Metallic"),
-        _one(passes, "IndexOB"),
+        _one(passes, "Object" if "Object" in passes else "IndexOB"),
         footprints(_one(passes, "Depth"), now),
     )
     components = np.stack([passes.pop(name) * passes[COLOURS[name]] for name in COMPONENTS], axis=2)
     transmitted = None
-    if all(name in passes for name in _LATER):
+    if all(name in passes for name in _LATER[:3]):
         transmitted = np.stack([passes.pop(name) * passes[COLOURS[name]] for name in _LATER[:2]], axis=2)
         components[:, :, 2:] += transmitted
     moved: Motion = motion(position, passes.pop("Previous Position"), coverage, now, before)

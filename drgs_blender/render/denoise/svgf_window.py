@@ -110,7 +110,7 @@ def _neighbours(pictures: Sequence[NoisyPicture | None]) -> Iterator[tuple[int, 
                 break
             # The picture that the motion belongs to, in both directions the later one.
             g = here.guides if direction < 0 else there.guides
-            index = centre.guides.pass_index
+            index = centre.guides.object
             over_range(kernel, len(vector), motion, g, index, vector, expected, fewest=ROWS)
             yield abs(k - middle), there, vector, expected
             here = there
@@ -177,14 +177,14 @@ def _away(seen, guides, y, x, px, py, pz):  # type: ignore[no-untyped-def]
 @njit
 def _step_back(y0, y1, motion, guides, centre, vector, expected):  # type: ignore[no-untyped-def]
     """Follow the motion of the picture that `vector` leads to, one frame further back."""
-    h, w = guides.pass_index.shape
+    h, w = guides.object.shape
     for y in range(y0, y1):
         for x in range(w):
             i, j = _nearest(np.float32(x) + vector[y, x, 0], np.float32(y) + vector[y, x, 1], w, h)
             px, py, pz = expected[y, x, 0], expected[y, x, 1], expected[y, x, 2]
             if (
                 i < 0
-                or guides.pass_index[j, i] != centre[y, x]
+                or guides.object[j, i] != centre[y, x]
                 or not _away(guides.position, guides, j, i, px, py, pz) < np.float32(SAME_PLANE)
             ):
                 vector[y, x, 0] = np.float32(np.nan)
@@ -198,7 +198,7 @@ def _step_back(y0, y1, motion, guides, centre, vector, expected):  # type: ignor
 @njit
 def _step_ahead(y0, y1, motion, guides, centre, vector, expected):  # type: ignore[no-untyped-def]
     """Search the picture after that which `vector` leads to for the pixel whose motion leads back there."""
-    h, w = guides.pass_index.shape
+    h, w = guides.object.shape
     for y in range(y0, y1):
         for x in range(w):
             tx, ty = np.float32(x) + vector[y, x, 0], np.float32(y) + vector[y, x, 1]
@@ -216,7 +216,7 @@ def _step_ahead(y0, y1, motion, guides, centre, vector, expected):  # type: igno
                     break
             if (
                 not found
-                or guides.pass_index[j, i] != centre[y, x]
+                or guides.object[j, i] != centre[y, x]
                 or not _away(motion.previous, guides, j, i, px, py, pz) < np.float32(SAME_PLANE)
             ):
                 vector[y, x, 0] = np.float32(np.nan)

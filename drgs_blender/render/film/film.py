@@ -6,7 +6,7 @@ by coverage. Passes that describe the surface are not premultiplied, so that the
 - Depth, Position: mean of the samples on the surface nearest to the camera (those within `SAME_SURFACE` pixel widths
   of the nearest one), so that no value lies between two surfaces; 1e10 and 0 where the pixel is empty;
 - Normal, Albedo, Roughness, Metallic: mean of all covered samples by weight;
-- IndexOB: of the nearest sample.
+- IndexOB, Object: of the nearest sample.
 
 Combined is the light of `Pixels.components` + environment + emission, added in this order. The passes of light are
 these components divided by the colours of the surfaces, as in Cycles (`core.passes.COLOURS`).
@@ -26,13 +26,14 @@ from ...compute.jit import njit
 from ...compute.threads import ROWS, over_range
 from ...core.frame import Camera, RenderSettings
 from ...core.passes import COLOURS, without_colour
-from ..camera import FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, sample_ray
+from ..camera import FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, footprints, sample_ray
 from ..gbuffer.gbuffer import GBuffer
 from ..lights.environment import EnvironmentLight, envmap_radiance, map_at
 from ..sampling import luminance
 from ..shading_points import CATCHER, UNLIT, Radiance
 from .guides import Guides
 from .light_passes import LIGHT_PASSES, add_light, light_parts
+from .object_numbers import ObjectNumbers, number_of
 from .surface_film import mean_of_points
 
 Array = np.ndarray
@@ -51,8 +52,8 @@ class Pixels(NamedTuple):
     ----------
     coverage, roughness, metallic : (h, w) array
         In [0, 1].
-    pass_index : (h, w) array
-        Of the nearest sample's object, Blender's IndexOB.
+    object_row : (h, w) array
+        Of the nearest sample's object, in `ObjectNumbers`.
     depth : (h, w) array
         Metres along the view axis; `EMPTY_DEPTH` where the pixel is empty.
     position : (h, w, 3) array
@@ -77,7 +78,7 @@ class Pixels(NamedTuple):
     albedo: Array
     roughness: Array
     metallic: Array
-    pass_index: Array
+    object_row: Array
     depth: Array
     components: Array
     variance: Array
@@ -87,7 +88,7 @@ class Pixels(NamedTuple):
     @classmethod
     def empty(cls, size: tuple[int, int]) -> Pixels:
         """Pixels (h, w) that nothing covers."""
-        scalars = {"coverage": (), "roughness": (), "metallic": (), "pass_index": (), "depth": ()}
+        scalars = {"coverage": (), "roughness": (), "metallic": (), "object_row": (), "depth": ()}
         widths = scalars | {"components": (4, 3), "variance": (2,)}
         made = cls(*(np.zeros((*size, *widths.get(name, (3,))), np.float32) for name in cls._fields))
         made.depth[:] = EMPTY_DEPTH
@@ -125,18 +126,23 @@ class Film:
         self.environment, self.veiled = (np.zeros((*size, 3), np.float32) for _ in range(2))
         self.unlit: Array | None = None
         self.transmitted: Array | None = None
+        self._objects: ObjectNumbers | None = None
 
-    def add(self, buffer: GBuffer, radiance: Radiance, pass_index: Array, environment: EnvironmentLight) -> None:
+    def add(
+        self, buffer: GBuffer, radiance: Radiance, objects: ObjectNumbers, environment: EnvironmentLight
+    ) -> None:  # fmt: skip
         """Take the strip `buffer` with the light of its points.
 
         Parameters
         ----------
         buffer : GBuffer
         radiance : Radiance
-        pass_index : (objects,) int32 array
+        objects : ObjectNumbers
+            The same for all strips.
         environment : EnvironmentLight
             Background, unless the film is transparent.
         """
+        self._objects = objects
         x0, top = self.origin
         y0, y1 = buffer.rows
         rows = slice(y0 - top, y1 - top)
@@ -156,7 +162,7 @@ class Film:
         light = radiance.components, radiance.variance, unshadowed
         over_range(
             _develop, y1 - y0, buffer.point_rows(x0, int(self.parameters[WIDTH])), buffer.surfaces(), light,
-            pass_index, self.parameters, self.pixels.rows(y0 - top, y1 - top), fewest=ROWS)  # fmt: skip
+            objects.row, self.parameters, self.pixels.rows(y0 - top, y1 - top), fewest=ROWS)  # fmt: skip
         if not self.transparent and not environment.black:
             over_range(
                 _background, y1 - y0, self.parameters, x0, y0, buffer.alpha, environment.envmap,
@@ -175,7 +181,10 @@ class Film:
             lit = known["coverage"] - self.unlit
             known["coverage"] = np.where(lit > _ROUNDING, lit, np.float32(0.0))
         shared = {name: known[name] for name in Guides._fields if name in known}
-        return Guides(**shared, footprint=footprints(self.pixels.depth, self.parameters))
+        return Guides(**shared, object=self._number("name"), footprint=footprints(known["depth"], self.parameters))
+
+    def _number(self, kind: str) -> Array:
+        return number_of(self._objects, kind, self.pixels.object_row, self.pixels.depth == EMPTY_DEPTH)
 
     def passes(
         self,
@@ -216,7 +225,8 @@ class Film:
             "Roughness": seen.roughness,
             "Metallic": seen.metallic,
             "Coverage": seen.coverage,
-            "IndexOB": seen.pass_index,
+            "IndexOB": self._number("pass_index"),
+            "Object": self._number("name"),
         }
         made |= {name: values[..., None] for name, values in scalars.items()}
         if "Combined" in names:
@@ -242,14 +252,8 @@ class Film:
         return add_light(light, environment, self.pixels.emission, opaque)
 
 
-def footprints(depth: Array, parameters: Array) -> Array:
-    """(h, w) float32 metres: width of a pixel at `depth` (h, w) before the camera of `parameters`."""
-    per_metre = np.float32(1.0 / min(parameters[FX], parameters[FY]))
-    return np.full_like(depth, per_metre) if parameters[ORTHOGRAPHIC] != 0.0 else depth * per_metre
-
-
 @njit
-def _develop(y0, y1, points, surfaces, light, pass_index, p, pixels):  # type: ignore[no-untyped-def]
+def _develop(y0, y1, points, surfaces, light, row, p, pixels):  # type: ignore[no-untyped-def]
     """Sum the points of each pixel of some rows; they are neighbours in the arrays.
 
     Parameters
@@ -258,7 +262,8 @@ def _develop(y0, y1, points, surfaces, light, pass_index, p, pixels):  # type: i
     surfaces : PointSurfaces
     light : tuple of array
         Components, variance and unshadowed luminance of `Radiance`.
-    pass_index : array
+    row : array
+        Of `ObjectNumbers`.
     p : array
         `camera.camera_parameters`.
     pixels : Pixels
@@ -337,7 +342,7 @@ def _develop(y0, y1, points, surfaces, light, pass_index, p, pixels):  # type: i
                 b * inverse,
             )
             pixels.roughness[y, x], pixels.metallic[y, x] = rough * inverse, metal * inverse
-            pixels.pass_index[y, x] = np.float32(pass_index[surfaces.object_index[nearest]])
+            pixels.object_row[y, x] = np.float32(row[surfaces.object_index[nearest]])
             first = last
 
 

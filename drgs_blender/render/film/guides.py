@@ -18,8 +18,8 @@ class Guides(NamedTuple):
     ----------
     coverage, roughness, metallic : (h, w) array
         In [0, 1].
-    pass_index : (h, w) array
-        Of the object, Blender's IndexOB.
+    object : (h, w) array
+        Number of the object, see `ObjectNumbers.name`.
     position : (h, w, 3) array
         World, m; 0 where the pixel is empty.
     normal : (h, w, 3) array
@@ -36,7 +36,7 @@ class Guides(NamedTuple):
     albedo: Array
     roughness: Array
     metallic: Array
-    pass_index: Array
+    object: Array
     footprint: Array
 
     def plain(self) -> Guides:

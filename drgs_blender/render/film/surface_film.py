@@ -10,6 +10,8 @@ up where the ray meets the surface; colours are cut at 0, and have as alpha the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from ...compute.jit import njit
@@ -20,12 +22,14 @@ from ..camera import POSITION
 from ..gbuffer.gbuffer import GBuffer
 from ..integrator import brdf
 from ..sampling import ONE, ZERO, F
+from ..scene.interaction import Geometry
+from ..scene.material_rows import MaterialRows
 from ..scene.shader_aovs import aov_at
 from ..scene.trace_scene import TraceScene
-from ..shading_points import CATCHER, UNLIT
-from .lobe_colours import put_lobe_colours
+from ..shading_points import CATCHER, UNLIT, ShadingPoints
 
 Array = np.ndarray
+PutColours = Callable[[ShadingPoints, Geometry, MaterialRows, tuple[Array, Array, Array]], None]
 
 #: Name -> channels.
 CHANNELS = {"DiffCol": 3, "GlossCol": 3, "TransCol": 3, "UV": 3, "Mist": 1, "IndexMA": 1}
@@ -42,14 +46,17 @@ class SurfaceFilm:
     frame : Frame
     parameters : array
         `camera.camera_parameters`.
+    put_colours : callable
+        `lobe_colours.put_lobe_colours`; handed in, so that kernels of films depend on no lobe.
     """
 
-    def __init__(self, scene: TraceScene, frame: Frame, parameters: Array) -> None:
+    def __init__(self, scene: TraceScene, frame: Frame, parameters: Array, put_colours: PutColours) -> None:
         x0, y0, x1, y1 = frame.camera.window
         wanted = {*frame.passes, *(COLOURS[name] for name in frame.passes if name in COLOURS)}
         self._aovs = [name for name in frame.passes if name.startswith(AOVS)]
         widths = CHANNELS | {name: len(kind.channels) for name in self._aovs if (kind := pass_of(name))}
         self._scene, self._frame, self._parameters, self._origin = scene, frame, parameters, (x0, y0)
+        self._put_colours = put_colours
         self.pixels = {
             name: np.zeros((y1 - y0, x1 - x0, channels), np.float32)
             for name, channels in widths.items()
@@ -91,7 +98,7 @@ class SurfaceFilm:
         over_range(_lobe_colours, len(points), points.arrays, model, tables, diffuse, glossy, fewest=ELEMENTS)
         rows = self._scene.mesh_materials.table.rows
         if rows is not None and self._frame.settings.shading_model == "principled":
-            put_lobe_colours(points, self._scene.geometry, rows, (diffuse, glossy, passed))
+            self._put_colours(points, self._scene.geometry, rows, (diffuse, glossy, passed))
         unlit = points.flags & UNLIT != 0  # they emit alone
         if unlit.any():
             diffuse[unlit] = glossy[unlit] = passed[unlit] = 0.0

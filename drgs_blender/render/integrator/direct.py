@@ -52,6 +52,13 @@ def _add(sums, h, kind, qr, qg, qb, sr, sg, sb):  # type: ignore[no-untyped-def]
 
 
 @njit
+def _reflect_sample(lights, sums, rays, slot, group, diffuse, glossy):  # type: ignore[no-untyped-def]
+    """`_reflect` of a sample of the environment or of lights, and its share of the light's group."""
+    _reflect(sums, rays, slot, 0, diffuse, glossy)
+    credit_point(lights, sums, rays, slot, 0, group, diffuse, glossy)
+
+
+@njit
 def _reflect(sums, rays, slot, kind, diffuse, glossy):  # type: ignore[no-untyped-def]
     """Add what a slot's point reflects of the light that its diffuse and its glossy lobe get along the ray."""
     s, ints = rays
@@ -150,9 +157,8 @@ def _trace_lights(rays, count, scene, settings, sums):  # type: ignore[no-untype
         receiver = s[i + w.POINT_SET]
         dr, dg, db, gr, gg, gb = light_radiance(rays, slot, others, glossy_others, s[i + w.WL], receiver, scene, mask)
         if dr + dg + db + gr + gg + gb > ZERO:
-            _reflect(sums, rays, slot, 0, (dr, dg, db), (gr, gg, gb))
             group = group_of_sample(scene.lights, receiver, np.int64(rays.ints[c + w.CELL]))
-            credit_point(scene.lights, sums, rays, slot, 0, group, (dr, dg, db), (gr, gg, gb))
+            _reflect_sample(scene.lights, sums, rays, slot, group, (dr, dg, db), (gr, gg, gb))
 
 
 @njit
@@ -165,8 +171,7 @@ def _see_envmap(rays, count, scene, sums):  # type: ignore[no-untyped-def]
         if through > ZERO:
             r, g, b = envmap_radiance(s[i + w.MU], s[i + w.MV], scene.envmap)
             light = r * through, g * through, b * through
-            _reflect(sums, rays, slot, 0, light, light)
-            credit_point(scene.lights, sums, rays, slot, 0, group_of_environment(scene.lights), light, light)
+            _reflect_sample(scene.lights, sums, rays, slot, group_of_environment(scene.lights), light, light)
 
 
 @njit

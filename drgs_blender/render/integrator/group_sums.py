@@ -13,7 +13,7 @@ import numpy as np
 from ...compute.jit import njit, overload
 from ..lights.light_groups import first_lamp, is_grouped
 from ..lights.light_sampler import light_along
-from ..lights.light_tree import COUNT, END, FIRST, NEXT, PAST, SECOND, SUNS, box_hit
+from ..lights.light_tree import END, FIRST, PAST, SUNS, leaf_along
 from ..sampling import ZERO, F
 from . import wavefront as w
 
@@ -113,17 +113,13 @@ def _lamp(row, base, i, first, scale, ray, lights, own):  # type: ignore[no-unty
 @njit
 def _lamps(row, base, first, scale, ray, lights, own):  # type: ignore[no-untyped-def]
     """`lights_along`, lamp by lamp to the columns of their groups, times a scale per channel."""
-    (ox, oy, oz), (dx, dy, dz), reach = ray[0], ray[1], ray[2]
     pick = own.pick
-    node, count = np.int64(1), np.int64(pick[0, COUNT])
-    while node < count:
-        if not box_hit(node, ox, oy, oz, dx, dy, dz, reach, pick):
-            node = np.int64(pick[node, NEXT])
-            continue
-        if pick[node, SECOND] == ZERO:
+    node = np.int64(0)
+    while node >= 0:
+        node = leaf_along(node + 1, ray[0], ray[1], ray[2], pick)
+        if node > 0:
             for i in range(np.int64(pick[node, FIRST]), np.int64(pick[node, PAST])):
                 _lamp(row, base, i, first, scale, ray, lights, own)
-        node += 1
     for i in range(np.int64(pick[0, SUNS]), np.int64(pick[0, END])):
         _lamp(row, base, i, first, scale, ray, lights, own)
 

@@ -97,6 +97,15 @@ def _evaluate(rays, count, scene, shading_model):  # type: ignore[no-untyped-def
 
 
 @njit
+def _find(lights, found, owner, group, r, g, b):  # type: ignore[no-untyped-def]
+    """Add light that a path brings, to it and to the group that the light is of."""
+    found[owner, INDIRECT] += r
+    found[owner, INDIRECT + 1] += g
+    found[owner, INDIRECT + 2] += b
+    credit_path(lights, found, owner, group, r, g, b)
+
+
+@njit
 def _towards_envmap(rays, count, scene, shift, found):  # type: ignore[no-untyped-def]
     """The environment samples that `environment_directions` drew and `path_weights` weighed."""
     s, ints = rays
@@ -110,12 +119,8 @@ def _towards_envmap(rays, count, scene, shift, found):  # type: ignore[no-untype
         red, green, blue = red * s[i + w.QR] * weight, green * s[i + w.QG] * weight, blue * s[i + w.QB] * weight
         if red + green + blue > ZERO:
             through = passed(scene, rays, slot, FAR, np.int32(ray_masks.SHADOW << shift))
-            owner = np.int64(ints[c + w.OWNER])
-            found[owner, INDIRECT] += red * through
-            found[owner, INDIRECT + 1] += green * through
-            found[owner, INDIRECT + 2] += blue * through
-            group = group_of_environment(scene.lights)
-            credit_path(scene.lights, found, owner, group, red * through, green * through, blue * through)
+            owner, group = np.int64(ints[c + w.OWNER]), group_of_environment(scene.lights)
+            _find(scene.lights, found, owner, group, red * through, green * through, blue * through)
 
 
 @njit
@@ -133,11 +138,8 @@ def _towards_lights(rays, count, scene, shift, found):  # type: ignore[no-untype
             red = s[i + w.TR] * (s[i + w.QR] * dr + s[i + w.SR] * gr)
             green = s[i + w.TG] * (s[i + w.QG] * dg + s[i + w.SG] * gg)
             blue = s[i + w.TB] * (s[i + w.QB] * db + s[i + w.SB] * gb)
-            found[owner, INDIRECT] += red
-            found[owner, INDIRECT + 1] += green
-            found[owner, INDIRECT + 2] += blue
             group = group_of_sample(scene.lights, s[i + w.PATH_SET], np.int64(ints[c + w.CELL]))
-            credit_path(scene.lights, found, owner, group, red, green, blue)
+            _find(scene.lights, found, owner, group, red, green, blue)
 
 
 @njit
@@ -176,20 +178,14 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
         if emissive and emits_to(scene.lights, s[i + w.PATH_SET], hit, scene.geometry):
             red, green, blue, own, glossy = emission_along(position, direction, hit, scene.geometry, lights)
             weight = ONE / (s[i + w.PG] + (own if diffuse else glossy))
-            found[owner, INDIRECT] += fr * red * weight
-            found[owner, INDIRECT + 1] += fg * green * weight
-            found[owner, INDIRECT + 2] += fb * blue * weight
             group = group_of_hit(scene.lights, hit, scene.geometry)
-            credit_path(scene.lights, found, owner, group, fr * red * weight, fg * green * weight, fb * blue * weight)
+            _find(scene.lights, found, owner, group, fr * red * weight, fg * green * weight, fb * blue * weight)
         if through > ZERO:
             u, v = map_at(*direction, envmap)
             red, green, blue = envmap_radiance(u, v, envmap)
             weight = through / (s[i + w.PG] + envmap_pdf(u, v, ints[c + w.ROW], envmap))
-            found[owner, INDIRECT] += fr * red * weight
-            found[owner, INDIRECT + 1] += fg * green * weight
-            found[owner, INDIRECT + 2] += fb * blue * weight
             group = group_of_environment(scene.lights)
-            credit_path(scene.lights, found, owner, group, fr * red * weight, fg * green * weight, fb * blue * weight)
+            _find(scene.lights, found, owner, group, fr * red * weight, fg * green * weight, fb * blue * weight)
         if through < ONE and not last:
             weight = (ONE - through) / s[i + w.PG]
             fr, fg, fb = fr * weight, fg * weight, fb * weight

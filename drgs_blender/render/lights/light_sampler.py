@@ -33,16 +33,13 @@ from .light_shapes import (
     light_row,
 )
 from .light_tree import (
-    COUNT,
     END,
     FIRST,
-    NEXT,
     PAST,
-    SECOND,
     SUNS,
-    box_hit,
     build,
     is_sun,
+    leaf_along,
     lights_weight,
     pick_light,
     pick_probability,
@@ -429,20 +426,15 @@ def lights_along(origin, direction, tmax, others, share, seen_by, lights):  # ty
     r, g, b : float32
         Linear Rec.709, not shadowed.
     """
-    ox, oy, oz = origin
-    dx, dy, dz = direction
     pick = lights.pick
     red, green, blue = ZERO, ZERO, ZERO
-    node, count = np.int64(1), np.int64(pick[0, COUNT])
-    while node < count:
-        if not box_hit(node, ox, oy, oz, dx, dy, dz, tmax, pick):
-            node = np.int64(pick[node, NEXT])
-            continue
-        if pick[node, SECOND] == ZERO:
+    node = np.int64(0)
+    while node >= 0:
+        node = leaf_along(node + 1, origin, direction, tmax, pick)
+        if node > 0:
             for i in range(np.int64(pick[node, FIRST]), np.int64(pick[node, PAST])):
                 r, g, b = light_along(i, origin, direction, tmax, others, share, seen_by, lights)
                 red, green, blue = red + r, green + g, blue + b
-        node += 1
     r, g, b = suns_along(origin, direction, tmax, others, share, seen_by, lights)
     return red + r, green + g, blue + b
 

@@ -306,3 +306,36 @@ def box_hit(node, ox, oy, oz, dx, dy, dz, tmax, pick):  # type: ignore[no-untype
     near, far = _slab(oy, dy, pick[node, _LOW + 1], pick[node, _HIGH + 1], near, far)
     near, far = _slab(oz, dz, pick[node, _LOW + 2], pick[node, _HIGH + 2], near, far)
     return near <= far * F(1.00001)
+
+
+@njit
+def leaf_along(node, origin, direction, tmax, pick):  # type: ignore[no-untyped-def]
+    """The first leaf, from a node on, whose box a ray meets.
+
+    Parameters
+    ----------
+    node : int64
+        Row of the tree, from 1 on.
+    origin, direction : tuple of float32
+        World, m; the direction is of unit length.
+    tmax : float32
+        End of the ray, m.
+    pick : (m, 16) float32 array
+        `Lights.pick`.
+
+    Returns
+    -------
+    int64
+        Row of the tree; -1 where there is none any more.
+    """
+    ox, oy, oz = origin
+    dx, dy, dz = direction
+    count = np.int64(pick[0, COUNT])
+    while node < count:
+        if not box_hit(node, ox, oy, oz, dx, dy, dz, tmax, pick):
+            node = np.int64(pick[node, NEXT])
+        elif pick[node, SECOND] == ZERO:
+            return node
+        else:
+            node += 1
+    return np.int64(-1)

@@ -111,7 +111,7 @@ def put_lobes(place, base, normals, facing, view, geometry, rows, tables, p, b):
     face, instance, u, v = place
     normal, smooth = normals
     specular = _specular(normal, facing, view)
-    count, own = 0, np.int64(face) - geometry.vertex_faces
+    count, own = np.int64(0), np.int64(face) - geometry.vertex_faces
     parts = 0
     material = np.int64(0)
     if face >= 0 and own >= 0:
@@ -120,7 +120,8 @@ def put_lobes(place, base, normals, facing, view, geometry, rows, tables, p, b):
     if parts == 0:
         plain_parameters(base[0], base[1], base[2], base[3], base[4], rows, p)
         all_normals, nowhere = (normal, specular, specular), (ZERO, ZERO, ZERO)
-        count = add_material(b, count, p, 0, (False, False), all_normals, nowhere, view, ONE, tables)
+        never = parts < 0  # of the types of the other call, so that one form of `add_material` is compiled
+        count = add_material(b, count, p, np.int32(0), (never, never), all_normals, nowhere, view, ONE, tables)
         share_out(b, count)
         return count, False
     side = side_of(place, facing, geometry)
