@@ -240,7 +240,7 @@ def _name_lost_light(tree: SurfaceWalker, *values: SocketValue) -> None:
         float(value.colour[0]) * (1 if value.texture is None else float(tree.mean(value.texture)[0]))
         for value in values
     )
-    lost = float(np.interp(rough, *_LOST)) * metal
+    lost = float(np.interp(rough, *_LOST)) * min(max(metal, 0.0), 1.0)
     if lost > _SMALL_LOSS:
         tree.report(f"Multiscatter GGX is rendered as GGX; this rough metal is some {lost:.0%} darker by that")
 

@@ -53,7 +53,7 @@ class TexturedAsset:
             try:
                 pixels = _decoded(files[number][1], f"{self.key}, image {files[number][0]}")
             except AssetError as error:
-                self.faults.append(f"{error}; the materials of its vertices are shown")
+                self.faults.append(f"{str(error).rstrip('.')}; the materials of its vertices are shown")
                 slots[uses] = -1
                 continue
             for coloured in {bool(slot == ALBEDO) for slot in np.nonzero(uses)[1]}:

@@ -21,6 +21,7 @@ from .atlas import (
     uniform_channels,
     vertex_channels,
 )
+from .images import decode_image
 
 Array = np.ndarray
 
@@ -192,20 +193,27 @@ def _image_material(mesh: Mesh, textures: MeshTextures, k: int, rows: Array) -> 
     own_channels = uniform_channels(middle, columns)
     colour = picture(ALBEDO)
     if colour is not None and own_channels.get("opacity", 1.0) < 1:
-        colour = colour._replace(data=_opaque(colour.data))
+        colour = colour._replace(data=_opaque(colour.data, f"image {files[int(slots[ALBEDO])][0]}"))
     return ImageMaterial(
         **own_channels, name=textures.names[k], normal_strength=float(factors[5]),
         colour_picture=colour, surface_picture=picture(ROUGHNESS), normal_picture=picture(NORMAL),
     )  # fmt: skip
 
 
-def _opaque(data: bytes) -> bytes:
-    """An image file without alpha, which would count a second time where its material has opacity."""
-    picture = Pillow.open(io.BytesIO(data))
-    if not picture.has_transparency_data:
+def _opaque(data: bytes, subject: str) -> bytes:
+    """An image file without alpha, which would count a second time where its material has opacity.
+
+    Raises
+    ------
+    AssetError
+        The file cannot be read.
+    """
+    pixels = decode_image(data, subject)
+    if pixels.shape[2] < 4:
         return data
+    rgb = pixels[..., :3] if pixels.dtype == np.uint8 else (pixels[..., :3] >> 8).astype(np.uint8)
     made = io.BytesIO()
-    picture.convert("RGBA").convert("RGB").save(made, "PNG", compress_level=6)
+    Pillow.fromarray(np.ascontiguousarray(rgb)).save(made, "PNG", compress_level=6)
     return made.getvalue()
 
 

@@ -506,6 +506,16 @@ def test_gltf_has_images_with_opacity_and_emission_that_are_alike_in_a_material(
     assert "0 materials with the images" in capsys.readouterr().out
 
 
+def test_an_image_that_cannot_be_read_is_named_where_its_alpha_goes(tmp_path: Path, capsys) -> None:
+    asset = textured(uniform((200, 100, 50)), opacity=np.full(169, 0.5))
+    assert asset.mesh.textures is not None
+    asset.mesh.textures.images["albedo"] = np.frombuffer(b"\x89PNG\r\n\x1a\njunk", np.uint8)
+    write_asset(tmp_path / "a.drgs", asset)
+    assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.glb")]) == 65
+    assert "image albedo.png: is no image that can be read" in capsys.readouterr().err
+    assert not (tmp_path / "a.glb").exists()
+
+
 def test_gltf_of_channels_that_vary_at_vertices_is_an_atlas(tmp_path: Path, capsys) -> None:
     """Painted albedo under an image of roughness: no material of glTF has both."""
     asset = textured(uniform((9, 9, 9)), (-1, 1, 1, -1), albedo=np.random.default_rng(2).random((169, 3)))
