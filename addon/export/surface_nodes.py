@@ -60,7 +60,7 @@ class SurfaceWalker(MixingWalker):
     @once(lambda self: _plain(uniform(self.unknown)))
     def shader(self, ref: SocketRef) -> Surface:
         """The surface of a shader input."""
-        origin = ref.origin()
+        origin = self.origin(ref)
         if not origin.socket.is_output:
             return Surface()
         evaluate = getattr(self, f"shader_{origin.node.type.lower()}", None)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import bpy
@@ -243,6 +245,27 @@ def test_a_movie_that_cannot_be_read_is_named(scene, export, tmp_path):
     frame, warnings = export()
     assert any('"Broken"' in w and "broken.avi" in w for w in warnings)
     assert frame.meshes[0].materials[0].emission == (1, 0, 1)
+
+
+def test_16_bits_with_alpha_are_multiplied_as_they_are_stored(scene, export, tmp_path):
+    """As Cycles does with those of 8 bits."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    stored = np.random.default_rng(1).integers(1, 65536, (5, 4, 4))
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in stored)
+    head = struct.pack(">IIBBBBB", 4, 5, 16, 6, 0, 0, 0)
+    path = tmp_path / "deep.png"
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    )
+    shown(bpy.data.images.load(str(path)))
+    (sent,) = export()[0].images
+    alpha = stored[..., 3:] / 65535
+    expected = part("drgs_blender.core.color").srgb_to_linear(stored[..., :3] / 65535 * alpha)
+    np.testing.assert_allclose(sent.pixels[..., :3], expected, atol=2e-3)
+    np.testing.assert_allclose(sent.pixels[..., 3:], alpha, atol=1e-4)
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])

@@ -475,8 +475,10 @@ def test_loops_of_nodes_end(scene, export):
     tree.links.new(gammas[0].outputs[0], principled.inputs["Emission Color"])
     principled.inputs["Emission Strength"].default_value = 1
     swatch(bpy.data.materials["Material"])
-    found = export()[0].meshes[0].materials[0]
+    frame, warnings = export()
+    found = frame.meshes[0].materials[0]
     assert min(found.base_colour) > 0 and min(found.emission) > 0
+    assert any('node "Gamma' in w and "part of a loop" in w for w in warnings), warnings
 
 
 def test_nodes_that_share_a_source_are_worked_out_once(scene, export):
