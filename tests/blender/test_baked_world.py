@@ -11,6 +11,7 @@ import bpy
 import disks
 import numpy as np
 import pytest
+from kept_blender import keep_blender
 from mathutils import Vector
 from scenes import mesh_object, new_world, part, read_exr
 from test_world import cycles_picture, link_sky, picture_of, sky  # noqa: F401 - a fixture
@@ -20,8 +21,9 @@ SIZE = 512
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    """Results are kept in a folder of the test."""
+def folder(tmp_path, monkeypatch, kept_blenders):
+    """Results are kept in a folder of the test; the Blender that bakes is that of the last one."""
+    keep_blender(monkeypatch, kept_blenders)
     monkeypatch.setattr(part("addon.bakes.store"), "cache_folder", lambda: tmp_path / "bakes")
     yield tmp_path / "bakes"
     part("addon.bakes").manager.stop()

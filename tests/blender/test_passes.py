@@ -96,6 +96,8 @@ def test_passes_are_those_of_cycles(passes):
 @pytest.mark.judged
 @pytest.mark.slow
 def test_passes_of_glass_are_those_of_cycles(passes):
+    render = bpy.context.scene.render
+    render.resolution_x, render.resolution_y = 64, 36  # means alone are compared
     bpy.ops.mesh.primitive_cube_add(size=0.5, location=(-0.6, -1.0, 0.0), rotation=(0.3, 0.2, 0.5))
     glass = bpy.data.materials.new("glass")
     glass.use_nodes = True

@@ -236,6 +236,7 @@ def test_neutral_values() -> None:
     assert ObjectState("a", "b").emission is None
 
 
+@pytest.mark.slow  # its kernels take a minute to compile
 def test_a_device_draws_the_same(save, make_frame, monkeypatch) -> None:
     """Warp's processor as the card."""
     pytest.importorskip("warp", reason="warp-lang is not installed")

@@ -109,7 +109,13 @@ RENDERER: dict[str, tuple[Any, list[np.ndarray]]] = {
 }
 
 
-@pytest.mark.parametrize("name", RENDERER)
+#: Short ones: the others hold more of the language, and each takes a second to compile, here and there.
+SHORT = {"unit", "scrambled", "fast_acos", "fast_atan2_turns", "basis", "cosine_hemisphere"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SHORT else []) for name in RENDERER]
+)
 def test_the_renderers_arithmetic_is_the_same_to_the_last_bit(name: str) -> None:
     function, columns = RENDERER[name]
     expected, found = here(function, columns), on_device(function, columns)
