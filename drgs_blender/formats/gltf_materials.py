@@ -18,8 +18,8 @@ Array = np.ndarray
 _READ = (
     "KHR_materials_emissive_strength", "KHR_materials_specular", "KHR_materials_clearcoat", "KHR_materials_ior",
 )  # fmt: skip
-#: What others are that change what is seen most.
-_LOST = {"KHR_materials_transmission": ": its glass is opaque", "KHR_materials_sheen": ": its fibres are left out"}
+#: What the loss of others does that is seen most.
+_LOST = {"KHR_materials_transmission": ": its glass is opaque"}
 _WRAP = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
 
 
