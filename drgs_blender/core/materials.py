@@ -182,6 +182,9 @@ class Material:
         `diffuse_roughness`, "sheen" `sheen_roughness` for its Roughness; "diffuse" and "translucent" have no gloss.
     multiscatter : bool
         Multiscatter GGX instead of GGX, of a material that `has_more_lobes`.
+    of_point : bool
+        Whether the surface has base colour, roughness and metallic of the shading point, which may be a surfel's, not
+        those of above; of a single part alone.
     parts : list of Part
         Mix and Add Shader: if there are any, the surface scatters their weighted sum, and of the material itself only
         name, `alpha`, `emission`, `details` and `pass_index` count.
@@ -222,6 +225,7 @@ class Material:
     textures: dict[str, Texture] = field(default_factory=dict)
     kind: Literal["principled", "diffuse", "glossy", "glass", "refraction", "translucent", "sheen"] = "principled"
     multiscatter: bool = False
+    of_point: bool = False
     parts: list[Part] = field(default_factory=list)
     aovs: list[ShaderAOV] = field(default_factory=list)
 

@@ -190,7 +190,8 @@ def alpha_image(alpha: np.ndarray) -> Image:
 @pytest.mark.parametrize("said", [True, False])
 def test_cut_out_cards_keep_the_leaf_alone(said: bool) -> None:
     """Whether the file says so, or only that it has alpha."""
-    asset = make_asset(card(MaterialFile("leaf", alpha_image=alpha_image(leaf()), cut_out=said)))
+    file = card(MaterialFile("leaf", alpha_image=alpha_image(leaf()), cut_out=said))
+    asset = make_asset(file, max_texture=0)
     mesh = asset.mesh
     area = Faces.of(mesh.vertices, mesh.faces).area.sum()
     assert area == pytest.approx(np.pi * 0.09, rel=0.01)
@@ -200,6 +201,13 @@ def test_cut_out_cards_keep_the_leaf_alone(said: bool) -> None:
     assert asset.surfels.opacity[inside].min() > 0.95
     assert mesh.source_count == 9 and len(mesh.in_own_order(np.ones((9, 3)))) == len(mesh.vertices)
     assert any("cut out" in note for note in asset.provenance["report"]["notes"])
+    # With the image, whose alpha cuts, faces that the edge crosses stay; surfels beyond it show nothing.
+    whole = make_asset(file)
+    kept = Faces.of(whole.mesh.vertices, whole.mesh.faces).area.sum()
+    assert area < kept < 2 * area and whole.mesh.textures is not None
+    assert whole.mesh.textures.optional == ("opacity",)
+    far = np.hypot(*(whole.surfels.centre[:, :2] - 0.5).T)
+    assert whole.surfels.opacity[far > 0.32].max() < 0.05 and whole.surfels.opacity[far < 0.28].min() > 0.95
 
 
 def test_glass_keeps_its_opacity() -> None:

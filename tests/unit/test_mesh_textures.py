@@ -428,15 +428,15 @@ def test_no_textures_where_none_are_wanted_or_there(tmp_path: Path) -> None:
 def test_faces_without_images_lose_their_material() -> None:
     textures = textured(uniform((1, 2, 3))).mesh.textures
     assert textures is not None
-    some = np.zeros((288, 4), bool)
+    some = np.zeros((288, 8), bool)
     some[:10] = True
     some[10:20, ALBEDO] = True
     kept = without(textures, some)
     assert kept is not None and kept.names == ["paint", "paint"]
     assert (kept.material[:10] == -1).all() and (kept.material[10:20] == kept.material[10]).all()
-    assert kept.slots[kept.material[10]].tolist() == [-1, 1, 1, -1]
-    assert kept.slots[kept.material[20]].tolist() == [0, 1, 1, -1]
-    assert without(textures, np.ones((288, 4), bool)) is None
+    assert kept.slots[kept.material[10], :4].tolist() == [-1, 1, 1, -1]
+    assert kept.slots[kept.material[20], :4].tolist() == [0, 1, 1, -1]
+    assert without(textures, np.ones((288, 8), bool)) is None
 
 
 def converted(tmp_path: Path, asset: Asset, name: str) -> MeshFile:
@@ -463,7 +463,7 @@ def test_gltf_has_the_images_and_an_atlas_for_the_rest(tmp_path: Path, capsys) -
     asset = slanted(textured(images, (0, 1, 1, 2), albedo=np.random.default_rng(2).random((169, 3))))
     textures = asset.mesh.textures
     assert textures is not None
-    textures.factors[0] = 0.5, 0.75, 1, 0.5, 0.25, 0.7
+    textures.factors[0, :6] = 0.5, 0.75, 1, 0.5, 0.25, 0.7
     file = converted(tmp_path, asset, "a.glb")
     assert "1 materials with the images" in (out := capsys.readouterr().out) and "144 others" in out
     own = file.face_material == 0
