@@ -172,7 +172,7 @@ class Material:
         Blender's node of that name, with all of the above that it has: `base_colour` is its Color; "diffuse" has
         `diffuse_roughness`, "sheen" `sheen_roughness` for its Roughness; "diffuse" and "translucent" have no gloss.
     multiscatter : bool
-        Multiscatter GGX instead of GGX, of a material that `has_more_lobes`.
+        Multiscatter GGX instead of GGX: rough metals are as bright as smooth ones.
     parts : list of Part
         Mix and Add Shader: if there are any, the surface scatters their weighted sum, and of the material itself only
         name, `alpha`, `emission`, `details` and `pass_index` count.

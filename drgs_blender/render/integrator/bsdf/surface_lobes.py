@@ -15,6 +15,7 @@ from ...scene.material_rows import ALONG, COAT_DETAILS, MULTISCATTER, THIN
 from ...scene.material_rows import KIND as ROW_KIND
 from ...scene.texture_lookup import blend, layer_at
 from .. import brdf
+from ..multiscatter import has_multiscatter
 from .lobes import DIFFUSE, KIND, LOBE, METAL, MIRROR, SHEEN, share_out
 from .principled import add_material
 from .surface_parameters import parameters_at, plain_parameters
@@ -120,7 +121,8 @@ def put_lobes(place, base, normals, facing, view, geometry, rows, tables, p, b):
     if parts == 0:
         plain_parameters(base[0], base[1], base[2], base[3], base[4], rows, p)
         all_normals, nowhere = (normal, specular, specular), (ZERO, ZERO, ZERO)
-        count = add_material(b, count, p, 0, (False, False), all_normals, nowhere, view, ONE, tables)
+        flags = (False, has_multiscatter(face, geometry))
+        count = add_material(b, count, p, 0, flags, all_normals, nowhere, view, ONE, tables)
         share_out(b, count)
         return count, False
     side = side_of(place, facing, geometry)
