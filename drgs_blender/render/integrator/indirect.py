@@ -17,7 +17,7 @@ from ..lights.light_groups import group_of_environment, group_of_hit, group_of_s
 from ..lights.light_links import emits_to, lights_of, set_of
 from ..lights.light_sampler import emission_along, lights_along
 from ..lights.light_shapes import DIFFUSE, GLOSSY
-from ..lights.product_sampling import product_row
+from ..lights.product_sampling import SIDE, product_row
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
 from ..scene.terminator import terminator_at
@@ -188,7 +188,11 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
         if through > ZERO:
             u, v = map_at(*direction, envmap)
             red, green, blue = envmap_radiance(u, v, envmap)
-            weight = through / (s[i + w.PG] + envmap_pdf(u, v, ints[c + w.ROW], envmap))
+            density, light = s[i + w.PG], envmap_pdf(u, v, ints[c + w.ROW], envmap)
+            weight = through / (density + light)
+            if scene.geometry.terminators != 0 and w.grazing(s, i) > ZERO:
+                light = envmap_pdf(u, v, U(SIDE * SIDE), envmap)
+                weight = through * density / (density * density + light * light)
             found[owner, INDIRECT] += fr * red * weight
             found[owner, INDIRECT + 1] += fg * green * weight
             found[owner, INDIRECT + 2] += fb * blue * weight
@@ -242,6 +246,7 @@ def trace_paths(rays, count, scene, settings, found):  # type: ignore[no-untyped
             w.environment_directions(rays, count, envmap)
             _evaluate(rays, count, scene, shading_model)
             if scene.geometry.terminators != 0:
+                mis.terminator_weights(rays, count, settings, envmap)
                 w.terminate(rays, count)
             mis.path_weights(rays, count, ONE)
             _towards_envmap(rays, count, scene, shift, found)

@@ -428,18 +428,62 @@ def soften(rays, count):  # type: ignore[no-untyped-def]
             s[i + QR], s[i + QG], s[i + QB] = s[i + QR] * g, s[i + QG] * g, s[i + QB] * g
 
 
+@inlined
+def moved_part(above, flat, limit):  # type: ignore[no-untyped-def]
+    """Part of its terminator offset by which the start of a shadow ray is moved.
+
+    Parameters
+    ----------
+    above, flat : float32
+        Cosine between light and smooth normal, and between light and geometric normal.
+    limit : float32
+        Of `terminator.terminator_at`; 0: it is not moved.
+
+    Returns
+    -------
+    float32
+        In [0, 1].
+    """
+    inverse = ONE / max(limit, _TINY)
+    part = TWO - (flat + above) * inverse if above < limit else ONE - flat * inverse
+    return min(max(part, ZERO), ONE) if limit > ZERO and above > ZERO else ZERO
+
+
+@inlined
+def grazing(s, i):  # type: ignore[no-untyped-def]
+    """`moved_part` of light along the direction of the slot at i.
+
+    Parameters
+    ----------
+    s : (packets * 59 * LANES,) float32 array
+        `Batch.floats`.
+    i : int64
+        Index of the slot in it, see `at`.
+
+    Returns
+    -------
+    float32
+        In [0, 1].
+    """
+    lx, ly, lz = s[i + LX], s[i + LY], s[i + LZ]
+    ux, uy, uz = s[i + UX], s[i + UY], s[i + UZ]
+    own = ux * ux + uy * uy + uz * uz > ZERO
+    ux, uy, uz = ux if own else s[i + NX], uy if own else s[i + NY], uz if own else s[i + NZ]
+    return moved_part(ux * lx + uy * ly + uz * lz, s[i + GX] * lx + s[i + GY] * ly + s[i + GZ] * lz, s[i + LIMIT])
+
+
 @njit
 def terminate(rays, count):  # type: ignore[no-untyped-def]
     """Light samples of smooth meshes: where their shadow rays start, and whether there is light below the face.
 
-    As in Cycles the diffuse lobe gets light that is above the smooth normal alone, as far as the shadow ray passes; the
-    other strategies draw none of it. See `scene.terminator`.
+    As in Cycles lobes get light that is above the smooth normal alone, as far as the shadow ray passes; the other
+    strategies draw none of it. See `scene.terminator`.
 
     Parameters
     ----------
     rays : Batch
         G, N or U, LIMIT and LX, LY, LZ are read, and the results of `evaluate`. Written: MOVED, LIVE, and where light
-        is below the face SR, SG, SB, PC, PG.
+        is below the face PC, PG.
     count : int64
         Slots.
     """
@@ -451,18 +495,13 @@ def terminate(rays, count):  # type: ignore[no-untyped-def]
             own = ux * ux + uy * uy + uz * uz > ZERO
             ux, uy, uz = ux if own else s[i + NX], uy if own else s[i + NY], uz if own else s[i + NZ]
             nl, gl = ux * lx + uy * ly + uz * lz, s[i + GX] * lx + s[i + GY] * ly + s[i + GZ] * lz
-            inverse = ONE / max(limit, _TINY)
-            moved = TWO - (gl + nl) * inverse if nl < limit else ONE - gl * inverse
-            moved = min(max(moved, ZERO), ONE)
             any_light = limit > ZERO and nl > ZERO
-            s[i + MOVED] = moved if any_light else ZERO
+            s[i + MOVED] = moved_part(nl, gl, limit)
             below = any_light and gl <= ZERO
-            s[i + SR] = ZERO if below else s[i + SR]
-            s[i + SG] = ZERO if below else s[i + SG]
-            s[i + SB] = ZERO if below else s[i + SB]
             s[i + PC] = ZERO if below else s[i + PC]
             s[i + PG] = ZERO if below else s[i + PG]
-            live = (ONE if s[i + QR] + s[i + QG] + s[i + QB] > ZERO else ZERO) if below else s[i + LIVE]
+            bright = s[i + QR] + s[i + QG] + s[i + QB] + s[i + SR] + s[i + SG] + s[i + SB] > ZERO
+            live = (ONE if bright else ZERO) if below else s[i + LIVE]
             s[i + LIVE] = ZERO if limit > ZERO and nl <= ZERO else live
 
 
