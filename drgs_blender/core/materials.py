@@ -181,7 +181,7 @@ class Material:
         Blender's node of that name, with all of the above that it has: `base_colour` is its Color; "diffuse" has
         `diffuse_roughness`, "sheen" `sheen_roughness` for its Roughness; "diffuse" and "translucent" have no gloss.
     multiscatter : bool
-        Multiscatter GGX instead of GGX, of a material that `has_more_lobes`.
+        Multiscatter GGX instead of GGX: rough metals are as bright as smooth ones.
     of_point : bool
         Whether the surface has base colour, roughness and metallic of the shading point, which may be a surfel's, not
         those of above; of a single part alone.

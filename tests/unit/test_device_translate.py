@@ -84,7 +84,8 @@ def units(count: int, seed: int = 0) -> list[np.ndarray]:
 
 @njit
 def _evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic, a2, norm, shading_model):  # type: ignore[no-untyped-def]
-    return brdf.evaluate((nl, nv, vl, nh2, sin2), (r, g, b), kd, metallic, a2, norm, shading_model)
+    weights = kd, (metallic, metallic, metallic), sampling.ONE - metallic
+    return brdf.evaluate((nl, nv, vl, nh2, sin2), (r, g, b), weights, a2, norm, shading_model)
 
 
 KEYS = [np.random.default_rng(1).integers(0, 2**32, 2000, dtype=np.uint32) for _ in range(2)]

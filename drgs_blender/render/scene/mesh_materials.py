@@ -57,7 +57,7 @@ class MeshMaterials:
         All materials.
     layers : MeshLayers
         What textures and normal maps refer to.
-    addresses : (11,) int64 array
+    addresses : (12,) int64 array
         Of the arrays of `table`, then of the frames of `layers`.
     index : (k,) int32 array
         Material of each face, in `table`.

@@ -15,6 +15,7 @@ from ...scene.material_rows import ALONG, COAT_DETAILS, MULTISCATTER, OF_POINT, 
 from ...scene.material_rows import KIND as ROW_KIND
 from ...scene.texture_lookup import blend, layer_at
 from .. import brdf
+from ..multiscatter import has_multiscatter
 from .lobes import DIFFUSE, KIND, LOBE, METAL, MIRROR, SHEEN, share_out
 from .principled import add_material
 from .surface_parameters import parameters_at, plain_parameters, put_base
@@ -121,7 +122,8 @@ def put_lobes(place, base, normals, facing, view, geometry, rows, tables, p, b):
         plain_parameters(base[0], base[1], base[2], base[3], base[4], rows, p)
         all_normals, nowhere = (normal, specular, specular), (ZERO, ZERO, ZERO)
         never = parts < 0  # of the types of the other call, so that one form of `add_material` is compiled
-        count = add_material(b, count, p, np.int32(0), (never, never), all_normals, nowhere, view, ONE, tables)
+        flags = (never, has_multiscatter(face, geometry))
+        count = add_material(b, count, p, np.int32(0), flags, all_normals, nowhere, view, ONE, tables)
         share_out(b, count)
         return count, False
     side = side_of(place, facing, geometry)
