@@ -675,18 +675,6 @@ def test_shaders_that_are_clear_everywhere_may_be_added(scene, export):
     assert not export()[0].meshes
 
 
-def test_the_loss_of_a_metal_is_at_most_its_light(scene, export):
-    tree, principled = material()
-    principled.inputs["Metallic"].default_value = 1
-    principled.inputs["Roughness"].default_value = 1
-    value = tree.nodes.new("ShaderNodeValue")
-    value.outputs[0].default_value = 1e30
-    tree.links.new(value.outputs[0], principled.inputs["Metallic"])
-    swatch(bpy.data.materials["Material"])
-    (warning,) = export()[1]
-    assert "51% darker" in warning
-
-
 def test_unchanged_images_are_not_read_again(scene, export, tmp_path):
     image = picture()
     image.filepath_raw, image.file_format = str(tmp_path / "picture.png"), "PNG"
