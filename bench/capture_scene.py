@@ -120,16 +120,17 @@ def main() -> None:
     scene.camera = camera
     images = args.folder / "images"
     images.mkdir(parents=True, exist_ok=True)
-    frames = {}
-    for k, matrix in enumerate(cameras(args.pictures, 5)):
-        camera.matrix_world = matrix
-        path = images / f"photo_{k:03d}.jpg"
-        frames[path.name] = [list(row) for row in matrix]
-        if not path.exists():
-            scene.render.filepath = str(path)
+    places = {f"photo_{k:03d}.jpg": matrix for k, matrix in enumerate(cameras(args.pictures, 5))}
+    truth = {
+        "focal": args.size * camera.data.lens / camera.data.sensor_width,
+        "frames": {name: [list(row) for row in matrix] for name, matrix in places.items()},
+    }
+    (args.folder / "truth.json").write_text(json.dumps(truth))
+    for name, matrix in places.items():
+        if not (images / name).exists():
+            camera.matrix_world = matrix
+            scene.render.filepath = str(images / name)
             bpy.ops.render.render(write_still=True)
-    focal = args.size * camera.data.lens / camera.data.sensor_width
-    (args.folder / "truth.json").write_text(json.dumps({"focal": focal, "frames": frames}))
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,7 @@ def complete(folder: Path, digest: str) -> bool:
 
 
 def write_capture(
-    folder: Path, pictures: dict[str, Picture], found: Registration, said: list[str], **more: Any
+    folder: Path, pictures: dict[str, Picture], found: Registration, said: list[str], more: dict[str, Any]
 ) -> None:
     """Write the pictures with their cameras, and the report; `transforms.json` comes last.
 
@@ -70,7 +71,7 @@ def write_capture(
         Z up, ground at 0, metres.
     said : list of str
         Lines of the report's drawing.
-    **more
+    more : dict
         Further entries of `capture.json`.
 
     Raises
@@ -101,7 +102,7 @@ def write_capture(
             masks.mkdir(exist_ok=True)
             target = masks / f"{written.stem}.png"
             drawn = Pillow.fromarray(np.asarray(decode_mask(picture.mask) * 255 + 0.5, np.uint8))
-            replace_by(target, lambda path, drawn=drawn: drawn.save(path, "PNG"))
+            replace_by(target, partial(drawn.save, format="PNG"))
             frame["mask_path"] = f"masks/{target.name}"
         frames.append(frame)
         if picture.notes:
@@ -112,7 +113,7 @@ def write_capture(
     if len(found.points):
         _write_points(folder / POINTS, found)
     draw_cameras(folder / DRAWING, found, said)
-    write_report(folder / REPORT, found, notes=notes, **more)
+    write_report(folder / REPORT, found, {"notes": notes, **more})
     # nerfstudio's keys: the world stays as it is (Z up); the points that surfels begin at.
     text: dict[str, Any] = {"camera_model": "OPENCV", "orientation_override": "none", "frames": frames}
     if len(found.points):

@@ -40,8 +40,8 @@ class Photo:
         Pictures with equal ones share a camera.
     focal : float, optional
         Focal length in parts of the longer side, known from EXIF.
-    size : (width, height) of int
-        Pixels of the file.
+    size : tuple of int
+        Width and height of the file, pixels.
     """
 
     file: str

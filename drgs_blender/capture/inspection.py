@@ -22,8 +22,8 @@ FEWEST, SPARSE = 5, 20
 SHARPNESS_SIZE = 640
 #: Sharpness below this part of the median is blur. A variance: a fifth of the contrast of edges.
 _BLURRED = 0.04
-#: Stops by which exposures may differ.
-_STOPS = 0.5
+#: Stops by which exposures may differ; the same of brightness, which differs with what is seen, too.
+_STOPS, _BRIGHTNESS = 0.5, 1.5
 #: Sides of the reduced picture by which pictures are compared, and its greatest mean difference of equal ones.
 _SIGNATURE, _SAME = 32, 0.004
 #: The same after brightness is taken out: frames of one bracket, by correlation.
@@ -85,7 +85,8 @@ def inspect(pictures: Sequence[Picture], looks: Sequence[Look], subject: str) ->
         Fewer than `FEWEST` are fit.
     """
     left_out: dict[str, str] = {}
-    _duplicates(pictures, looks, left_out)
+    if pictures:
+        _duplicates(pictures, looks, left_out)
     _blurred(pictures, looks, left_out)
     fit = [picture for picture in pictures if picture.path.name not in left_out]
     reasons = defaultdict(list)
@@ -118,8 +119,8 @@ def _duplicates(pictures: Sequence[Picture], looks: Sequence[Look], left_out: di
     for i, picture in enumerate(pictures):
         if taken[i]:
             continue
-        alike = np.flatnonzero((np.abs(stack[i:] - stack[i]).mean(axis=1) < _SAME) & ~taken[i:]) + i
-        alike = np.array([j for j in alike if pictures[j].size == picture.size], int)
+        near = (np.abs(stack[i:] - stack[i]).mean(axis=1) < _SAME) & ~taken[i:]
+        alike = [int(j) + i for j in np.flatnonzero(near) if pictures[int(j) + i].size == picture.size]
         for j in alike[1:]:
             left_out[pictures[j].path.name] = f"the same as another one of them ({picture.path.name})"
         taken[alike] = True
@@ -170,6 +171,8 @@ def _tell_exposures(pictures: Sequence[Picture], looks: Sequence[Look], subject:
     else:
         light = np.log2([max(one.brightness, 1e-4) for one in looks])
         spread, of = float(np.quantile(light, 0.95) - np.quantile(light, 0.05)) / 2, "brightness"
+        if spread < _BRIGHTNESS:
+            return
     if spread > _STOPS:
         logger.warning(
             "%s: pictures differ by %.1f stops in %s, which materials will show; lock exposure and white balance",

@@ -54,8 +54,8 @@ class Picture:
     mask : Path, optional
         File of its mask.
     exif : Metadata
-    size : (width, height) of int
-        Pixels, upright.
+    size : tuple of int
+        Width and height, pixels, upright.
     notes : list of str
         What is unusual about it, for the report.
     """

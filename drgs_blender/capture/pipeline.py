@@ -122,11 +122,17 @@ def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, can
     made.lines = _lines(made)
     _tell_left_out(found, photos, by_file, source)
     tell("writing the capture", 0.96)
-    capture_folder.write_capture(
-        folder, by_file, found, [f"{source.name}: {made.lines[0]}", *made.lines[1:]], digest=digest,
-        method=found.method, left_out=left_out, scale=alignment.scale_from, up=alignment.up_from,
-        ground=alignment.ground_from, error=round(made.error, 4),
-    )  # fmt: skip
+    more = {
+        "digest": digest,
+        "method": found.method,
+        "left_out": left_out,
+        "scale": alignment.scale_from,
+        "up": alignment.up_from,
+        "ground": alignment.ground_from,
+        "error": round(made.error, 4),
+    }
+    said = [f"{source.name}: {made.lines[0]}", *made.lines[1:]]
+    capture_folder.write_capture(folder, by_file, found, said, more)
     shutil.rmtree(work, ignore_errors=True)
     return made
 

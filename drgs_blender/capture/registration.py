@@ -143,7 +143,7 @@ def register(database: Path, pictures: Path, work: Path, photos: Sequence[Photo]
     if best is None:
         _refuse([], photos, subject)
     tell("adjusting cameras", 0.95)
-    _refine(colmap, best)
+    _refine(libraries.load("pycolmap"), best)  # mapping sets its messages back to all
     found = _read(best, method, apart)
     if len(found.matrices) < max(FEWEST, PART * len(photos)):
         _refuse(list(found.matrices), photos, subject)
@@ -219,6 +219,7 @@ def _refine(colmap: Any, model: Any) -> None:
     options = colmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = True
     options.refine_principal_point = False
+    options.print_summary = False
     colmap.bundle_adjustment(model, options)
     model.update_point_3d_errors()
 

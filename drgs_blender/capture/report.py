@@ -75,7 +75,7 @@ def _frustum(draw: ImageDraw.ImageDraw, matrix: Array, width: float, height: flo
         draw.line([at[i], at[4]], fill=_CAMERA)
 
 
-def write_report(path: Path, found: Registration, **more: Any) -> None:
+def write_report(path: Path, found: Registration, more: dict[str, Any]) -> None:
     """Write cameras and figures as JSON: matrices are camera to world, Blender's axes, metres; lenses in pixels."""
     cameras = [
         {
