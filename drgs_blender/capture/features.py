@@ -21,7 +21,7 @@ EXHAUSTIVE = 120
 #: of that step: loops close there.
 _OVERLAP, _LOOP_STEP = 12, 6
 #: Pictures and pairs that are computed before the user can cancel.
-_BATCH, _PAIRS = 8, 240
+_BATCH, _PAIRS = 8, 40
 #: Features a picture. Matching grows with their square.
 _MOST = 6000
 #: Contrast of the faintest feature, COLMAP's own and that inside masks, which leave fewer.

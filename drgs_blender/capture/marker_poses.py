@@ -19,8 +19,10 @@ from .registration import Registration
 
 logger = logging.getLogger(__name__)
 
-#: Markers that a picture must show, and pictures of a lens from which its distortion is found.
-FEWEST_MARKERS, _FOR_DISTORTION = 2, 8
+#: Markers that a picture must show.
+FEWEST_MARKERS = 2
+#: Pictures of a lens from which its first and second radial coefficient and its principal point are found.
+_FOR_K1, _FOR_K2, _FOR_CENTRE = 8, 15, 20
 #: Error above which a marker is taken for misread: pixels of a picture of 1600; times the median, where that is more.
 _STRAY, _TIMES = 3.0, 4.0
 #: The same from the plane of the others, before the lens and its distortion are known.
@@ -89,8 +91,12 @@ def _calibrate(sights: list[_Sight], photo: Photo, result: Registration) -> None
     focal = (photo.focal or 1.0) * max(width, height)
     camera = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
-    if len(sights) < _FOR_DISTORTION:
-        flags |= cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
+    if len(sights) < _FOR_CENTRE:
+        flags |= cv2.CALIB_FIX_PRINCIPAL_POINT
+    if len(sights) < _FOR_K2:
+        flags |= cv2.CALIB_FIX_K2
+    if len(sights) < _FOR_K1:
+        flags |= cv2.CALIB_FIX_K1
         if photo.focal is not None or len(sights) < 3:
             flags |= cv2.CALIB_FIX_FOCAL_LENGTH
     limit = _STRAY * max(width, height) / 1600

@@ -207,7 +207,7 @@ def test_a_sheet_gives_lens_and_cameras_in_metres(cv2):
     from drgs_blender.capture.marker_sheet import MarkerSheet
 
     sheet = MarkerSheet("a4", marker=29.0)
-    cameras = ring(14)
+    cameras = ring(24)
     random = np.random.default_rng(0)
     found = {
         name: {
@@ -218,7 +218,7 @@ def test_a_sheet_gives_lens_and_cameras_in_metres(cv2):
     found["03.jpg"][5] += 60.0  # misread
     photos = [Photo(name, ("one",), None, (800, 600)) for name in cameras]
     result = poses_from_markers(sheet, found, photos)
-    assert len(result.matrices) == 14 and max(result.errors.values()) < 0.2
+    assert len(result.matrices) == 24 and max(result.errors.values()) < 0.2
     for name, matrix in cameras.items():
         np.testing.assert_allclose(result.matrices[name], matrix, atol=2e-3)
     lens = result.lenses["03.jpg"]
@@ -323,3 +323,21 @@ def test_without_markers_poses_by_markers_are_refused(cv2, tmp_path):
         Image.fromarray(pixels).save(tmp_path / "photos" / f"{k}.png")
     with pytest.raises(AssetError, match="shows a marker sheet in 0 pictures"):
         make_capture(tmp_path / "photos", tmp_path / "out", Settings(poses="markers"), tell, never)
+
+
+def test_a_video_of_a_sheet_becomes_a_capture(cv2, tmp_path):
+    av = pytest.importorskip("av", reason="video needs PyAV")
+    cameras = photographs_of_a_sheet(cv2, tmp_path / "photos", 12)
+    film = tmp_path / "walk.mkv"
+    with av.open(str(film), "w") as container:
+        stream = container.add_stream("mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 800, 600, "yuv420p", 20_000_000
+        for name in cameras:
+            with Image.open(tmp_path / "photos" / name) as image:
+                container.mux(stream.encode(av.VideoFrame.from_image(image)))
+        container.mux(stream.encode())
+    made = make_capture(film, tmp_path / "capture", Settings(), tell, never)
+    assert made.pictures == made.of == 12
+    views = sorted(read_capture(tmp_path / "capture").views, key=lambda view: view.name)
+    for view, matrix in zip(views, cameras.values(), strict=True):
+        np.testing.assert_allclose(view.camera.matrix_world, matrix, atol=0.02)
