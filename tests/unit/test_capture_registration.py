@@ -268,17 +268,17 @@ def photographs_of_a_sheet(cv2, folder, count: int) -> dict[str, np.ndarray]:
 
 
 def test_photographs_of_a_sheet_become_a_capture_that_reconstruct_reads(cv2, tmp_path):
-    cameras = photographs_of_a_sheet(cv2, tmp_path / "photos", 8)
+    cameras = photographs_of_a_sheet(cv2, tmp_path / "photos", 6)
     out = tmp_path / "capture"
     made = make_capture(tmp_path / "photos", out, Settings(), tell, never)
-    assert made.pictures == 8 and made.method == "marker sheet" and not made.left_out
+    assert made.pictures == 6 and made.method == "marker sheet" and not made.left_out
     capture = read_capture(out)
     for view in capture.views:
         true = cameras[f"{view.name}.jpg"]
         np.testing.assert_allclose(view.camera.matrix_world, true, atol=8e-3)
     assert capture.points is None  # surfels must not begin on the sheet
     report = json.loads((out / capture_folder.REPORT).read_text())
-    assert len(report["cameras"]) == 8 and report["scale"] == "marker sheet (a4)"
+    assert len(report["cameras"]) == 6 and report["scale"] == "marker sheet (a4)"
     with Image.open(out / capture_folder.DRAWING) as drawing:
         assert np.asarray(drawing).min() < 200
     assert not (out / capture_folder.WORK).exists()
@@ -325,6 +325,7 @@ def test_without_markers_poses_by_markers_are_refused(cv2, tmp_path):
         make_capture(tmp_path / "photos", tmp_path / "out", Settings(poses="markers"), tell, never)
 
 
+@pytest.mark.slow
 def test_a_video_of_a_sheet_becomes_a_capture(cv2, tmp_path):
     av = pytest.importorskip("av", reason="video needs PyAV")
     cameras = photographs_of_a_sheet(cv2, tmp_path / "photos", 12)
