@@ -19,8 +19,9 @@ class Image:
 
     Attributes
     ----------
-    pixels : (h, w, 4) uint8 or float32 array, or (h, w, 3) or (h, w, 1) uint8 array
-        Row 0 at the top; alpha is straight and last. One channel is a grey.
+    pixels : (h, w, c) uint8 or float32 array
+        Row 0 at the top; alpha is straight and last. Four channels; of bytes also three, or one of a grey, where all
+        is opaque.
     encoding : {"linear", "srgb"}
         "srgb" is decoded by the engine (colour channels only), "linear" is linear Rec.709 or no colour at all.
     """
