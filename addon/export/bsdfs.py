@@ -11,10 +11,8 @@ from .layers import LayerRef
 from .normal_nodes import DetailRef, NormalWalker
 from .socket_value import SocketValue, uniform
 
-#: What BSDFs may differ in and still be one whose value is the weighted mean; the base colour of glass is not of them.
-_LINEAR = ("base_colour", "metallic", "sheen", "coat", "transmission")
-#: Kinds whose light is in proportion to their colour.
-_PROPORTIONAL = ("diffuse", "glossy", "glass", "refraction", "translucent", "sheen")
+#: Kinds whose colour is a factor of all their light.
+_COLOURED = ("diffuse", "glossy", "glass", "refraction", "translucent", "sheen")
 #: More parts than that are not told apart.
 _MOST_PARTS = 8
 
@@ -37,6 +35,25 @@ class Bsdf:
     switches: frozenset[str] = frozenset()
     tangent: LayerRef | None = None
     leaves: tuple[tuple[str, str], ...] = ()
+
+    def has(self, name: str) -> bool:
+        """Whether a value is given and not zero everywhere."""
+        return not self.values.get(name, uniform(0)).black
+
+    def is_linear(self, name: str) -> bool:
+        """Whether the light of the BSDF is a linear function of a value, as far as that is known.
+
+        It is none of a colour where light meets a surface several times, and is coloured each time: of Multiscatter GGX
+        metals and of rough diffuse surfaces; nor of metals brighter than white.
+        """
+        if name == "base_colour":
+            bright = self.kind == "principled" and bool((self.values[name].colour > 1).any())
+            metal = self.has("metallic") and (bright or "multiscatter" in self.switches)
+            return not (metal or self.has("diffuse_roughness") or self.has("transmission"))
+        if name == "coat":
+            tint = self.values.get("coat_tint", uniform(1))
+            return tint.texture is None and bool((tint.colour == 1).all()) and not self.has("sheen")
+        return name in ("metallic", "sheen", "transmission")
 
     def difference(self, other: Bsdf) -> set[str] | None:
         """Names of the values in which both differ; None where they differ in more than values."""
@@ -164,9 +181,7 @@ class MixingWalker(NormalWalker):
         """Two parts as one; None where no single BSDF scatters the same light."""
         a, b = first.bsdf, second.bsdf
         names = a.difference(b)
-        if names is None or len(names) > 1 or not names.issubset(_LINEAR):
-            return None
-        if "base_colour" in names and not a.values.get("transmission", uniform(0)).black:
+        if names is None or len(names) > 1 or not all(a.is_linear(n) and b.is_linear(n) for n in names):
             return None
         one, two = first.weight, second.weight
         texts = _texts(one, two)
@@ -192,7 +207,7 @@ class MixingWalker(NormalWalker):
         if len(surface.parts) != 1 or surface.parts[0].is_whole:
             return surface
         (part,) = surface.parts
-        if part.bsdf.kind not in _PROPORTIONAL:
+        if part.bsdf.kind not in _COLOURED or not part.bsdf.is_linear("base_colour"):
             return surface
         base = self.combine(node, np.multiply, part.bsdf.values["base_colour"], self.plain(node, part))
         bsdf = replace(part.bsdf, values=part.bsdf.values | {"base_colour": base})

@@ -240,8 +240,9 @@ class Child:
         while (item := self._outbox.get()) is not None:
             try:
                 self.link.send(*item)
-            except OSError as error:
-                logger.debug("the engine's pipe is closed: %s", error)  # the reading thread reports the end
+            except OSError as error:  # the reading thread reports the end
+                level = logging.DEBUG if isinstance(error, BrokenPipeError) else logging.WARNING
+                logger.log(level, "the engine cannot be written to any more: %s", error)
                 break
             except ValueError as error:
                 self.idle.set()

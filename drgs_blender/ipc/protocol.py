@@ -7,6 +7,7 @@ Needs numpy and the standard library only: Blender's Python uses this module as 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import socket
@@ -268,7 +269,7 @@ class Link:
         Raises
         ------
         OSError
-            When the other side is gone.
+            When the other side is gone, or a file cannot be handed over. The link cannot be used any more.
         CodecError
             When the message cannot be expressed.
         """
@@ -291,8 +292,7 @@ class Link:
                 size = 0
             self._write(PREFIX.pack(MAGIC, len(header), size) + header)
             for array in shared.values():
-                assert self.files is not None
-                socket.send_fds(self.files, [b"\0"], [shared_file(array) or 0])
+                self._send_file(array)
             if size:
                 for array in ready.values():
                     self._write(array.reshape(-1).view(np.uint8).data)
@@ -329,6 +329,17 @@ class Link:
             self._read(array.reshape(-1).view(np.uint8).data)
             self._read(memoryview(padding)[: _aligned(item.size) - item.size])
         return message, arrays
+
+    def _send_file(self, array: Array) -> None:
+        fd = shared_file(array)
+        assert self.files is not None and fd is not None
+        try:
+            socket.send_fds(self.files, [b"\0"], [fd])
+        except OSError:
+            # The other side waits for the file: now it knows that none comes, and ends.
+            with contextlib.suppress(OSError):
+                self.files.shutdown(socket.SHUT_RDWR)
+            raise
 
     def _map(self, item: ArrayHeader) -> Array:
         """The array in the next file that arrives."""

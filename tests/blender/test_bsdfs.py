@@ -135,7 +135,7 @@ def test_gold_by_its_refractive_index(scene, export):
 
 
 def test_shares_of_the_same_bsdf_are_one(scene, export):
-    """Only the colour differs: the mean colour scatters the same light."""
+    """Only the colour differs, and all light is in proportion to it: the mean colour scatters the same light."""
     tree, _ = material()
     one, two = add(tree, "BsdfGlass", A, 0.2), add(tree, "BsdfGlass", B, 0.2)
     shaded(tree, add(tree, "MixShader", 0.25, one, two))
@@ -145,6 +145,58 @@ def test_shares_of_the_same_bsdf_are_one(scene, export):
     tree.nodes.remove(tree.nodes["Mix Shader"])
     shaded(tree, add(tree, "AddShader", one, two))
     np.testing.assert_allclose(exported(export)[0].base_colour, np.array(A) + B, rtol=1e-6)
+
+
+NONLINEAR = {
+    "glossy": ("BsdfAnisotropic", {}, {"Color": (TINT, A)}),
+    "rough diffuse": ("BsdfDiffuse", {"Roughness": 0.5}, {"Color": (TINT, A)}),
+    "metal": ("BsdfPrincipled", {"Metallic": 0.5}, {"Base Color": (TINT, A)}),
+    "tinted coat": ("BsdfPrincipled", {"Coat Tint": (*TINT, 1.0)}, {"Coat Weight": (1.0, 0.5)}),
+    "coat below sheen": ("BsdfPrincipled", {"Sheen Weight": 0.5}, {"Coat Weight": (1.0, 0.5)}),
+}
+LINEAR = {
+    "glossy of GGX": ("BsdfAnisotropic", {"distribution": "GGX"}, {"Color": (TINT, A)}),
+    "diffuse": ("BsdfDiffuse", {}, {"Color": (TINT, A)}),
+    "metallic": ("BsdfPrincipled", {"distribution": "GGX"}, {"Metallic": (1.0, 0.25)}),
+    "coat": ("BsdfPrincipled", {}, {"Coat Weight": (1.0, 0.5)}),
+    "dielectric": ("BsdfPrincipled", {}, {"Base Color": (TINT, A)}),
+}
+
+
+@pytest.mark.parametrize("case", [*NONLINEAR, *LINEAR])
+def test_only_what_is_linear_in_a_value_is_mixed_by_it(scene, export, case):
+    """The mean of two colours is no mean of the light where light is coloured several times; both stay parts."""
+    tree, _ = material()
+    kind, common, varied = (NONLINEAR | LINEAR)[case]
+    sockets = [add(tree, kind), add(tree, kind)]
+    for i, socket in enumerate(sockets):
+        for name, value in common.items():
+            if name == "distribution":
+                socket.node.distribution = value
+            else:
+                socket.node.inputs[name].default_value = value
+        for name, values in varied.items():
+            value = values[i]
+            socket.node.inputs[name].default_value = (*value, 1.0) if isinstance(value, tuple) else value
+    shaded(tree, add(tree, "MixShader", 0.25, *sockets))
+    found, warnings = exported(export)
+    assert not warnings and [part.weight[0] for part in found.parts] == ([0.75, 0.25] if case in NONLINEAR else [])
+
+
+@pytest.mark.parametrize("distribution", ["MULTI_GGX", "GGX"])
+def test_half_of_a_glossy_bsdf_is_half_as_dark_only_for_one_reflection(scene, export, distribution):
+    tree, _ = material()
+    glossy = add(tree, "BsdfAnisotropic", B, 1.0, distribution=distribution)
+    shaded(tree, add(tree, "MixShader", 0.5, add(tree, "Emission", A), glossy))
+    found, warnings = exported(export)
+    assert not warnings
+    if distribution == "GGX":
+        assert not found.parts
+        np.testing.assert_allclose(found.base_colour, np.array(B) / 2, rtol=1e-6)
+    else:
+        (part,) = found.parts
+        assert part.weight == (0.5,) * 3
+        np.testing.assert_allclose(part.material.base_colour, B, rtol=1e-6)
 
 
 def weights_of(found) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import gc
 import io
 import json
@@ -366,6 +367,24 @@ def test_arrays_that_may_change_are_copied():
     found = passed_on(link, pipe, {"a": whole})["a"]
     whole[0] = 5.0
     assert found[0] == 0.0 and found.flags.writeable
+
+
+def test_a_file_that_cannot_be_handed_over_ends_both_sides(monkeypatch):
+    """The sender has an error, and the receiver, which waits for the file, another one."""
+    link, pipe = mapping_loop()
+    ends = link.files, link.peer  # type: ignore[attr-defined]
+
+    def refuse(*_: object) -> int:
+        raise OSError(errno.ETOOMANYREFS, "too many references")
+
+    monkeypatch.setattr(socket, "send_fds", refuse)
+    with pytest.raises(OSError, match="too many references"):
+        link.send(protocol.Result(1, [], {}), {"large": frozen_shareable((1 << 20,), np.uint8)})
+    pipe.seek(0)
+    link.files = ends[1]
+    ends[1].settimeout(10)
+    with pytest.raises(ProtocolError, match="the file of array 'large' did not arrive"):
+        link.receive()
 
 
 def test_many_shareable_arrays_do_not_use_up_files():

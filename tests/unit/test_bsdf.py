@@ -18,9 +18,11 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 @njit
-def _lobes(p, kind, flags, view, side, tables, b):  # type: ignore[no-untyped-def]
-    up = (F(0.0), F(0.0), F(1.0))
-    count = add_material(b, 0, p, kind, flags, (up, up, up), (F(1.0), F(0.0), F(0.0)), view, side, tables)
+def _lobes(values, kind, flags, view, side, tables, b):  # type: ignore[no-untyped-def]
+    up, count = (F(0.0), F(0.0), F(1.0)), 0
+    for part in range(len(values)):
+        p, along = values[part].copy(), (F(1.0), F(0.0), F(0.0))
+        count = add_material(b, count, p, kind, flags, (up, up, up), along, view, side, tables)
     share_out(b, count)
     return count
 
@@ -63,20 +65,19 @@ def _fresnel(cosines, eta, out):  # type: ignore[no-untyped-def]
 
 
 class Surface:
-    """A material seen along (sin, 0, cos) from outside, or from inside where `side` is -1."""
+    """A material of equal parts seen along (sin, 0, cos) from outside, or from inside where `side` is -1."""
 
-    def __init__(self, cosine: float, side: float = 1.0, **fields) -> None:
+    def __init__(self, cosine: float, side: float = 1.0, parts: int = 1, **fields) -> None:
         self.warnings: list[str] = []
         fields.setdefault("base_colour", WHITE)
         # Never plain: rows are made of materials with further lobes alone.
-        rows = material_rows(
-            [Material("m", parts=[Part(Material("m", **fields))])], None, lambda *_: None, self.warnings
-        )
+        shares = [Part(Material("m", **fields), (1 / parts,) * 3)] * parts
+        rows = material_rows([Material("m", parts=shares)], None, lambda *_: None, self.warnings)
         kind, flags = KINDS.index(fields.get("kind", "principled")), (rows.ints[0, 1] == 1, rows.ints[0, 2] == 1)
         self.view = F(np.sqrt(1 - cosine * cosine)), F(0), F(cosine)
         self.lobes = np.zeros(MOST_LOBES * LOBE, np.float32)
         tables = albedo_tables(bool(flags[1]))
-        self.count = _lobes(rows.values[0].copy(), kind, flags, self.view, F(side), tables, self.lobes)
+        self.count = _lobes(rows.values, kind, flags, self.view, F(side), tables, self.lobes)
 
     def drawn(self, n: int = 1 << 17) -> tuple[np.ndarray, np.ndarray]:
         numbers = np.random.default_rng(3).random((n, 3), dtype=np.float32)
@@ -140,12 +141,122 @@ def test_no_surface_sends_more_than_it_gets(look, cosine):
         assert values[:, :9:3].sum(axis=1).mean() < 1.01
 
 
-@pytest.mark.parametrize("fields", ({"metallic": 1.0}, {"transmission": 1.0}, {"kind": "glossy"}, {}))
+@pytest.mark.parametrize(
+    "fields",
+    (
+        {"metallic": 1.0},
+        *({"transmission": 1.0, "ior": ior} for ior in (0.5, 0.75, 1.5)),
+        {"kind": "glass", "ior": 0.5},
+        {"kind": "glossy"},
+        {},
+    ),
+)
 @pytest.mark.parametrize("cosine", (0.95, 0.25))
 def test_multiscatter_loses_no_light(fields, cosine):
     for side in (1.0, -1.0):
         _, values = Surface(cosine, side, roughness=0.8, multiscatter=True, **fields).drawn()
         assert values[:, :9:3].sum(axis=1).mean() == pytest.approx(1.0, abs=0.012)
+
+
+def test_all_lobes_of_all_parts_count():
+    """Eight parts of six lobes each scatter what one of them does."""
+    one, all_ = (Surface(0.6, parts=parts, **LOOKS["all"]) for parts in (1, 8))
+    assert (one.count, all_.count) == (6, 48)
+    even = everywhere(1 << 12)
+    np.testing.assert_allclose(all_.along(even), one.along(even), rtol=1e-4, atol=1e-6)
+
+
+# Closed forms, in colours
+
+
+def mirrored(surface: Surface) -> np.ndarray:
+    """(9,): value along the mirrored direction."""
+    x, y, z = surface.view
+    return surface.along(np.array([[-x, -y, z]]))[0, :9].astype(np.float64)
+
+
+TINT = np.array([0.9, 0.4, 0.1])
+BLACK = {"base_colour": (0, 0, 0), "specular_level": 0.0}
+
+
+@pytest.mark.parametrize("cosine", (1.0, 0.6, 0.2))
+def test_coat_absorbs_along_its_slanted_way_and_reflects_by_fresnel(cosine):
+    """Diffuse light below loses what the coat reflects, and is tinted by the power of the way through it."""
+    below = {"base_colour": WHITE, "specular_level": 0.0, "roughness": 0.9, "anisotropy": 0.7}
+    coat = Surface(cosine, coat=0.8, coat_ior=1.8, coat_tint=tuple(TINT), coat_roughness=0.3, **below)
+    inside = np.sqrt(1 - (1 - cosine * cosine) / 1.8**2)
+    across, along = (cosine - 1.8 * inside) / (cosine + 1.8 * inside), (1.8 * cosine - inside) / (1.8 * cosine + inside)
+    reflected = (across**2 + along**2) / 2
+    found, bare = mirrored(coat), mirrored(Surface(cosine, **below))
+    rest = (1 - 0.8 * reflected) * (1 + 0.8 * (TINT ** (1 / inside) - 1))
+    np.testing.assert_allclose(found[:3] / bare[:3], rest, rtol=1e-4)
+    whole = mirrored(Surface(cosine, kind="glossy", roughness=0.3))
+    np.testing.assert_allclose(found[3:6] - bare[3:6] * rest, 0.8 * reflected * whole[3:6], rtol=1e-3)
+
+
+def test_dielectric_reflects_along_its_normal_by_ior_level_and_tint():
+    found = mirrored(Surface(1.0, roughness=0.4, ior=1.8, specular_level=0.8, specular_tint=tuple(TINT)))
+    whole = mirrored(Surface(1.0, kind="glossy", roughness=0.4))
+    np.testing.assert_allclose(found[3:6] / whole[3:6], (0.8 / 2.8) ** 2 * 1.6 * TINT, rtol=1e-4)
+
+
+def test_edge_tint_of_metals_is_met_at_82_degrees():
+    """At cosine 1/7 the reflectance is Schlick's times the tint."""
+    base, cosine = np.array([0.8, 0.5, 0.0]), 1 / 7
+    found = mirrored(Surface(cosine, metallic=1.0, roughness=0.3, base_colour=tuple(base), specular_tint=tuple(TINT)))
+    whole = mirrored(Surface(cosine, kind="glossy", roughness=0.3))
+    np.testing.assert_allclose(found[3:6] / whole[3:6], (base + (1 - base) * (6 / 7) ** 5) * TINT, rtol=1e-4)
+
+
+def test_sheen_is_tinted_and_takes_its_largest_channel_from_below():
+    sheen = {"sheen": 0.7, "sheen_roughness": 0.4, "sheen_tint": tuple(TINT)}
+    alone = mirrored(Surface(0.3, **BLACK, **sheen))[:3]
+    np.testing.assert_allclose(alone, mirrored(Surface(0.3, kind="sheen", sheen_roughness=0.4))[:3] * 0.7 * TINT, 1e-4)
+    albedo = Surface(0.3, kind="sheen", sheen_roughness=0.4).drawn(1 << 14)[1][:, 0].mean()
+    below = mirrored(Surface(0.3, specular_level=0.0))[:3]
+    found = mirrored(Surface(0.3, specular_level=0.0, **sheen))[:3] - alone
+    np.testing.assert_allclose(found, below * (1 - 0.7 * TINT.max() * albedo), rtol=1e-3)
+
+
+def test_light_between_microfacets_is_coloured_at_each_of_them():
+    """A geometric series: after the first, a part E of what each microfacet reflects leaves the surface."""
+    cosine, colour = 0.5, np.array([1.0, 0.5, 0.1])
+
+    def single(c: float) -> float:
+        return Surface(c, kind="glossy", roughness=0.8).drawn(1 << 14)[1][:, 3].mean()
+
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    mean = sum(w * c * single(c) for c, w in zip((nodes + 1) / 2, weights))
+    expected = colour * (single(cosine) + (1 - single(cosine)) * mean * colour / (1 - colour * (1 - mean)))
+    fields = {"roughness": 0.8, "multiscatter": True, "base_colour": tuple(colour)}
+    found = Surface(cosine, kind="glossy", **fields).drawn(1 << 15)[1][:, 3:6].mean(axis=0)
+    np.testing.assert_allclose(found, expected, rtol=0.02)
+
+
+def test_rough_diffuse_light_is_coloured_at_each_facet():
+    """Along the normal 0.776 is scattered once, whatever the colour; the rest has its square more, as in Cycles."""
+    colour = np.array([0.9, 0.5, 0.1])
+    a = 1 / (np.pi + np.pi / 2 - 2 / 3)
+    single, mean = a * np.pi, a * np.pi + (2 * np.pi - 5.6) / 3 * a
+    expected = colour * (single + (1 - single) * colour**2 * mean / (1 - colour * (1 - mean)))
+    np.testing.assert_allclose(expected, [0.8585, 0.4136, 0.0778], atol=1e-4)  # Cycles of Blender 5.0
+    surface = Surface(1.0, kind="diffuse", base_colour=tuple(colour), diffuse_roughness=1.0)
+    np.testing.assert_allclose(surface.drawn(1 << 15)[1][:, :3].mean(axis=0), expected, rtol=5e-3)
+
+
+def test_colours_above_1_reflect_as_much_between_microfacets_as_white_does():
+    fields = {"kind": "glossy", "roughness": 1.0, "multiscatter": True, "base_colour": (3.0, 1.0, 0.0)}
+    found = Surface(0.8, **fields).drawn(1 << 15)[1][:, 3:6].mean(axis=0)
+    np.testing.assert_allclose(found, [3.0, 1.0, 0.0], rtol=0.02)
+
+
+@pytest.mark.parametrize("sign", (1, -1))
+def test_rotation_turns_the_highlight_counterclockwise(sign):
+    fields = {"roughness": 0.7, "metallic": 1.0, "anisotropy": 0.8, "anisotropy_rotation": sign * 0.1}
+    turn = np.radians(np.arange(0, 180, 2.0))
+    ring = np.stack([0.5 * np.cos(turn), 0.5 * np.sin(turn), np.full(len(turn), 0.75**0.5)], axis=1)
+    brightest = np.degrees(turn[Surface(1.0, **fields).along(ring)[:, 3].argmax()])
+    assert brightest == pytest.approx(36 if sign > 0 else 144, abs=1.1)
 
 
 def test_smooth_glass_follows_snell_and_fresnel():
@@ -207,7 +318,7 @@ def _between(look, view, light):
     fields = LOOKS[look] | {"base_colour": WHITE}
     rows = material_rows([Material("m", parts=[Part(Material("m", **fields))])], None, lambda *_: None, [])
     kind = KINDS.index(fields.get("kind", "principled"))
-    given = rows.values[0].copy(), kind, (False, False), surface.view, F(1), albedo_tables(False), surface.lobes
+    given = rows.values, kind, (False, False), surface.view, F(1), albedo_tables(False), surface.lobes
     surface.count = _lobes(*given)
     return (surface.along(np.array([light]))[0, [0, 3]] / light[2]).sum()
 

@@ -215,6 +215,22 @@ def test_sizes_are_not_believed() -> None:
         decode_image(bytes(data), "it")
 
 
+@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
+def test_the_largest_texture_has_16k_a_side(tmp_path: Path) -> None:
+    data = bytearray(png16(np.zeros((1, 1, 3), np.uint16)))
+
+    def of_size(width: int, height: int) -> bytes:
+        struct.pack_into(">2I", data, 16, width, height)
+        struct.pack_into(">I", data, 29, zlib.crc32(data[12:29]))
+        return bytes(data)
+
+    path = tmp_path / "large.png"
+    path.write_bytes(of_size(16384, 16384))
+    assert image_size(path) == (16384, 16384)
+    with pytest.raises(AssetError, match="16385 x 16384 pixels"):
+        decode_image(of_size(16385, 16384), "it")
+
+
 def test_what_unpacks_to_more_than_its_pixels_is_refused() -> None:
     data = tiff(np.ones((64, 64, 3), np.float32), compression="zlib", rowsperstrip=64)
     with tifffile.TiffFile(io.BytesIO(data)) as file:

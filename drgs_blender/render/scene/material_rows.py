@@ -37,7 +37,7 @@ _HIGHEST = {
     "base_colour": 1e3, "ior": 1e3, "specular_level": 1e3, "coat_ior": 1e3, "weight": 1e3, "anisotropy_rotation": 1e3,
 }  # fmt: skip
 _LOWEST = {"ior": 1e-5, "anisotropy": -1.0, "anisotropy_rotation": -1e3, "coat_ior": 1.0}
-#: Most parts of a material: a Principled BSDF has up to six lobes.
+#: Most parts of a material.
 MOST_PARTS = 8
 #: By parameter: number of values, first column, largest and least value.
 WIDTHS = tuple(PARAMETERS.values())
@@ -56,7 +56,7 @@ class MaterialRows(NamedTuple):
     first, parts : (materials,) int32 array
         Rows of each material; none of one without further lobes.
     values : (rows, PARAMETER_COUNT) float32 array
-        Parameters, in the order of `principled.PARAMETERS`.
+        Parameters, in the order of `PARAMETERS`.
     ints : (rows, INTS) int32 array
         See above; textures are rows, or -1.
     neutral : (PARAMETER_COUNT,) float32 array

@@ -13,6 +13,7 @@ import math
 
 from ....compute.jit import inlined, njit
 from ...sampling import INVERSE_PI, ONE, PI, TWO, ZERO, F, cosine_hemisphere
+from ...scene.material_rows import MOST_PARTS
 from .microfacet import fresnel, normal_reflectance, reflection, refraction, visible_normal
 
 #: Columns of a lobe: kind, weight, alphas, eta, normal, tangent, F0, slope of F82, tints of reflection and of
@@ -20,8 +21,8 @@ from .microfacet import fresnel, normal_reflectance, reflection, refraction, vis
 KIND, WEIGHT, AX, AY, ETA, NORMAL, TANGENT, F0, SLOPE, REFLECTED, PASSED = 0, 1, 4, 5, 6, 7, 10, 13, 16, 19, 22
 SCALE, PROBABILITY, OWN, DELTA = 25, 26, 27, 32
 LOBE = 33
-#: Most lobes of a surface.
-MOST_LOBES = 24
+#: Most lobes of a surface: sheen, coat, metal, glass, dielectric and diffuse lobe of each part.
+MOST_LOBES = 6 * MOST_PARTS
 #: Kinds. Of fibres, diffuse light on this and on the other side; of microfacets, mirrors by F82-tint and by the Fresnel
 #: equations, glass, what it only lets pass, and a sheet of it.
 DIFFUSE, TRANSLUCENT, SHEEN, METAL, MIRROR, GLASS, REFRACTION, SHEET = (F(k) for k in range(8))

@@ -59,11 +59,8 @@ def _add_glass(b, count, kind, weight, p, colour, frame, seen, multiscatter, tab
     normal, tangent = frame
     view, side = seen
     k = begin_lobe(b, count, kind, weight, normal, tangent)
-    if k < 0:
-        return count
     ior = max(p[IOR], F(1e-5))
-    inside = 1 if side < ZERO and kind != SHEET else 0
-    eta = ONE / ior if inside == 1 else ior
+    eta = ONE / ior if side < ZERO and kind != SHEET else ior
     if abs(eta - ONE) < F(1e-4):
         eta = F(1.0001)
     b[k + ETA] = eta
@@ -76,7 +73,7 @@ def _add_glass(b, count, kind, weight, p, colour, frame, seen, multiscatter, tab
     if alpha < SMOOTH:
         b[k + DELTA] = ONE
     elif multiscatter and kind == GLASS:
-        make_up(b, k, cosine_to(normal, view), weight, inside, tables)
+        make_up(b, k, cosine_to(normal, view), weight, tables)
     settle(b, k, view)
     return count + 1
 
@@ -133,14 +130,12 @@ def add_material(b, count, p, kind, flags, normals, along, view, side, tables): 
         return _add_glass(b, count, shape, tinted, p, white, frame, (view, side), multiscatter, tables)
     if kind == _GLOSSY:
         k = begin_lobe(b, count, MIRROR, (wr * cr, wg * cg, wb * cb), specular, tangent)
-        if k < 0:
-            return count
         put_alphas(b, k, p[ROUGHNESS], p[ANISOTROPY], True)
         b[k + ETA] = F(1.5)
         for i in range(3):
             b[k + F0 + i] = ONE
         if multiscatter:
-            make_up(b, k, nv, (cr, cg, cb), 0, tables)
+            make_up(b, k, nv, (cr, cg, cb), tables)
         settle(b, k, view)
         return count + 1
     if kind == _DIFFUSE:
@@ -170,13 +165,12 @@ def add_material(b, count, p, kind, flags, normals, along, view, side, tables): 
         cosine = cosine_to(coated, view)
         eta = max(p[COAT_IOR], ONE)
         k = begin_lobe(b, count, MIRROR, (w * wr, w * wg, w * wb), coated, frame_about(coated, coated))
-        if k >= 0:
-            put_alphas(b, k, p[COAT_ROUGHNESS], ZERO, False)
-            b[k + ETA] = eta
-            base = normal_reflectance(eta)
-            b[k + F0] = b[k + F0 + 1] = b[k + F0 + 2] = base
-            settle(b, k, view)
-            count += 1
+        put_alphas(b, k, p[COAT_ROUGHNESS], ZERO, False)
+        b[k + ETA] = eta
+        base = normal_reflectance(eta)
+        b[k + F0] = b[k + F0 + 1] = b[k + F0 + 2] = base
+        settle(b, k, view)
+        count += 1
         reflected, _ = fresnel(cosine, eta)
         rest = min(max(ONE - w * reflected, ZERO), ONE)
         wr, wg, wb = wr * rest, wg * rest, wb * rest
@@ -188,22 +182,21 @@ def add_material(b, count, p, kind, flags, normals, along, view, side, tables): 
     metal = min(p[METALLIC], ONE)
     if metal > _LEAST:
         k = begin_lobe(b, count, METAL, (metal * wr, metal * wg, metal * wb), specular, tangent)
-        if k >= 0:
-            put_alphas(b, k, p[ROUGHNESS], p[ANISOTROPY], False)
-            edge = F((6.0 / 7.0) ** 5)
-            base = (hr, hg, hb)
-            mr = mg = mb = ZERO
-            for i in range(3):
-                f82 = min(max(p[TINT + i], ZERO), ONE)
-                schlick = base[i] + (ONE - base[i]) * edge
-                slope = schlick * F(7.0 / (6.0 / 7.0) ** 6) * (ONE - f82)
-                b[k + F0 + i], b[k + SLOPE + i] = base[i], slope
-                mean = min(max(base[i] + (ONE - base[i]) / F(21.0) - slope / F(126.0), ZERO), ONE)
-                mr, mg, mb = (mean if i == 0 else mr), (mean if i == 1 else mg), (mean if i == 2 else mb)
-            if multiscatter:
-                make_up(b, k, nv, (mr, mg, mb), 0, tables)
-            settle(b, k, view)
-            count += 1
+        put_alphas(b, k, p[ROUGHNESS], p[ANISOTROPY], False)
+        edge = F((6.0 / 7.0) ** 5)
+        base = (hr, hg, hb)
+        mr = mg = mb = ZERO
+        for i in range(3):
+            f82 = min(max(p[TINT + i], ZERO), ONE)
+            schlick = base[i] + (ONE - base[i]) * edge
+            slope = schlick * F(7.0 / (6.0 / 7.0) ** 6) * (ONE - f82)
+            b[k + F0 + i], b[k + SLOPE + i] = base[i], slope
+            mean = min(max(base[i] + (ONE - base[i]) / F(21.0) - slope / F(126.0), ZERO), ONE)
+            mr, mg, mb = (mean if i == 0 else mr), (mean if i == 1 else mg), (mean if i == 2 else mb)
+        if multiscatter:
+            make_up(b, k, nv, (mr, mg, mb), tables)
+        settle(b, k, view)
+        count += 1
         rest = ONE - metal if metal < F(1.0 - 1e-5) else ZERO
         wr, wg, wb = wr * rest, wg * rest, wb * rest
     glass = min(p[TRANSMISSION], ONE)
@@ -225,23 +218,22 @@ def add_material(b, count, p, kind, flags, normals, along, view, side, tables): 
         eta = ONE / raised if eta < ONE else raised
     if eta != ONE:
         k = begin_lobe(b, count, MIRROR, (wr, wg, wb), specular, tangent)
-        if k >= 0:
-            put_alphas(b, k, p[ROUGHNESS], p[ANISOTROPY], False)
-            b[k + ETA] = eta
-            z = math.sqrt(abs((eta - ONE) / (eta + ONE)))
-            rough = math.sqrt(math.sqrt(b[k + AX] * b[k + AY]))
-            s = read_3d(tables.real, z, nv, rough)
-            part = min(max((mean_fresnel(eta) - base) / max(ONE - base, _TINY), ZERO), ONE)
-            fr, fg, fb = min(base * p[TINT], ONE), min(base * p[TINT + 1], ONE), min(base * p[TINT + 2], ONE)
-            b[k + F0], b[k + F0 + 1], b[k + F0 + 2] = fr, fg, fb
-            if multiscatter:
-                make_up(b, k, nv, (fr + (ONE - fr) * part, fg + (ONE - fg) * part, fb + (ONE - fb) * part), 0, tables)
-            settle(b, k, view)
-            count += 1
-            ar = b[k + WEIGHT] / max(wr, _TINY) * (fr + (ONE - fr) * s)
-            ag = b[k + WEIGHT + 1] / max(wg, _TINY) * (fg + (ONE - fg) * s)
-            ab = b[k + WEIGHT + 2] / max(wb, _TINY) * (fb + (ONE - fb) * s)
-            rest = min(max(ONE - max(ar, max(ag, ab)), ZERO), ONE)
-            wr, wg, wb = wr * rest, wg * rest, wb * rest
+        put_alphas(b, k, p[ROUGHNESS], p[ANISOTROPY], False)
+        b[k + ETA] = eta
+        z = math.sqrt(abs((eta - ONE) / (eta + ONE)))
+        rough = math.sqrt(math.sqrt(b[k + AX] * b[k + AY]))
+        s = read_3d(tables.real, z, nv, rough)
+        part = min(max((mean_fresnel(eta) - base) / max(ONE - base, _TINY), ZERO), ONE)
+        fr, fg, fb = min(base * p[TINT], ONE), min(base * p[TINT + 1], ONE), min(base * p[TINT + 2], ONE)
+        b[k + F0], b[k + F0 + 1], b[k + F0 + 2] = fr, fg, fb
+        if multiscatter:
+            make_up(b, k, nv, (fr + (ONE - fr) * part, fg + (ONE - fg) * part, fb + (ONE - fb) * part), tables)
+        settle(b, k, view)
+        count += 1
+        ar = b[k + WEIGHT] / max(wr, _TINY) * (fr + (ONE - fr) * s)
+        ag = b[k + WEIGHT + 1] / max(wg, _TINY) * (fg + (ONE - fg) * s)
+        ab = b[k + WEIGHT + 2] / max(wb, _TINY) * (fb + (ONE - fb) * s)
+        rest = min(max(ONE - max(ar, max(ag, ab)), ZERO), ONE)
+        wr, wg, wb = wr * rest, wg * rest, wb * rest
     own = (wr * cr, wg * cg, wb * cb)
     return add_diffuse(b, count, own, p[DIFFUSE_ROUGHNESS], (cr, cg, cb), normal, view)

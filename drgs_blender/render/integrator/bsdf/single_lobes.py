@@ -16,7 +16,6 @@ from .lobes import (
     GLASS,
     KIND,
     LOBE,
-    MOST_LOBES,
     NORMAL,
     OWN,
     PASSED,
@@ -53,7 +52,7 @@ def brightness(r, g, b):  # type: ignore[no-untyped-def]
 
 @njit
 def begin_lobe(b, count, kind, weight, normal, tangent):  # type: ignore[no-untyped-def]
-    """Start a lobe; returns where, or -1 where there is no room.
+    """Start a lobe; returns where. There is room for all lobes of `MOST_PARTS` parts.
 
     Parameters
     ----------
@@ -72,8 +71,6 @@ def begin_lobe(b, count, kind, weight, normal, tangent):  # type: ignore[no-unty
     -------
     int64
     """
-    if count >= MOST_LOBES:
-        return -1
     k = count * LOBE
     for i in range(LOBE):
         b[k + i] = ZERO
@@ -139,7 +136,7 @@ def put_alphas(b, k, roughness, anisotropy, glossy):  # type: ignore[no-untyped-
 
 
 @njit
-def make_up(b, k, mu, mean, inside, tables):  # type: ignore[no-untyped-def]
+def make_up(b, k, mu, mean, tables):  # type: ignore[no-untyped-def]
     """Multiscatter GGX: scale the lobe's value by what microfacets lose, and colour its weight by Fresnel.
 
     Parameters
@@ -151,24 +148,21 @@ def make_up(b, k, mu, mean, inside, tables):  # type: ignore[no-untyped-def]
     mu : float32
         Cosine between its normal and the viewer.
     mean : tuple of float32
-        Mean of Fresnel over the hemisphere, linear Rec.709.
-    inside : int64
-        1 where a path leaves glass, else 0.
+        Mean of Fresnel over the hemisphere, linear Rec.709; taken as 1 at most.
     tables : AlbedoTables
     """
     rough = math.sqrt(math.sqrt(b[k + AX] * b[k + AY]))
-    kind = b[k + KIND]
-    if kind in (GLASS, REFRACTION):
-        eta = max(b[k + ETA], ONE / b[k + ETA])
-        z = math.sqrt((eta - ONE) / (eta + ONE))
-        e = read_3d(tables.glass[inside], z, mu, rough)
+    if b[k + KIND] == GLASS:
+        eta = b[k + ETA]
+        z = math.sqrt(abs((eta - ONE) / (eta + ONE)))
+        e = read_3d(tables.glass[1 if eta < ONE else 0], z, mu, rough)
         b[k + SCALE] = ONE / max(e, F(1e-3))
         return
     e, average = max(read_2d(tables.energy, mu, rough), F(1e-3)), read_1d(tables.mean_energy, rough)
     missing = (ONE - e) / e
     b[k + SCALE] = ONE + missing
     for i in range(3):
-        f = mean[i]
+        f = min(max(mean[i], ZERO), ONE)
         many = f * average / max(ONE - f * (ONE - average), F(1e-6))
         b[k + WEIGHT + i] *= (ONE + many * missing) / (ONE + missing)
 
@@ -221,8 +215,6 @@ def add_sheen(b, count, weight, roughness, normal, view):  # type: ignore[no-unt
     if not (a > _LEAST and albedo > _LEAST):
         return count, ZERO
     k = begin_lobe(b, count, SHEEN, (weight[0] * albedo, weight[1] * albedo, weight[2] * albedo), normal, normal)
-    if k < 0:
-        return count, ZERO
     b[k + TANGENT], b[k + TANGENT + 1], b[k + TANGENT + 2] = frame_about(normal, view)
     b[k + OWN], b[k + OWN + 1] = a, c
     b[k + PROBABILITY] = brightness(b[k + WEIGHT], b[k + WEIGHT + 1], b[k + WEIGHT + 2])
@@ -278,8 +270,6 @@ def add_diffuse(b, count, weight, roughness, colour, normal, view):  # type: ign
         Lobes.
     """
     k = begin_lobe(b, count, DIFFUSE, weight, normal, frame_about(normal, normal))
-    if k < 0:
-        return count
     sigma = min(max(roughness, ZERO), ONE)
     if sigma > _LEAST:
         a = ONE / (PI + sigma * (PI * F(0.5) - F(2.0 / 3.0)))
@@ -316,7 +306,5 @@ def add_translucent(b, count, weight, normal):  # type: ignore[no-untyped-def]
         Lobes.
     """
     k = begin_lobe(b, count, TRANSLUCENT, weight, normal, frame_about(normal, normal))
-    if k < 0:
-        return count
     b[k + PROBABILITY] = brightness(weight[0], weight[1], weight[2])
     return count + 1
