@@ -23,6 +23,7 @@ from ..drgs_blender.core.phases import PREPARING
 from ..drgs_blender.ipc.child_process import clean_environment
 from ..drgs_blender.ipc.locate import VARIABLE
 from .engine_environment import (
+    CAPTURE,
     ENGINE,
     GPU,
     PACKAGE,
@@ -216,7 +217,7 @@ class EngineSetup:
         doctor = [str(own), *_FLAGS, "-m", f"{PACKAGE}.cli.main", "doctor"]
         ready = lambda: write_stamp(self.folder, sources=digest(self.source))  # noqa: E731
         steps.append(Step("Trying the engine", doctor, 0.1, ready, before=self._copy))
-        names = {RECONSTRUCT: "PyTorch", GPU: "NVIDIA Warp"}
+        names = {RECONSTRUCT: "PyTorch", CAPTURE: "COLMAP", GPU: "NVIDIA Warp"}
         steps += [fetch(f"Installing {names[group]}", group) for group in missing if group in names]
         kernels = [str(own), *_FLAGS, "-m", f"{PACKAGE}.compute.prepare", "--all"]
         return [*steps, Step(PREPARING, kernels, 0.3, needed=False)]

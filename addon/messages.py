@@ -51,8 +51,8 @@ def withdraw(level: str, text: str) -> None:
 
 
 def named_in(text: str, known: Container[str]) -> str:
-    """The first name in quotation marks that is `known`, else ""."""
-    return next((name for name in re.findall(r'"([^"]+)"', text) if name in known), "")
+    """The first name that is `known`, in quotation marks or, as the engine writes it, before a colon; else ""."""
+    return next((name for name in (*re.findall(r'"([^"]+)"', text), text.partition(": ")[0]) if name in known), "")
 
 
 #: What the render under way has warned of, in this frame or in those before.

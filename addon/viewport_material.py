@@ -11,6 +11,8 @@ from ..drgs_blender.core.asset import BASE_CHANNELS, OPTIONAL_CHANNELS
 NAME = "DR-GS"
 #: Custom property of images and materials of textures: what they were made of, and the optional channels they show.
 KEY = "drgs_textures"
+#: Custom property of materials of textures: optional channels of which they have images, which their attributes leave.
+PICTURED = "drgs_pictured"
 #: Material channel -> (output of its attribute, input of the Principled BSDF).
 _INPUTS = {
     "albedo": ("Color", "Base Color"),
@@ -42,7 +44,8 @@ def viewport_material(channels: Collection[str] = ()) -> bpy.types.Material:
 def textured_material(material: bpy.types.Material, channels: Collection[str]) -> bpy.types.Material:
     """`material`, which shows textures, or that with the same textures that shows these optional `channels`."""
     base, _, shown = material[KEY].partition(" ")
-    more = [name for name in OPTIONAL_CHANNELS if name in channels]
+    pictured = str(material.get(PICTURED, "")).split()
+    more = [name for name in OPTIONAL_CHANNELS if name in channels and name not in pictured]
     if shown.split() == more:
         return material
     key = " ".join([base, *more])
@@ -53,7 +56,7 @@ def textured_material(material: bpy.types.Material, channels: Collection[str]) -
     made[KEY] = key
     for node in [n for n in made.node_tree.nodes if n.type == "ATTRIBUTE" and n.attribute_name in OPTIONAL_CHANNELS]:
         made.node_tree.nodes.remove(node)
-    _show(made, more)
+    _show(made, more, "emission" in pictured)
     return made
 
 
@@ -69,11 +72,11 @@ def update_viewport_material(mesh: bpy.types.Mesh) -> None:
             mesh.materials[slot] = textured_material(material, channels)
 
 
-def _show(material: bpy.types.Material, channels: Collection[str]) -> None:
-    """Feed the Principled BSDF of a material with the attributes of channels."""
+def _show(material: bpy.types.Material, channels: Collection[str], glows: bool = False) -> None:
+    """Feed the Principled BSDF of a material with the attributes of channels; `glows`: it has an image of emission."""
     nodes, links = material.node_tree.nodes, material.node_tree.links
     surface = next(n for n in nodes if n.type == "BSDF_PRINCIPLED")
-    surface.inputs["Emission Strength"].default_value = 1.0 if "emission" in channels else 0.0
+    surface.inputs["Emission Strength"].default_value = 1.0 if glows or "emission" in channels else 0.0
     for row, channel in enumerate(channels):
         output, target = _INPUTS[channel]
         attribute = nodes.new("ShaderNodeAttribute")

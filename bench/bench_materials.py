@@ -35,6 +35,7 @@ SCENES = {
     "rough_glass": "frosted glass, half glass",
     "thin_glass": "a pane of glass",
     "anisotropy": "brushed metals",
+    "metals": "Multiscatter GGX: rough metals, one half",
     "specular": "IOR, specular level and tint, rough Diffuse BSDF",
     "glass_nodes": "Glass, Refraction and Glossy BSDF",
     "translucent": "Translucent BSDF, mixed with Diffuse",

@@ -116,6 +116,19 @@ def anisotropy(job: dict) -> None:
     )
 
 
+def metals(job: dict) -> None:
+    """Rough metals with Blender's default distribution, Multiscatter GGX, one of them half a dielectric."""
+    gold, red = (0.9, 0.65, 0.3, 1), (0.8, 0.15, 0.1, 1)
+    made = [
+        principled("Worn", Metallic=1.0, Roughness=0.5, Base_Color=gold),
+        principled("Cast", Metallic=1.0, Roughness=0.9, Base_Color=gold),
+        principled("Half", Metallic=0.5, Roughness=0.7, Base_Color=red),
+    ]
+    for one in made:
+        one["multiscatter"] = True
+    balls(*made)
+
+
 def specular(job: dict) -> None:
     """IOR, specular level and tint of the glossy lobe, and rough diffuse light."""
     paint = {"Base_Color": (0.1, 0.2, 0.4, 1), "Roughness": 0.25}
@@ -163,6 +176,6 @@ def mixes(job: dict) -> None:
 BSDFS: dict[str, Callable[[dict], None]] = {
     made.__name__: made
     for made in (
-        coat, sheen, glass, rough_glass, thin_glass, anisotropy, specular, glass_nodes, translucent, mixes,
+        coat, sheen, glass, rough_glass, thin_glass, anisotropy, metals, specular, glass_nodes, translucent, mixes,
     )
 }  # fmt: skip

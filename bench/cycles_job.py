@@ -33,9 +33,12 @@ def reset() -> bpy.types.Scene:
 def plain_shading() -> None:
     """Let all materials and objects of the file be what both programs solve alike.
 
-    GGX without multiple scattering; Cycles' shadow terminator offsets, which are no physics, off.
+    GGX without multiple scattering, but for materials with the property "multiscatter"; Cycles' shadow terminator
+    offsets, which are no physics, off.
     """
     for material in bpy.data.materials:
+        if "multiscatter" in material:
+            continue
         for node in material.node_tree.nodes if material.node_tree else ():
             if getattr(node, "distribution", "") == "MULTI_GGX":
                 node.distribution = "GGX"

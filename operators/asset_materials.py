@@ -7,12 +7,29 @@ import hashlib
 import bpy
 import numpy as np
 
-from ..addon.viewport_material import KEY, update_viewport_material
-from ..drgs_blender.core.asset.textures import ALBEDO, METALLIC, NORMAL, ROUGHNESS, MeshTextures
+from ..addon.viewport_material import KEY, PICTURED, update_viewport_material
+from ..drgs_blender.core.asset.textures import (
+    ALBEDO,
+    COAT,
+    COLOURED,
+    EMISSION,
+    FACTORS,
+    METALLIC,
+    NORMAL,
+    OPACITY,
+    ROUGHNESS,
+    SLOTS,
+    SPECULAR,
+    MeshTextures,
+    channel_of,
+)
 
 _EXTENSIONS = ("REPEAT", "EXTEND", "MIRROR")
-_CHANNELS = {ROUGHNESS: "Green", METALLIC: "Blue"}
-_INPUTS = {ALBEDO: "Base Color", ROUGHNESS: "Roughness", METALLIC: "Metallic", NORMAL: "Normal"}
+_CHANNELS = {"r": "Red", "g": "Green", "b": "Blue"}
+_INPUTS = {
+    ALBEDO: "Base Color", ROUGHNESS: "Roughness", METALLIC: "Metallic", NORMAL: "Normal", OPACITY: "Alpha",
+    EMISSION: "Emission Color", SPECULAR: "Specular IOR Level", COAT: "Coat Weight",
+}  # fmt: skip
 
 
 def show_textures(mesh: bpy.types.Mesh, textures: MeshTextures) -> None:
@@ -32,9 +49,8 @@ def show_textures(mesh: bpy.types.Mesh, textures: MeshTextures) -> None:
 
 def _material(textures: MeshTextures, k: int, uv_map: str) -> bpy.types.Material:
     """Material `k`, the one that is there or a new one."""
-    images = {
-        slot: _image(textures, int(textures.slots[k, slot]), slot) for slot in _INPUTS if textures.slots[k, slot] >= 0
-    }
+    slots = textures.slots[k]
+    images = {slot: _image(textures, int(slots[slot]), _space(slot, slots)) for slot in _INPUTS if slots[slot] >= 0}
     numbers = b"".join(a[k].tobytes() for a in (textures.factors, textures.transforms, textures.extensions))
     names = "".join(f"{slot} {image[KEY]} " for slot, image in images.items())
     key = hashlib.sha256(numbers + f"{names}{uv_map} {textures.names[k]}".encode()).hexdigest()
@@ -49,6 +65,7 @@ def _material(textures: MeshTextures, k: int, uv_map: str) -> bpy.types.Material
     surface.distribution = "GGX"
     for slot, image in images.items():
         _plug(material.node_tree, surface, textures, (k, slot), image, uv_map)
+    material[PICTURED] = " ".join(SLOTS[slot] for slot in images if slot >= OPACITY)
     for slot, attribute, output in (
         (ALBEDO, "albedo", "Color"),
         (ROUGHNESS, "roughness", "Fac"),
@@ -81,27 +98,33 @@ def _plug(
     if not np.array_equal(transform, np.eye(2, 3)):
         placed = _moved(tree, surface, slot, placed, transform)
     links.new(placed, texture.inputs["Vector"])
-    factors, value = textures.factors[k].tolist(), texture.outputs["Color"]
+    factors, value = textures.factors[k, FACTORS[slot]].tolist(), texture.outputs["Color"]
+    channel = channel_of(slot, textures.files[int(textures.slots[k, slot])][1])
     if slot == NORMAL:
         bumps = _node(tree, "ShaderNodeNormalMap", surface, -300, slot)
-        bumps.uv_map, bumps.inputs["Strength"].default_value = uv_map, factors[5]
+        bumps.uv_map, bumps.inputs["Strength"].default_value = uv_map, factors[0]
         links.new(value, bumps.inputs["Color"])
         value = bumps.outputs["Normal"]
-    elif slot == ALBEDO and factors[:3] != [1.0, 1.0, 1.0]:
-        tinted = _node(tree, "ShaderNodeVectorMath", surface, -300, slot)
-        tinted.operation, tinted.inputs[1].default_value = "MULTIPLY", factors[:3]
-        links.new(value, tinted.inputs[0])
-        value = tinted.outputs["Vector"]
-    elif slot in _CHANNELS:
-        parts = _node(tree, "ShaderNodeSeparateColor", surface, -550, slot)
-        links.new(value, parts.inputs["Color"])
-        value = parts.outputs[_CHANNELS[slot]]
-        if factors[slot + 2] != 1.0:
+    elif channel == "rgb":
+        if factors != [1.0, 1.0, 1.0]:
+            tinted = _node(tree, "ShaderNodeVectorMath", surface, -300, slot)
+            tinted.operation, tinted.inputs[1].default_value = "MULTIPLY", factors
+            links.new(value, tinted.inputs[0])
+            value = tinted.outputs["Vector"]
+    else:
+        value = texture.outputs["Alpha"]
+        if channel != "a":
+            parts = _node(tree, "ShaderNodeSeparateColor", surface, -550, slot)
+            links.new(texture.outputs["Color"], parts.inputs["Color"])
+            value = parts.outputs[_CHANNELS[channel]]
+        if factors != [1.0]:
             scaled = _node(tree, "ShaderNodeMath", surface, -300, slot)
-            scaled.operation, scaled.inputs[1].default_value = "MULTIPLY", factors[slot + 2]
+            scaled.operation, scaled.inputs[1].default_value = "MULTIPLY", factors[0]
             links.new(value, scaled.inputs[0])
             value = scaled.outputs["Value"]
     links.new(value, surface.inputs[_INPUTS[slot]])
+    if slot == EMISSION:
+        surface.inputs["Emission Strength"].default_value = 1.0
 
 
 def _moved(
@@ -130,10 +153,14 @@ def _node(tree: bpy.types.NodeTree, kind: str, surface: bpy.types.Node, x: float
     return node
 
 
-def _image(textures: MeshTextures, number: int, slot: int) -> bpy.types.Image:
+def _space(slot: int, slots: np.ndarray) -> str:
+    """Colour space of an image in a slot; the alpha of an image of colours is the same in either."""
+    return "sRGB" if slot in COLOURED or (slot == OPACITY and slots[slot] == slots[ALBEDO]) else "Non-Color"
+
+
+def _image(textures: MeshTextures, number: int, space: str) -> bpy.types.Image:
     """An image with its file packed, the one that is there or a new one."""
     name, data = textures.files[number]
-    space = "sRGB" if slot == ALBEDO else "Non-Color"
     key = f"{hashlib.sha256(data.tobytes()).hexdigest()} {space}"
     found = next((i for i in bpy.data.images if i.get(KEY) == key and not i.library), None)
     if found is not None:

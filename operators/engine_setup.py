@@ -46,6 +46,12 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         default=False,
         options={"SKIP_SAVE"},
     )
+    capture: BoolProperty(
+        name="Photographs without Cameras",
+        description="Also fetch COLMAP, OpenCV and PyAV, which find the cameras of photographs and of videos",
+        default=False,
+        options={"SKIP_SAVE"},
+    )
     gpu: BoolProperty(
         name="Graphics Card",
         description="Also fetch NVIDIA Warp, which the engine needs to trace on an NVIDIA card; its driver is enough",
@@ -69,6 +75,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         folder = engine_link.engine_folder()
         if engine_environment.state(folder) != "absent":
             self.reconstruct = self.reconstruct or not self._missing(engine_environment.RECONSTRUCT)
+            self.capture = self.capture or not self._missing(engine_environment.CAPTURE)
             self.gpu = self.gpu or not self._missing(engine_environment.GPU)
         return context.window_manager.invoke_props_dialog(self, width=440, confirm_text="Set Up")
 
@@ -89,6 +96,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         for line in textwrap.wrap(text, 70) + path_lines(folder, 70):
             column.label(text=line)
         layout.prop(self, "reconstruct")
+        layout.prop(self, "capture")
         layout.prop(self, "gpu")
         column = layout.column(align=True)
         if groups:
@@ -111,7 +119,11 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         return [engine_environment.ENGINE, *self._extras()]
 
     def _extras(self) -> list[engine_environment.Group]:
-        wanted = {engine_environment.RECONSTRUCT: self.reconstruct, engine_environment.GPU: self.gpu}
+        wanted = {
+            engine_environment.RECONSTRUCT: self.reconstruct,
+            engine_environment.CAPTURE: self.capture,
+            engine_environment.GPU: self.gpu,
+        }
         return [group for group, chosen in wanted.items() if chosen]
 
     def _missing(self, group: engine_environment.Group) -> bool:

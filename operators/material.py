@@ -201,8 +201,8 @@ class DRGS_OT_paint(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
             ("metallic", "Metallic", "Black is no metal, white is metal"),
             ("opacity", "Opacity", "Light passes what is black; white lets none through"),
             ("emission", "Emission", "Light that the surface gives off by itself; black is none"),
-            ("specular", "Specular", "Middle grey reflects as glass does, black not at all. It is kept, not rendered"),
-            ("coat", "Coat", "White is varnished, black is not. It is kept, not rendered"),
+            ("specular", "Specular", "Middle grey reflects as glass does, black not at all"),
+            ("coat", "Coat", "White is varnished, black is not"),
         ),
         default="albedo",
     )

@@ -28,14 +28,16 @@ _CAMERAS = (
 
 
 class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
-    """Make a DR-GS object of photographs with known cameras (COLMAP, NeRF, nerfstudio). Blender goes on meanwhile"""
+    """Make a DR-GS object of photographs, with cameras (COLMAP, NeRF, nerfstudio) or without. Blender goes on"""
 
     bl_idname = "drgs.reconstruct"
     bl_label = "Reconstruct from Photographs"
     bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
 
     filepath: StringProperty(
-        description="Folder of the photographs and their cameras", subtype="FILE_PATH", options={"SKIP_SAVE"}
+        description="Folder of the photographs, with their cameras or without; or a video",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
     )
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     out: StringProperty(
@@ -104,7 +106,7 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
             raise UsageError(
                 str(capture if self.filepath else "Photographs"),
                 "is not there",
-                "Choose the folder of the photographs and their cameras, or its transforms.json",
+                "Choose the folder of the photographs, its transforms.json, or a video",
             )
         folder = capture if capture.is_dir() else capture.parent
         if not self.out and not bpy.data.filepath:

@@ -66,12 +66,14 @@ SUITES = {
     "engine": suites.Suite("engine", ("tests/unit", "tests/engine"), spread=True),
     "farm": suites.Suite("farm", ("tests/farm",)),
     "blender": suites.Suite(f"Blender {BLENDER}", ("tests/blender",)),
-    FLOOR: suites.Suite(f"Blender {BLENDER_FLOOR}", ("tests/blender",), leaves="judged"),
+    FLOOR: suites.Suite(f"Blender {BLENDER_FLOOR}", ("tests/blender",), leaves="judged or (slow and not blender_api)"),
     LTS: suites.Suite(f"Blender {BLENDER_LTS}", ("tests/blender",)),
     suites.WINDOW: suites.Suite("a window", ("tests/ui",), times=suites.WINDOW_TIMES),
 }
-#: What `make test` runs, in this order: the one that spreads over processes takes what the others leave.
+#: What `make test` and `make check` run, in this order: the longest first, and last the one that spreads over
+#: processes, which takes what the others leave.
 FAST = (suites.LINT, "blender", "farm", "engine")
+ALL = (suites.LINT, "blender", FLOOR, "farm", "engine")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -319,7 +321,7 @@ def run_test(args: argparse.Namespace) -> int:
 
 def run_check(args: argparse.Namespace) -> int:
     """Run everything, or what the words choose of it."""
-    every = [*(name for name in FAST if name != suites.LINT or not args.others), FLOOR]
+    every = [name for name in ALL if name != suites.LINT or not args.others]
     return run_suites(args, "slow" if args.others else "all", every)
 
 

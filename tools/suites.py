@@ -52,7 +52,7 @@ class Suite:
     times : int
         How many times longer than others it may take.
     leaves : str
-        Mark of tests that it leaves to others, unless it is asked for by name.
+        Marks of tests that it leaves to others, as an expression of pytest, unless it is asked for by name.
     """
 
     title: str
@@ -204,7 +204,7 @@ def suite_jobs(name: str, suite: Suite, plan: Plan, python: Path, root: Path, fo
         command = [str(python), "-m", "pytest", "-q", f"--part={part}", f"--lane={lane}", f"--junitxml={report}"]
         command += ["-o", f"cache_dir=.pytest_cache/{own}", "-o", f"faulthandler_timeout={STUCK_SECONDS}"]
         if suite.leaves and not plan.named and not any("::" in file for file in files):
-            command += ["-m", f"not {suite.leaves}"]
+            command += ["-m", f"not ({suite.leaves})"]
         environment = {}
         if lane == "shared" and suite.spread:
             command += ["-n", str(workers()), "--dist", "loadfile"]

@@ -208,7 +208,7 @@ class Manager:
             except (OSError, RuntimeError, DrgsError) as error:
                 _clear(folder)
                 with self._changed:
-                    self.failed[request.key] = f"{_FILES} ({error})"
+                    self.failed[request.key] = f"{_FILES} ({str(error).strip()})"
                     self.news += 1
                 continue
             except BaseException:

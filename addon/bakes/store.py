@@ -27,6 +27,8 @@ LIMIT = 4 << 30
 #: Exports for which a result that none of them used stays in memory: view layers and scenes take turns.
 KEPT_EXPORTS = 4
 _SUFFIX = ".npz"
+#: What results of a surface and of a World hold: the number of axes of each array.
+_CONTENTS = ({"pixels": 3, "uvs": None, "factor": 0}, {"map": 3, "suns": 2, "kept": 0})
 
 
 def cache_folder() -> Path | None:
@@ -43,7 +45,7 @@ class Store:
     Attributes
     ----------
     trouble : str
-        Why results are not kept for the next start, for the user; "" when they are.
+        Why the last results are not kept for the next start, for the user; "" when they are, and once it was said.
     """
 
     def __init__(self) -> None:
@@ -94,7 +96,10 @@ class Store:
             _prune(folder)
             self.trouble = ""
         except OSError as error:
-            self.trouble = f"Baked textures cannot be kept in {folder} ({error.strerror or error}): made at each start"
+            self.trouble = (
+                f"Baked textures cannot be kept in {folder} ({error.strerror or error}): they are made at each start. "
+                "Make room there, or name another folder in DRGS_CACHE_DIR"
+            )
 
     def end_export(self) -> None:
         """Drop from memory what the last exports did not use."""
@@ -121,6 +126,9 @@ def read(path: Path) -> Baked:
             found = {name: data[name] for name in data.files}  # the checksum of each is compared
     except (zipfile.BadZipFile, EOFError, KeyError, SyntaxError, MemoryError, NotImplementedError) as error:
         raise ValueError(str(error) or type(error).__name__) from error
+    axes = {name: array.ndim for name, array in found.items()}
+    if not any(axes == {n: axes.get(n) if k is None else k for n, k in known.items()} for known in _CONTENTS):
+        raise ValueError(f"holds {', '.join(axes) or 'nothing'}, which is no result of a bake")
     for array in found.values():
         array.flags.writeable = False
     return found

@@ -63,4 +63,5 @@ def export_baked(
         warn(f"{request.label} is another whenever it is looked at, and cannot be baked; it is approximated")
     if manager.store.trouble:
         warn(manager.store.trouble)
+        manager.store.trouble = ""
     return frame

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.core.arrays import shareable
-from ...drgs_blender.core.color import srgb_to_linear
+from ...drgs_blender.core.color import linear_to_srgb, srgb_to_linear
 from ...drgs_blender.core.materials import Image
 
 Array = np.ndarray
@@ -61,13 +61,21 @@ def associated(image: bpy.types.Image) -> Image | None:
     pixels = _rgba(image)
     if pixels is None:
         return None
-    if pixels.shape[2] == 4 and not image.is_float and _has_alpha(image):
-        for first in range(0, len(pixels), _STRIP):
-            part = pixels[first : first + _STRIP]
-            if (part[..., 3] != 255).any():
-                # Of the encoded values and rounded down, as Cycles does.
-                part[..., :3] = part[..., :3].astype(np.uint16) * part[..., 3:] // 255
+    if pixels.shape[2] == 4 and _has_alpha(image) and (not image.is_float or _is_encoded(image)):
+        for part in _strips(pixels):
+            colours, alpha = part[..., :3], part[..., 3:]
+            # Of the encoded values, and bytes rounded down, as Cycles does.
+            if image.is_float:
+                straight = np.divide(colours, alpha, out=np.zeros_like(colours), where=alpha > 0)
+                colours[:] = srgb_to_linear(linear_to_srgb(straight) * alpha)
+            elif (alpha != 255).any():
+                colours[:] = colours.astype(np.uint16) * alpha // 255
     return _picture(image, pixels)
+
+
+def _is_encoded(image: bpy.types.Image) -> bool:
+    """Whether the file has 16 bits a channel, encoded as sRGB: Blender has them as linear floats, times alpha."""
+    return image.file_format == "PNG" and image.colorspace_settings.name == "sRGB"
 
 
 def _has_alpha(image: bpy.types.Image) -> bool:

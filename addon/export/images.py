@@ -192,6 +192,11 @@ def _named(picture: Image | None, name: str) -> Image | None:
     return None if picture is None else replace(picture, name=name)
 
 
+def has_file(image: bpy.types.Image, frame: int) -> bool:
+    """Whether there is a file of what a node shows of an image, packed or on disk, readable or not."""
+    return image.packed_file is not None or os.path.isfile(image_parts.frame_file(image, frame))
+
+
 def mean_colour(picture: Image) -> Array:
     """(4,) linear mean of a picture, from at most some 65 thousand of its pixels."""
     some = _some(picture).astype(np.float64)

@@ -40,10 +40,6 @@ class ExportedMaterial:
     is_baked: bool = False
 
 
-#: Metals of a roughness, and the part of their light that GGX lacks of Multiscatter GGX (albedo 0.8, at 45 degrees).
-_LOST = (0.3, 0.4, 0.6, 0.8, 1.0), (0.01, 0.04, 0.17, 0.34, 0.51)
-#: Of it what is not worth a warning.
-_SMALL_LOSS = 0.05
 #: Says the name that a layer has in the frame.
 Label = Callable[[LayerRef], str]
 #: Least numbers, other than 0. Rotations have none.
@@ -146,10 +142,7 @@ class Materials:
         }
         if not found.parts:
             bsdfs = [part.bsdf for part in surface.parts]
-            made = Material(material.name, **values, **(_switched(bsdfs[0], label) if bsdfs else {}))
-            if made.multiscatter and not made.has_more_lobes:
-                _name_lost_light(tree, found.own["roughness"], found.own["metallic"])
-            return made
+            return Material(material.name, **values, **(_switched(bsdfs[0], label) if bsdfs else {}))
         parts = []
         for part, (weights, channels) in zip(surface.parts, found.parts, strict=True):
             weight, name = weights["weight"], ", ".join((material.name, *(leaf[1] for leaf in part.bsdf.leaves[:1])))
@@ -232,17 +225,6 @@ class _Paints:
             for values in held:
                 for name in values:
                     yield values, name, leaves
-
-
-def _name_lost_light(tree: SurfaceWalker, *values: SocketValue) -> None:
-    """Say how much light a metal of a roughness lacks where Cycles gives back what is lost between microfacets."""
-    rough, metal = (
-        float(value.colour[0]) * (1 if value.texture is None else float(tree.mean(value.texture)[0]))
-        for value in values
-    )
-    lost = float(np.interp(rough, *_LOST)) * metal
-    if lost > _SMALL_LOSS:
-        tree.report(f"Multiscatter GGX is rendered as GGX; this rough metal is some {lost:.0%} darker by that")
 
 
 def _switched(bsdf: Bsdf, label: Label) -> dict[str, Any]:

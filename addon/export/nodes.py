@@ -73,11 +73,18 @@ class Walker:
 
     # Sockets
 
+    def origin(self, ref: SocketRef) -> SocketRef:
+        """What feeds an input; a link that Blender cannot follow is named."""
+        found = ref.origin()
+        if found.is_cut:
+            self.note(found.node, f'the link to "{found.socket.name}" is part of a loop; it is left out')
+        return found
+
     @tracked
     @once(lambda self: uniform(self.unknown))
     def colour(self, ref: SocketRef) -> SocketValue:
         """Value of a colour or vector input."""
-        origin = ref.origin()
+        origin = self.origin(ref)
         if not origin.socket.is_output:
             return SocketValue(constant(origin.socket))
         evaluate = getattr(self, f"node_{origin.node.type.lower()}", None)

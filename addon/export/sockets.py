@@ -25,6 +25,12 @@ class SocketRef(NamedTuple):
         """The inputs of the same node by identifier, which is unique."""
         return {s.identifier: SocketRef(s, self.groups) for s in self.node.inputs}
 
+    @property
+    def is_cut(self) -> bool:
+        """Whether it is an input whose link is not followed, as links of loops are not."""
+        socket = self.socket
+        return not socket.is_output and socket.is_linked and not socket.links[0].is_valid
+
     def origin(self) -> SocketRef:
         """The output that feeds this input, through reroutes, muted nodes and groups.
 

@@ -60,7 +60,7 @@ class SurfaceWalker(MixingWalker):
     @once(lambda self: _plain(uniform(self.unknown)))
     def shader(self, ref: SocketRef) -> Surface:
         """The surface of a shader input."""
-        origin = ref.origin()
+        origin = self.origin(ref)
         if not origin.socket.is_output:
             return Surface()
         evaluate = getattr(self, f"shader_{origin.node.type.lower()}", None)
@@ -223,6 +223,8 @@ class SurfaceWalker(MixingWalker):
         if first.alpha.black and second.alpha.black:
             return first
         a, b = (float(self.flat(node, surface.alpha)[0]) for surface in (first, second))
+        if a + b <= 0:  # of images that are clear everywhere
+            return replace(first, alpha=uniform(0))
         alpha = max(1 - (2 - a - b), _LEAST_ADDED)
         if a + b < 2:
             self.warn(node, f"light added to what passes: the surface hides {alpha:.0%} of what is behind it")

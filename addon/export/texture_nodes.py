@@ -56,7 +56,10 @@ class TextureWalker(Walker):
         shown = None if image is None else images.show(image, straight, self._warn, lookup)
         if shown is None:
             name = "has no image" if image is None else f'image "{image.name}" cannot be read'
-            self.warn(node, f"{name}; as in Cycles it is magenta. Choose another, or find its file")
+            problem = f"{name}; as in Cycles it is magenta. Choose another, or find its file"
+            self.note(node, problem)  # also where a bake shows it
+            if image is not None and images.has_file(image, lookup.frame):
+                self.approximated = (*self.approximated, problem)  # Cycles reads part of some damaged files
             return uniform(1) if output.socket.name == "Alpha" else SocketValue(np.array(images.MISSING))
         if node.projection != "FLAT":
             self.warn(node, f"the {node.projection.title()} projection is not supported; the UV map is used")
@@ -111,7 +114,9 @@ class TextureWalker(Walker):
             name = self.mesh.color_attributes[max(self.mesh.color_attributes.render_color_index, 0)].name
         values = attribute_values(self.mesh, name)
         if values is None:
-            self.warn(output.node, f'mesh "{self.mesh.name}" has no values "{name}"; a plain grey is used')
+            problem = f'mesh "{self.mesh.name}" has no values "{name}", which are black in Cycles. Choose others'
+            self.note(output.node, problem)  # also where a bake shows the black
+            self.approximated = (*self.approximated, problem)
             return uniform(self.unknown)
         layer, channel = LayerRef("attribute", name), cast(Channel, "rgb")
         if output.socket.name == "Alpha":

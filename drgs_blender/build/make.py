@@ -16,13 +16,15 @@ from ..formats.axes import UP_AXES, mesh_to_z_up
 from ..formats.files import MeshFile, plain_name
 from ..formats.gltf_nodes import Pose
 from ..formats.mesh import check_extent
-from .mesh_textures import MAX_TEXTURE, mesh_textures
+from .mesh_textures import MAX_TEXTURE, has_opacity_image, mesh_textures
 from .refine import MAX_TRIANGLES, TOLERANCE, refine
 from .surface_detail import MAX_SURFELS, CornerFrames, SurfaceDetail
 from .texture import CUT, CUT_OUT, Materials
 from .topology import Net, weld
 
 Array = np.ndarray
+#: Alpha below which a corner of a face shows nothing.
+_SEEN = 1 / 255
 log = logging.getLogger(__name__)
 
 
@@ -157,7 +159,11 @@ def detailed_mesh(
     origin = _source(net, file.vertex_numbers[source], file.vertex_numbers[corners], count)
     divided = len(net.faces) > faces
     if alpha is not None:
-        _cut_out(net, alpha, materials.cut_out, name, report)
+        kept = max_texture > 0 and file.corner_uvs is not None
+        pictured = np.array([kept and has_opacity_image(m) for m in file.materials] + [False])
+        _cut_out(net, alpha, materials.cut_out, pictured, name, report)
+        if (pictured & materials.cut_out).any():
+            columns["opacity"] = columns.get("opacity", 1) * alpha
     report["vertices"], report["faces"] = len(net.vertices), len(net.faces)
     mesh = Mesh(net.vertices, net.faces, **columns, groups=_groups(net, file), source=origin)
     if max_texture > 0:
@@ -168,7 +174,7 @@ def detailed_mesh(
     return mesh, report, SurfaceDetail(net, materials, frames, divided)
 
 
-def _cut_out(net: Net, alpha: Array, which: Array, name: str, report: dict[str, Any]) -> None:
+def _cut_out(net: Net, alpha: Array, which: Array, pictured: Array, name: str, report: dict[str, Any]) -> None:
     """Leave out the transparent faces of `net`; their vertices stay, so that poses of the source fit.
 
     Parameters
@@ -178,12 +184,16 @@ def _cut_out(net: Net, alpha: Array, which: Array, name: str, report: dict[str, 
         Of the vertices.
     which : (materials + 1,) bool array
         Materials that are cut out.
+    pictured : (materials + 1,) bool array
+        Those whose image the mesh keeps: of these, only what is transparent all over.
     name : str
         Of the file, in errors.
     report : dict
         Its notes get how many faces that were.
     """
-    keep = (alpha[net.faces].mean(axis=1) >= CUT_OUT) | ~which[net.tags[:, 0]]
+    corners, material = alpha[net.faces], net.tags[:, 0]
+    there = np.where(pictured[material], corners.max(axis=1) >= _SEEN, corners.mean(axis=1) >= CUT_OUT)
+    keep = there | ~which[material]
     if not keep.any():
         raise AssetError(name, "is transparent everywhere", "Make its materials opaque")
     if cut := int((~keep).sum()):

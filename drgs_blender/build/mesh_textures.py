@@ -7,7 +7,22 @@ import io
 import numpy as np
 from PIL import Image as Pillow
 
-from ..core.asset.textures import ALBEDO, EXTENSIONS, METALLIC, NORMAL, ROUGHNESS, MeshTextures, image_suffix, without
+from ..core.asset.textures import (
+    ALBEDO,
+    COAT,
+    COLOURED,
+    EMISSION,
+    EXTENSIONS,
+    METALLIC,
+    NORMAL,
+    OPACITY,
+    ROUGHNESS,
+    SLOTS,
+    SPECULAR,
+    MeshTextures,
+    image_suffix,
+    without,
+)
 from ..core.color import linear_to_srgb, to_unit
 from ..formats.files import Image, MaterialFile, MeshFile
 from ..geometry.normals import unit
@@ -45,17 +60,23 @@ def mesh_textures(
     if file.corner_uvs is None or not file.materials:
         return None
     images = _Images(largest, notes)
-    slots, extensions = np.full((len(file.materials), 4), -1, np.int32), np.zeros((len(file.materials), 4), np.int32)
-    transforms = np.tile(np.eye(2, 3), (len(file.materials), 4, 1, 1))
+    shape = len(file.materials), len(SLOTS)
+    slots, extensions = np.full(shape, -1, np.int32), np.zeros(shape, np.int32)
+    transforms = np.tile(np.eye(2, 3), (*shape, 1, 1))
     for k in np.unique(net.tags[net.tags[:, 0] >= 0, 0]):
         m = file.materials[k]
         for slot, image in _used(m):
-            slots[k, slot] = images.number(image, slot == ALBEDO, f"{m.name} {_what(slot)}")
+            slots[k, slot] = images.number(
+                image, slot in COLOURED or image is m.base_colour_image, f"{m.name} {_what(slot)}"
+            )
             transforms[k, slot] = image.uv_transform
             extensions[k, slot] = EXTENSIONS.index(_WRAP[image.wrap[0]])
             if slot != METALLIC and image.wrap[0] != image.wrap[1]:
                 notes.append(f"{m.name}: the {_what(slot)} image goes on as {image.wrap[0]} along v, too")
-    factors = [(*m.base_colour, m.roughness, m.metallic, m.normal_strength) for m in file.materials]
+    factors = [
+        (*m.base_colour, m.roughness, m.metallic, m.normal_strength, m.alpha, *m.emission, m.specular, m.coat)
+        for m in file.materials
+    ]
     with np.errstate(over="ignore"):
         uvs = np.nan_to_num(net.uvs.astype(np.float32), posinf=0.0, neginf=0.0)
     normals = None
@@ -76,17 +97,39 @@ def mesh_textures(
 def _used(m: MaterialFile) -> list[tuple[int, Image]]:
     """(slot, image) of a material."""
     surface = m.metallic_roughness_image
-    images = (ALBEDO, m.base_colour_image), (ROUGHNESS, surface), (METALLIC, surface), (NORMAL, m.normal_image)
+    images = (
+        (ALBEDO, m.base_colour_image), (ROUGHNESS, surface), (METALLIC, surface), (NORMAL, m.normal_image),
+        (OPACITY, _opacity_image(m)), (EMISSION, m.emission_image if any(m.emission) else None),
+        (SPECULAR, m.specular_image), (COAT, m.coat_image if m.coat > 0 else None),
+    )  # fmt: skip
     return [(slot, image) for slot, image in images if image is not None and image.pixels.size]
 
 
+def has_opacity_image(m: MaterialFile) -> bool:
+    """Whether a material lets light pass by an image."""
+    image = m.alpha_image
+    return image is not None and bool(image.pixels.size) and to_unit(image.pixels).min() < 1
+
+
+def _opacity_image(m: MaterialFile) -> Image | None:
+    """Image of the opacity of a material: that of its base colour, where the alpha is that one's as it is."""
+    if not has_opacity_image(m):
+        return None
+    colour, alpha = m.base_colour_image, m.alpha_image
+    assert alpha is not None
+    own = None if colour is None else colour.alpha
+    if own is None or own.pixels.shape != alpha.pixels.shape or not (own.pixels == alpha.pixels).all():
+        return alpha
+    return colour
+
+
 def _what(slot: int) -> str:
-    return {ALBEDO: "albedo", NORMAL: "normal"}.get(slot, "surface")
+    return "surface" if slot in (ROUGHNESS, METALLIC) else SLOTS[slot]
 
 
 def _of_vertices(net: Net) -> Array:
-    """(m, 4) bool: slots of faces whose vertices have values of their own."""
-    own, corners = np.zeros((len(net.faces), 4), bool), net.values[net.faces]
+    """(m, 8) bool: slots of faces whose vertices have values of their own."""
+    own, corners = np.zeros((len(net.faces), len(SLOTS)), bool), net.values[net.faces]
     own[:, ALBEDO] = (np.abs(corners[..., :3] - 1) > _WHITE).any(axis=(1, 2))
     own[:, [ROUGHNESS, METALLIC]] = np.isfinite(corners[..., 3:5]).any(axis=1)
     return own
@@ -119,18 +162,25 @@ class _Images:
         encoded = pixels.dtype.kind == "u" and image.srgb == coloured
         if step == 1 and pixels.dtype == np.uint8 and encoded and image.file and image_suffix(image.file):
             return image.file
-        if pixels.dtype != np.uint8:
+        if pixels.dtype != np.uint8 and not _is_8_bits(pixels):
             self._notes.append(f"{name}: kept with 8 bits of {8 * pixels.dtype.itemsize}")
         grey = pixels.ndim == 2 or pixels.shape[2] < 3
-        rgb = np.repeat(pixels.reshape(height, width, -1)[..., :1], 3, axis=2) if grey else pixels[..., :3]
-        if rgb.dtype != np.uint8 or not encoded:
-            values = to_unit(rgb)
-            values = linear_to_srgb(values) if coloured and not encoded else values
-            rgb = np.rint(np.clip(np.nan_to_num(values), 0, 1) * 255).astype(np.uint8)
-        picture = Pillow.fromarray(np.ascontiguousarray(rgb))
+        kept = np.repeat(pixels.reshape(height, width, -1)[..., :1], 3, axis=2) if grey else pixels[..., :4]
+        if kept.dtype != np.uint8 or not encoded:
+            values = to_unit(kept).copy()
+            if coloured and not encoded:
+                values[..., :3] = linear_to_srgb(values[..., :3])
+            kept = np.rint(np.clip(np.nan_to_num(values), 0, 1) * 255).astype(np.uint8)
+        picture = Pillow.fromarray(np.ascontiguousarray(kept))
         if step > 1:
             picture = picture.reduce(step)
             self._notes.append(f"{name}: {width} x {height} pixels reduced to {picture.width} x {picture.height}")
         data = io.BytesIO()
         picture.save(data, "PNG", compress_level=6)
         return data.getvalue()
+
+
+def _is_8_bits(pixels: Array) -> bool:
+    """Whether floats are those of bytes, or of nothing and all."""
+    values = pixels * np.float32(255) if pixels.dtype.kind == "f" else np.full(1, 0.5)
+    return bool((np.abs(values - np.rint(values)) < 1e-3).all() and values.min() >= 0 and values.max() <= 255.001)

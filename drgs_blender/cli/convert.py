@@ -189,7 +189,7 @@ def convert(args: argparse.Namespace) -> None:
         print(f"{args.output}: {len(mesh.faces)} triangles, {writer.name}, {up} up")
         print(f"  {kept(mesh, str(args.output)) or material_loss(mesh)}")
         for name in writer.lost_channels:
-            if getattr(mesh, name) is not None:
+            if getattr(mesh, name) is not None or (mesh.textures is not None and name in mesh.textures.optional):
                 print(f"  {name} is lost: {writer.name} has no place for it")
     else:
         from ..formats.splats import scaled, splats_from_z_up

@@ -212,6 +212,21 @@ def torch(args: argparse.Namespace) -> str:
         ) from None
 
 
+def capture(args: argparse.Namespace) -> str:
+    """Libraries that find the cameras of photographs and videos. They are not loaded."""
+    found, absent = [], []
+    for name in ("pycolmap", "opencv-python-headless", "av"):
+        try:
+            found.append(f"{name} {importlib.metadata.version(name)}")
+        except importlib.metadata.PackageNotFoundError:
+            absent.append(name)
+    if absent:
+        raise DeviceError(
+            ", ".join(absent), "not installed", f"Only drgs capture needs it: pip install '{_PACKAGE}[capture]'"
+        )
+    return ", ".join(found)
+
+
 def variables(args: argparse.Namespace) -> str:
     """Environment variables that are set."""
     return (
@@ -259,6 +274,7 @@ CHECKS: tuple[tuple[str, bool, Callable[[argparse.Namespace], str]], ...] = (
     ("Blender", False, blender),
     ("scikit-image", False, scikit_image),
     ("torch", False, torch),
+    ("capture", False, capture),
     ("GPU", False, gpu),
     ("variables", False, variables),
 )

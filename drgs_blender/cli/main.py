@@ -44,7 +44,9 @@ class Command:
 COMMANDS: tuple[Command, ...] = (
     Command("make", "make", "make an asset from a textured mesh"),
     Command("import", "import_surfels", "make an asset from captured surfels or splats"),
-    Command("reconstruct", "reconstruct", "make an asset from calibrated photographs"),
+    Command("reconstruct", "reconstruct", "make an asset from photographs"),
+    Command("capture", "capture", "find the cameras of photographs or of a video"),
+    Command("markers", "markers", "print a sheet of markers to photograph objects on"),
     Command("convert", "convert", "write an asset, splats, a mesh or a light in a format of other programs"),
     Command("bake", "bake", "bake the light on the objects of a frame to their vertices or to images"),
     Command(

@@ -1,7 +1,8 @@
-"""Make an asset from calibrated photographs: surfels, a closed mesh, materials and light.
+"""Make an asset from photographs: surfels, a closed mesh, materials and light.
 
-CAPTURE is a folder or file of NeRF-synthetic, NGP, nerfstudio, COLMAP, LLFF, NeRO GlossySynthetic or TensoIR. A run
-that was stopped goes on when the same command is given again. While surfels are learned, a picture beside the output,
+CAPTURE is a folder or file of NeRF-synthetic, NGP, nerfstudio, COLMAP, LLFF, NeRO GlossySynthetic or TensoIR. Of a
+folder of photographs or a video without cameras these are found first, as by `drgs capture`, in A.capture. A run that
+was stopped goes on when the same command is given again. While surfels are learned, a picture beside the output,
 A.preview.png, shows a view as it is now and its photograph.
 """
 
@@ -22,7 +23,7 @@ from ..formats.axes import UP_AXES
 from .frame_lines import emit
 from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_and_report
-from .progress import FractionBar
+from .progress import WORK_SECONDS, FractionBar
 from .sampling import int_range
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ _REPORT_EVERY = 2.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs reconstruct``."""
-    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder or file of photographs with cameras")
+    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder or file of photographs, or a video")
     parser.add_argument("--out", type=Path, required=True, metavar="A.drgs", help="asset to write")
     parser.add_argument(
         "--variant",
@@ -125,7 +126,8 @@ def run(args: argparse.Namespace) -> int:
     from ..reconstruct.optim.schedule import Schedule
     from ..reconstruct.readers import read_capture
 
-    capture = read_capture(args.capture, args.resolution, args.test_every, args.axes, args.up)
+    source = _with_cameras(args)
+    capture = read_capture(source, args.resolution, args.test_every, args.axes, args.up)
     logger.info("%d views to learn from, %d left out", len(capture.training), len(capture.testing))
     given = {"iterations": args.iterations, "surfels": args.surfels}
     settings = Settings(
@@ -161,6 +163,37 @@ def run(args: argparse.Namespace) -> int:
         shown = report["decoupling"]["psnr"]
         print(f"  materials in the light that was found, pixels learned from: PSNR {shown:.2f} dB")
     return 0
+
+
+def _with_cameras(args: argparse.Namespace) -> Path:
+    """The capture, or one made of photographs without cameras, beside the output."""
+    from ..reconstruct.readers import has_cameras
+
+    if has_cameras(args.capture):
+        return args.capture
+    from ..capture.pictures import has_pictures
+
+    if not has_pictures(args.capture):
+        return args.capture  # the readers say what is wrong with it
+    from ..capture.pipeline import Settings, make_capture
+
+    folder = args.out.with_name(f"{args.out.stem}.capture")
+    if not args.quiet:
+        emit(f"drgs: {args.capture} has no cameras: they are found first, in {folder}\n", sys.stderr)
+    said = 0.0
+    with interruptible() as cancelled, FractionBar(args, "capturing", every=WORK_SECONDS) as bar:
+
+        def tell(phase: str, part: float) -> None:
+            nonlocal said
+            bar(phase, part)
+            if not args.quiet and not sys.stdout.isatty() and time.monotonic() >= said + _REPORT_EVERY:
+                said = time.monotonic()
+                print(f'DRGS_PROGRESS part={part:.3f} surfels=0 phase="{phase}"', flush=True)
+
+        made = make_capture(args.capture, folder, Settings(), tell, cancelled)
+    for line in made.lines if not args.quiet else ():
+        emit(f"drgs: {line}\n", sys.stderr)
+    return folder
 
 
 def _clear(folder: Path) -> None:

@@ -19,8 +19,9 @@ class Image:
 
     Attributes
     ----------
-    pixels : (h, w, 4) uint8 or float32 array, or (h, w, 3) or (h, w, 1) uint8 array
-        Row 0 at the top; alpha is straight and last. One channel is a grey.
+    pixels : (h, w, c) uint8 or float32 array
+        Row 0 at the top; alpha is straight and last. Four channels; of bytes also three, or one of a grey, where all
+        is opaque.
     encoding : {"linear", "srgb"}
         "srgb" is decoded by the engine (colour channels only), "linear" is linear Rec.709 or no colour at all.
     """
@@ -181,7 +182,10 @@ class Material:
         Blender's node of that name, with all of the above that it has: `base_colour` is its Color; "diffuse" has
         `diffuse_roughness`, "sheen" `sheen_roughness` for its Roughness; "diffuse" and "translucent" have no gloss.
     multiscatter : bool
-        Multiscatter GGX instead of GGX, of a material that `has_more_lobes`.
+        Multiscatter GGX instead of GGX: rough metals are as bright as smooth ones.
+    of_point : bool
+        Whether the surface has base colour, roughness and metallic of the shading point, which may be a surfel's, not
+        those of above; of a single part alone.
     parts : list of Part
         Mix and Add Shader: if there are any, the surface scatters their weighted sum, and of the material itself only
         name, `alpha`, `emission`, `details` and `pass_index` count.
@@ -222,6 +226,7 @@ class Material:
     textures: dict[str, Texture] = field(default_factory=dict)
     kind: Literal["principled", "diffuse", "glossy", "glass", "refraction", "translucent", "sheen"] = "principled"
     multiscatter: bool = False
+    of_point: bool = False
     parts: list[Part] = field(default_factory=list)
     aovs: list[ShaderAOV] = field(default_factory=list)
 

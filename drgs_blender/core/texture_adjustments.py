@@ -8,12 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from .asset.model import Mesh
-from .asset.textures import ALBEDO, METALLIC, ROUGHNESS, MeshTextures, split, without
+from .asset.textures import ALBEDO, FACTORS, NORMAL, SLOTS, MeshTextures, split, without
 from .frame import Adjustment
 
 Array = np.ndarray
 
-_SLOT = {"albedo": ALBEDO, "roughness": ROUGHNESS, "metallic": METALLIC}
+_SLOT = {name: slot for slot, name in enumerate(SLOTS) if slot != NORMAL}
+#: Those that an adjustment multiplies by a number alone.
+_SCALED = ("emission", "opacity")
 #: Difference from which a vertex is painted, or not at all or wholly under a mask.
 _SAME = 1e-6
 
@@ -30,13 +32,13 @@ def painted_faces(mesh: Mesh, textures: MeshTextures, painted: Mapping[str, Arra
     painted : mapping of str to (n, 3) or (n,) array or None
         Channels of the vertices; a vertex whose value differs from that of `mesh` is painted.
     """
-    faces = np.zeros((len(mesh.faces), 4), bool)
+    faces = np.zeros((len(mesh.faces), len(SLOTS)), bool)
     for name, slot in _SLOT.items():
         values = painted.get(name)
         if values is None:
             continue
         with np.errstate(invalid="ignore"):
-            changed = np.abs(values - getattr(mesh, name)) > _SAME
+            changed = np.abs(values - mesh.channel(name)) > _SAME
         changed = changed.any(axis=1) if changed.ndim == 2 else changed
         faces[:, slot] = changed[mesh.faces].any(axis=1)
     return without(textures, faces) if faces.any() else textures
@@ -60,7 +62,7 @@ def adjusted_textures(
     -------
     textures : MeshTextures or None
         With other factors where these say all of it, and values of the vertices on faces that the mask covers in part.
-    pending : (k, 4) bool array
+    pending : (k, 8) bool array
         Images of its materials that are still to be adjusted, times their factors.
     parted : int
         How many textured faces the mask covers in part.
@@ -75,10 +77,10 @@ def adjusted_textures(
         parted = int(partly.sum()) if changes.any() else 0
         kept = without(textures, partly[:, None] & changes)
         if kept is None:
-            return None, np.zeros((0, 4), bool), parted
+            return None, np.zeros((0, len(SLOTS)), bool), parted
         textures = kept
     textures, number = split(textures, whole.astype(np.int64))
-    factors, pending = textures.factors.astype(np.float64), np.zeros((len(number), 4), bool)
+    factors, pending = textures.factors.astype(np.float64), np.zeros((len(number), len(SLOTS)), bool)
     under, has = number > 0, textures.slots >= 0
     if changes[ALBEDO]:
         gain = np.array(adjustment.tint, np.float64) * adjustment.value
@@ -92,9 +94,12 @@ def adjusted_textures(
         if not changes[slot]:
             continue
         if offset == 0 and low <= 0 and high >= 1 and gain >= 0:
-            factors[under, slot + 2] *= gain
+            factors[under, FACTORS[slot]] *= gain
         else:
             pending[:, slot] = under & has[:, slot]
+    for name in _SCALED:
+        columns = FACTORS[_SLOT[name]]
+        factors[under, columns] *= getattr(adjustment, name)
     return replace(textures, factors=factors.astype(np.float32)), pending, parted
 
 
@@ -125,15 +130,15 @@ def edited_textures(
     kept, pending, lost = adjusted_textures(kept, mesh.faces, adjustment, adjustment.mask)
     if kept is None or not pending.any():
         return kept, lost
-    of_faces = np.append(pending, np.zeros((1, 4), bool), axis=0)[kept.material]
+    of_faces = np.append(pending, np.zeros((1, len(SLOTS)), bool), axis=0)[kept.material]
     return without(kept, of_faces), lost + int(of_faces.any(axis=1).sum())
 
 
 def _changes(adjustment: Adjustment) -> Array:
-    """(4,) bool: which slots an adjustment changes."""
-    changes = np.zeros(4, bool)
+    """(8,) bool: which slots an adjustment changes."""
+    changes = np.zeros(len(SLOTS), bool)
     plain = Adjustment()
     changes[ALBEDO] = any(getattr(adjustment, k) != getattr(plain, k) for k in ("hue", "saturation", "value", "tint"))
-    for name in ("roughness", "metallic"):
+    for name in ("roughness", "metallic", *_SCALED):
         changes[_SLOT[name]] = getattr(adjustment, name) != getattr(plain, name)
     return changes

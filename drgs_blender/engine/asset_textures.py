@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core.arrays import keep
 from ..core.asset.model import Asset
-from ..core.asset.textures import ALBEDO, ROUGHNESS, MeshTextures
+from ..core.asset.textures import ALBEDO, COLOURED, ROUGHNESS, MeshTextures, channel_of
 from ..core.color import linear_to_srgb, srgb_to_linear
 from ..core.errors import AssetError
 from ..core.frame import Adjustment
@@ -53,10 +53,10 @@ class TexturedAsset:
             try:
                 pixels = _decoded(files[number][1], f"{self.key}, image {files[number][0]}")
             except AssetError as error:
-                self.faults.append(f"{error}; the materials of its vertices are shown")
+                self.faults.append(f"{str(error).rstrip('.')}; the materials of its vertices are shown")
                 slots[uses] = -1
                 continue
-            for coloured in {bool(slot == ALBEDO) for slot in np.nonzero(uses)[1]}:
+            for coloured in {int(slot) in COLOURED for slot in np.nonzero(uses)[1]}:
                 encoding = "srgb" if coloured else "linear"
                 name = f"{self.key}, {files[number][0]}, {encoding}"
                 self._images[int(number), coloured] = Image(name, pixels, encoding)  # type: ignore[arg-type]
@@ -64,7 +64,11 @@ class TexturedAsset:
 
     def image(self, number: int, slot: int) -> Image:
         """An image as it is for a slot."""
-        return self._images[number, slot == ALBEDO]
+        return self._images[number, slot in COLOURED]
+
+    def channel(self, number: int, slot: int) -> str:
+        """Channel of an image that counts for a slot, in the words of `core.materials.Texture`."""
+        return channel_of(slot, self.textures.files[number][1])
 
     def baked(self, number: int, slot: int, factors: Array, adjustment: Adjustment) -> Image:
         """An image times its factor, adjusted; made again when the adjustment has changed."""
@@ -109,7 +113,7 @@ def _decoded(data: Array, subject: str) -> Array:
     if pixels.dtype != np.uint8:
         raise AssetError(subject, f"has {pixels.dtype} pixels, where bytes are kept", "Make the asset again")
     whole = np.full((*pixels.shape[:2], 4), 255, np.uint8)
-    whole[..., :3] = pixels[..., :3]
+    whole[..., : pixels.shape[2]] = pixels
     whole.flags.writeable = False
     return whole
 

@@ -16,7 +16,7 @@ from ..render.scene.trace_scene import ObjectMesh, TraceObject
 from ..render.surfels.captured import CapturedObject
 from .captured_objects import glowing_mesh
 from .loaded_assets import LoadedAsset
-from .object_meshes import object_mesh, stub
+from .object_meshes import channels_of, object_mesh, stub
 from .optional_channels import optional_channels
 from .scene_objects import material_faults, traced_object
 
@@ -26,8 +26,8 @@ class CachedObject:
     """An object as it was in the last frame, and what was made of it.
 
     One that is shown in captured colours is `captured` for the camera, and for rays `glowing`. One with materials of
-    its own, or with `channels` that rays meet, has a `mesh` with `images`; `met` is what stands for the object in the
-    scene. Its surfels may have `emission` (n, 3).
+    its own, or with `channels` that rays meet, has a `mesh` with `images` and the optional channels `shown`; `met` is
+    what stands for the object in the scene. Its surfels may have `emission` (n, 3).
     """
 
     state: ObjectState
@@ -44,6 +44,7 @@ class CachedObject:
     images: list[Image] = field(default_factory=list)
     emission: Array | None = None
     channels: dict[str, Array] = field(default_factory=dict)
+    shown: frozenset[str] = frozenset()
 
     @property
     def seen_by_mesh(self) -> bool:
@@ -90,11 +91,12 @@ def begun(state: ObjectState, loaded: LoadedAsset, mode: tuple[bool, bool, bool]
             item.glowing = glowing_mesh(state, traced, loaded.glow_of(state.asset))
         return item
     item.channels = optional_channels(state, asset)
-    lit = "emission" in item.channels or "opacity" in item.channels
-    has_textures = asset.mesh.textures is not None
-    images = loaded.textured_of(state.asset) if has_textures and (textured or lit) else None
+    textures = asset.mesh.textures
+    needed = textures is not None and bool(textured or item.channels or textures.optional)
+    images = loaded.textured_of(state.asset) if needed else None
     item.mesh, item.images, faults = object_mesh(state, traced, asset, index, item.channels, images)
     item.faults += faults
+    item.shown = channels_of(item.mesh)
     if item.mesh is not None:
         item.met = stub(traced)
     return item

@@ -1,10 +1,13 @@
 """Optional material channels of objects in a frame: emission, opacity and others that assets need not have.
 
 Where its surface emits light or lets it pass, rays meet an object by its `object_meshes.object_mesh`. Where light
-passes, the camera does, too: surfels overlap, so that a share of each is no share of the surface.
+passes, the camera does, too: surfels overlap, so that a share of each is no share of the surface. Specular level and
+coat of surfels that the camera sees are those of the mesh where they are tied to it.
 """
 
 from __future__ import annotations
+
+from collections.abc import Collection
 
 import numpy as np
 
@@ -16,14 +19,20 @@ from .scene_objects import material
 
 Array = np.ndarray
 
-#: Channels that are kept in assets, painted and saved, and have no effect on the picture yet.
-NOT_RENDERED = ("specular", "coat")
+#: Channels of lobes that the mesh has, surfels on their own have not.
+LOBES = ("specular", "coat")
+_BE = ("", "is", "are")
 
 
 def has_channels(state: ObjectState, asset: Asset) -> bool:
     """Whether an object or its asset has optional channels at all."""
     fades = state.adjustment is not None and state.adjustment.opacity != 1
-    return fades or any(getattr(part, name) is not None for part in (state, asset.mesh) for name in OPTIONAL_CHANNELS)
+    pictured = asset.mesh.textures is not None and bool(asset.mesh.textures.optional)
+    return (
+        fades
+        or pictured
+        or any(getattr(part, name) is not None for part in (state, asset.mesh) for name in OPTIONAL_CHANNELS)
+    )
 
 
 def optional_channels(state: ObjectState, asset: Asset) -> dict[str, Array]:
@@ -61,13 +70,31 @@ def surfel_emission(state: ObjectState, asset: Asset, driven: MeshDriven | None)
     return own if own is not None and own.any() else None
 
 
-def channel_faults(state: ObjectState, asset: Asset, channels: dict[str, Array], settings: RenderSettings) -> list[str]:
-    """What of the object's optional channels is not shown, or otherwise than its surfels, in words for the user."""
+def channel_faults(state: ObjectState, asset: Asset, shown: Collection[str], settings: RenderSettings) -> list[str]:
+    """What of the object's optional channels is not shown, or otherwise than its surfels, in words for the user.
+
+    Parameters
+    ----------
+    state : ObjectState
+    asset : Asset
+    shown : set of str
+        Optional channels that its mesh has, see `object_meshes.channels_of`.
+    settings : RenderSettings
+    """
     name, found = state.name, []
-    kept = [channel for channel in NOT_RENDERED if channel in channels]
-    if kept:
-        found.append(f"{name}: its {' and '.join(kept)} are kept in the asset, but not rendered")
-    passes, emits = "opacity" in channels, "emission" in channels
+    bare = not len(asset.mesh.faces)
+    passes, emits = "opacity" in shown, "emission" in shown
+    lobes = [c for c in LOBES if c in shown or (bare and getattr(asset.surfels, c) is not None)]
+    own = f"its {' and '.join(lobes)}"
+    if lobes and bare:
+        found.append(f"{name}: has no mesh, so {own} {_BE[len(lobes)]} not shown")
+    elif lobes and settings.shading_model == "paper":
+        found.append(f"{name}: the shading model Cook-Torrance leaves out {own}. Choose Principled")
+    elif lobes:
+        if settings.camera_sees == "surfels" and not passes:
+            found.append(f"{name}: {own} on surfels {_BE[len(lobes)]} taken from the mesh next to them")
+        if settings.rays_see == "surfels" and not (passes or emits):
+            found.append(f"{name}: {own} {_BE[len(lobes)]} shown to the camera alone; other rays meet surfels without")
     if passes and settings.camera_sees == "surfels":
         found.append(f"{name}: light passes it, so the camera sees its mesh, not its surfels")
     if (passes or emits) and settings.rays_see == "surfels":

@@ -188,7 +188,7 @@ class SceneCache:
             objects.append(item)
             faults += captured_faults(kept, loaded.asset, frame)
             if not shown:
-                faults += channel_faults(kept, loaded.asset, item.channels, frame.settings)
+                faults += channel_faults(kept, loaded.asset, item.shown, frame.settings)
         meshes, images = reuse_equal(frame.meshes, self.meshes), reuse_equal(frame.images, self.images)
         same = len(objects) == len(self.objects) and all(a is b for a, b in zip(objects, self.objects))
         if not (self._current and same and meshes is self.meshes and images is self.images):

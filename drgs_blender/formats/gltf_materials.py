@@ -15,7 +15,11 @@ from .images import decode_image
 Array = np.ndarray
 
 #: Extensions that are read, where they are named here.
-_READ = ("KHR_materials_emissive_strength", "KHR_materials_specular", "KHR_materials_clearcoat")
+_READ = (
+    "KHR_materials_emissive_strength", "KHR_materials_specular", "KHR_materials_clearcoat", "KHR_materials_ior",
+)  # fmt: skip
+#: What the loss of others does that is seen most.
+_LOST = {"KHR_materials_transmission": ": its glass is opaque"}
 _WRAP = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
 
 
@@ -61,7 +65,7 @@ class GltfMaterials:
         uv_set = self._normal_map(entry, material, self._layers(entry, extensions, material, first))
         for name in extensions:
             if name.startswith("KHR_materials_") and name not in _READ:
-                self.notes.append(f"{material.name}: {name} ignored")
+                self.notes.append(f"{material.name}: {name} ignored{_LOST.get(name, '')}")
         return uv_set
 
     def _layers(self, entry: dict[str, Any], extensions: dict[str, Any], material: MaterialFile, uv_set: int) -> int:
@@ -82,7 +86,10 @@ class GltfMaterials:
         level, weight = (float(np.clip(np.nan_to_num(factor[0]), 0, 1)) for factor in factors)
         tint = np.nan_to_num(document.numbers(specular, "specularColorFactor", (1.0, 1.0, 1.0)).astype(np.float64))
         # A level of 0.5 is the 4 % that glTF's dielectrics reflect.
-        material.specular, material.coat = float(np.clip(0.5 * level * tint.mean(), 0, 1)), weight
+        whole = 0.5 * level * tint.mean() * self._of_ior(get(extensions, "KHR_materials_ior", dict, {}), material.name)
+        if whole > 1:
+            self.notes.append(f"{material.name}: reflects more than a specular level of 1, which is used")
+        material.specular, material.coat = float(np.clip(whole, 0, 1)), weight
         if np.ptp(tint) > 1e-3 or "specularColorTexture" in specular:
             self.notes.append(f"{material.name}: colour of KHR_materials_specular ignored, its mean is used")
         roughness = float(document.numbers(coat, "clearcoatRoughnessFactor", (0.0,))[0])
@@ -109,6 +116,14 @@ class GltfMaterials:
             uv_set = own_set
             setattr(material, f"{name}_image", image.alpha if name == "specular" else image)
         return uv_set
+
+    def _of_ior(self, entry: dict[str, Any], name: str) -> float:
+        """Specular level of an IOR over that of 1.5: the same light at normal incidence."""
+        ior = float(self.document.numbers(entry, "ior", (1.5,))[0])
+        if ior == 1.5 or not (np.isfinite(ior) and ior >= 1):
+            return 1.0
+        self.notes.append(f"{name}: IOR {ior:g} becomes a specular level")
+        return ((ior - 1) / (ior + 1) / 0.2) ** 2
 
     def _alpha(self, entry: dict[str, Any], material: MaterialFile, factor: float) -> None:
         """Read the alpha of the base colour, cut at the cutoff where the material says so."""

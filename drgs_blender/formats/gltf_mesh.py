@@ -116,13 +116,21 @@ class _Materials:
         specular: dict[str, Any] = {}
         coat: dict[str, Any] = {}
         if isinstance(material, UniformMaterial):
-            translucent, radiance, level = material.opacity < 1, max(material.emission), material.specular
+            pictured = material if isinstance(material, ImageMaterial) else ImageMaterial((1.0, 1.0, 1.0), 1.0, 0.0)
+            translucent = material.opacity < 1 or pictured.translucent
+            radiance, level = max(material.emission), material.specular
             if radiance > 0:
                 found["emissiveFactor"] = [value / max(radiance, 1.0) for value in material.emission]
+                if pictured.emission_picture is not None:
+                    found["emissiveTexture"] = self._of(pictured.emission_picture)
             if material.coat > 0:
                 coat = {"clearcoatFactor": material.coat}
-            if level != 0.5:
+                if pictured.coat_picture is not None:
+                    coat["clearcoatTexture"] = self._of(pictured.coat_picture)
+            if level != 0.5 or pictured.specular_picture is not None:
                 specular = {"specularFactor": min(2 * level, 1.0)}
+                if pictured.specular_picture is not None:
+                    specular["specularTexture"] = self._of(pictured.specular_picture)
         else:
             translucent, radiance, level = material.translucent, material.strength, material.level
             if material.emission is not None:

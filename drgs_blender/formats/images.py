@@ -20,8 +20,8 @@ Array = np.ndarray
 
 #: Largest texture that is decoded, in pixels (16k x 16k).
 PIXEL_LIMIT = 1 << 28
-# Pillow refuses images of more than twice its own limit, a smaller one.
-Pillow.MAX_IMAGE_PIXELS = PIXEL_LIMIT
+#: Pillow's own limit is lower than that, and its words do not say what to do.
+Pillow.MAX_IMAGE_PIXELS = None
 _FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF", "GIF")
 #: What Pillow raises of files it cannot read.
 _UNREADABLE = (OSError, ValueError, SyntaxError, EOFError, Pillow.DecompressionBombError)

@@ -10,7 +10,20 @@ import numpy as np
 from PIL import Image as Pillow
 
 from ..core.asset import Mesh
-from ..core.asset.textures import ALBEDO, METALLIC, NORMAL, ROUGHNESS, MeshTextures
+from ..core.asset.textures import (
+    ALBEDO,
+    COAT,
+    EMISSION,
+    FACTORS,
+    METALLIC,
+    NORMAL,
+    OPACITY,
+    ROUGHNESS,
+    SLOTS,
+    SPECULAR,
+    MeshTextures,
+    channel_of,
+)
 from ..geometry.normals import VertexNormals, unit
 from .atlas import (
     SAME,
@@ -21,11 +34,9 @@ from .atlas import (
     uniform_channels,
     vertex_channels,
 )
+from .images import decode_image
 
 Array = np.ndarray
-
-#: Where factors of textures are.
-_FACTORS = {"albedo": slice(0, 3), "roughness": slice(3, 4), "metallic": slice(4, 5)}
 
 
 class Picture(NamedTuple):
@@ -47,7 +58,7 @@ class Picture(NamedTuple):
 
 @dataclass(slots=True)
 class ImageMaterial(UniformMaterial):
-    """A material with images, which multiply its colour, roughness and metallic.
+    """A material with images, which multiply its values.
 
     Attributes
     ----------
@@ -55,10 +66,16 @@ class ImageMaterial(UniformMaterial):
     normal_strength : float
     colour_picture : Picture, optional
         sRGB.
+    translucent : bool
+        Whether the alpha of `colour_picture` multiplies the opacity.
     surface_picture : Picture, optional
         Green is the roughness, blue the metallic.
     normal_picture : Picture, optional
         Tangent space, green upwards.
+    emission_picture : Picture, optional
+        sRGB.
+    specular_picture, coat_picture : Picture, optional
+        Alpha is the specular level; red is the coat.
     """
 
     name: str = ""
@@ -66,6 +83,10 @@ class ImageMaterial(UniformMaterial):
     colour_picture: Picture | None = None
     surface_picture: Picture | None = None
     normal_picture: Picture | None = None
+    emission_picture: Picture | None = None
+    specular_picture: Picture | None = None
+    coat_picture: Picture | None = None
+    translucent: bool = False
 
 
 @dataclass(slots=True)
@@ -172,10 +193,10 @@ def _image_material(mesh: Mesh, textures: MeshTextures, k: int, rows: Array) -> 
     values, columns = vertex_channels(mesh)
     values = values[np.unique(mesh.faces[rows])]
     middle = np.median(values, axis=0)
-    pictured = {"albedo": ALBEDO, "roughness": ROUGHNESS, "metallic": METALLIC}
+    pictured = {SLOTS[slot]: slot for slot in np.flatnonzero(used).tolist() if slot != NORMAL}
     for name, own in columns.items():
-        if name in pictured and used[pictured[name]]:
-            middle[own] = factors[_FACTORS[name]]
+        if name in pictured:
+            middle[own] = factors[FACTORS[pictured[name]]]
         elif np.ptp(values[:, own], axis=0).max() >= SAME:
             return None
     if used[pair].any() and not used[pair].all():
@@ -190,22 +211,73 @@ def _image_material(mesh: Mesh, textures: MeshTextures, k: int, rows: Array) -> 
         return Picture(f"{number}_{_plain(files[number][0])}", files[number][1].tobytes(), extension)
 
     own_channels = uniform_channels(middle, columns)
-    colour = picture(ALBEDO)
-    if colour is not None and own_channels.get("opacity", 1.0) < 1:
-        colour = colour._replace(data=_opaque(colour.data))
+    for slot in (OPACITY, EMISSION, SPECULAR, COAT):  # of which vertices may have none
+        if used[slot]:
+            whole = tuple(factors[FACTORS[slot]].tolist())
+            own_channels[SLOTS[slot]] = whole if len(whole) > 1 else whole[0]
+    colour, opacity, specular = picture(ALBEDO), picture(OPACITY), picture(SPECULAR)
+    if opacity is not None:
+        if colour is not None and colour.extension != opacity.extension:
+            return None  # other programs have one image of both
+        if colour is None or slots[ALBEDO] != slots[OPACITY]:
+            colour = _joined(colour, opacity, channel_of(OPACITY, textures.images[_name(textures, slots[OPACITY])]))
+    elif colour is not None and own_channels.get("opacity", 1.0) < 1:
+        colour = colour._replace(data=_opaque(colour.data, f"image {files[int(slots[ALBEDO])][0]}"))
+    if specular is not None and channel_of(SPECULAR, textures.images[_name(textures, slots[SPECULAR])]) != "a":
+        specular = _joined(None, specular, "r")
     return ImageMaterial(
         **own_channels, name=textures.names[k], normal_strength=float(factors[5]),
         colour_picture=colour, surface_picture=picture(ROUGHNESS), normal_picture=picture(NORMAL),
+        emission_picture=picture(EMISSION), specular_picture=specular, coat_picture=picture(COAT),
+        translucent=opacity is not None,
     )  # fmt: skip
 
 
-def _opaque(data: bytes) -> bytes:
-    """An image file without alpha, which would count a second time where its material has opacity."""
-    picture = Pillow.open(io.BytesIO(data))
-    if not picture.has_transparency_data:
-        return data
+def _name(textures: MeshTextures, number: int) -> str:
+    return list(textures.images)[number]
+
+
+def _joined(colour: Picture | None, opacity: Picture, channel: str) -> Picture:
+    """An image of colours, white where there is none, whose alpha is a channel of another.
+
+    Raises
+    ------
+    AssetError
+        A file cannot be read.
+    """
+    alpha = _decoded(opacity.data, f"image {opacity.name}").convert("RGBA").getchannel(channel.upper())
+    whole = Pillow.new("RGB", alpha.size, "white")
+    if colour is not None:
+        whole = _decoded(colour.data, f"image {colour.name}").convert("RGB")
+        alpha = alpha.resize(whole.size, Pillow.Resampling.BILINEAR)
+    whole.putalpha(alpha)
+    stem = opacity.name if colour is None else f"{colour.name.rsplit('.', 1)[0]}_{opacity.name}"
+    return Picture(f"{stem.rsplit('.', 1)[0]}_alpha.png", _png(whole), opacity.extension)
+
+
+def _opaque(data: bytes, subject: str) -> bytes:
+    """An image file without alpha, which would count a second time where its material has opacity.
+
+    Raises
+    ------
+    AssetError
+        The file cannot be read.
+    """
+    picture = _decoded(data, subject)
+    return data if picture.mode == "RGB" else _png(picture.convert("RGB"))
+
+
+def _decoded(data: bytes, subject: str) -> Pillow.Image:
+    """An image file as bytes of RGB or RGBA."""
+    pixels = decode_image(data, subject)
+    if pixels.dtype == np.uint16:
+        pixels = (pixels >> 8).astype(np.uint8)
+    return Pillow.fromarray(np.ascontiguousarray(pixels))
+
+
+def _png(picture: Pillow.Image) -> bytes:
     made = io.BytesIO()
-    picture.convert("RGBA").convert("RGB").save(made, "PNG", compress_level=6)
+    picture.save(made, "PNG", compress_level=6)
     return made.getvalue()
 
 

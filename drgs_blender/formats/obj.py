@@ -167,28 +167,28 @@ def _read_mtl(path: Path, notes: list[str]) -> dict[str, MaterialFile]:
                 name = _text(line.strip()[6:].strip())
                 current = materials[name] = MaterialFile(name)
             elif keyword == "kd":
-                r, g, b = (float(w) for w in words[1:4])
+                r, g, b = (_finite(w) for w in words[1:4])
                 current.base_colour = r, g, b
             elif keyword == "ns":  # Blender's own mapping between shininess and roughness
-                current.roughness = float(np.clip(1.0 - np.sqrt(max(float(words[1]), 0.0) / 1000.0), 0.0, 1.0))
+                current.roughness = float(np.clip(1.0 - np.sqrt(max(_finite(words[1]), 0.0) / 1000.0), 0.0, 1.0))
             elif keyword == "pr":
-                current.roughness = float(words[1])
+                current.roughness = _finite(words[1])
             elif keyword == "pm":
-                current.metallic = float(words[1])
+                current.metallic = _finite(words[1])
             elif keyword == "map_kd":
                 current.base_colour_image = _image(current, line, path, notes)
                 if current.base_colour_image is not None:
                     current.base_colour = (1.0, 1.0, 1.0)
             elif keyword in ("d", "tr"):
-                hides = float(words[-1])
+                hides = _finite(words[-1])
                 current.alpha = float(np.clip(hides if keyword == "d" else 1 - hides, 0, 1))
             elif keyword == "map_d":
                 picture = _image(current, line, path, notes)
                 if picture is not None:
                     current.alpha_image = picture.alpha or replace(picture, srgb=False)
             elif keyword == "ke":
-                r, g, b = (float(w) for w in words[1:4])
-                if not (np.isfinite((r, g, b)).all() and min(r, g, b) >= 0):
+                r, g, b = (_finite(w) for w in words[1:4])
+                if min(r, g, b) < 0:
                     raise ValueError
                 current.emission = r, g, b
             elif keyword == "map_ke":
@@ -196,14 +196,22 @@ def _read_mtl(path: Path, notes: list[str]) -> dict[str, MaterialFile]:
                 if current.emission_image is not None:
                     current.emission = (1.0, 1.0, 1.0)
             elif keyword == "pc":
-                current.coat = float(np.clip(float(words[1]), 0, 1))
+                current.coat = float(np.clip(_finite(words[1]), 0, 1))
             elif keyword in ("norm", "map_bump", "bump"):
                 _read_normal_map(current, line, path, notes)
             elif keyword in ("map_pr", "map_pm", "map_ns"):
                 notes.append(f"{current.name}: {keyword} ignored")
-        except ValueError:
+        except (ValueError, IndexError):
             notes.append(f"{path.name}: line {line.strip()[:60]!r} not understood")
     return materials
+
+
+def _finite(word: str) -> float:
+    """A number as 32 bits hold it. Raises ValueError where it is none."""
+    number = float(word)
+    if not abs(number) <= np.finfo(np.float32).max:
+        raise ValueError
+    return number
 
 
 def _read_normal_map(material: MaterialFile, line: str, path: Path, notes: list[str]) -> None:

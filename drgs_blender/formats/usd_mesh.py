@@ -64,7 +64,7 @@ def _files(group: FaceGroup) -> list[tuple[str, bytes]]:
         return [(f"{name}.png", data) for name, data in baked.items() if data is not None]
     if not isinstance(m, ImageMaterial):
         return []
-    pictures = (m.colour_picture, m.surface_picture, m.normal_picture)
+    pictures = (m.colour_picture, m.surface_picture, m.normal_picture, m.emission_picture, m.coat_picture)
     return [(picture.name, picture.data) for picture in pictures if picture is not None]
 
 
@@ -147,14 +147,16 @@ def _material(name: str, material: UniformMaterial | TexturedMaterial) -> list[s
             surface += [f"float inputs:clearcoat.connect = <{path}/Layers.outputs:r>", _COAT_ROUGHNESS]
             shaders += _texture(path, "Layers", "layers.png", "raw", ["float outputs:r"])
     else:
-        picture = material.colour_picture if isinstance(material, ImageMaterial) else None
+        own = material if isinstance(material, ImageMaterial) else ImageMaterial((1.0, 1.0, 1.0), 1.0, 0.0)
+        picture = own.colour_picture
         if picture is None:
             surface.append(f"color3f inputs:diffuseColor = ({', '.join(f'{v:.9g}' for v in material.colour)})")
         else:
             surface.append(colour)
-            more = ["float3 outputs:rgb"], picture.extension, (*material.colour, 1.0)
+            of_colour = ["float3 outputs:rgb"] + ["float outputs:a"] * own.translucent
+            more = of_colour, picture.extension, (*material.colour, own.opacity if own.translucent else 1.0)
             shaders += _texture(path, "Color", picture.name, "sRGB", *more)
-        picture = material.surface_picture if isinstance(material, ImageMaterial) else None
+        picture = own.surface_picture
         if picture is None:
             surface.append(f"float inputs:roughness = {material.roughness:.9g}")
             surface.append(f"float inputs:metallic = {material.metallic:.9g}")
@@ -162,18 +164,29 @@ def _material(name: str, material: UniformMaterial | TexturedMaterial) -> list[s
             surface += numbers
             scale = (1.0, material.roughness, material.metallic, 1.0)
             shaders += _texture(path, "Parameters", picture.name, "raw", outputs, picture.extension, scale)
-        if isinstance(material, ImageMaterial) and material.normal_picture is not None:
-            picture, strength = material.normal_picture, material.normal_strength
+        if own.normal_picture is not None:
+            picture, strength = own.normal_picture, own.normal_strength
             surface.append(f"normal3f inputs:normal.connect = <{path}/Normal.outputs:rgb>")
             bias = (-strength, -strength, -1.0, 0.0)
             scale = (2 * strength, 2 * strength, 2.0, 1.0)
             placed = picture.extension, scale, bias
             shaders += _texture(path, "Normal", picture.name, "raw", ["float3 outputs:rgb"], *placed)
-        if max(material.emission) > 0:
+        if own.emission_picture is not None:
+            surface.append(f"color3f inputs:emissiveColor.connect = <{path}/Emission.outputs:rgb>")
+            glows, brightest = own.emission_picture, (*own.emission, 1.0)
+            outputs = ["float3 outputs:rgb"]
+            shaders += _texture(path, "Emission", glows.name, "sRGB", outputs, glows.extension, brightest)
+        elif max(material.emission) > 0:
             surface.append(f"color3f inputs:emissiveColor = ({', '.join(f'{v:.9g}' for v in material.emission)})")
-        if material.opacity < 1:
+        if own.translucent:
+            surface.append(f"float inputs:opacity.connect = <{path}/Color.outputs:a>")
+        elif material.opacity < 1:
             surface.append(f"float inputs:opacity = {material.opacity:.9g}")
-        if material.coat > 0:
+        if own.coat_picture is not None:
+            surface += [f"float inputs:clearcoat.connect = <{path}/Layers.outputs:r>", _COAT_ROUGHNESS]
+            coat, scale = own.coat_picture, (own.coat, 1.0, 1.0, 1.0)
+            shaders += _texture(path, "Layers", coat.name, "raw", ["float outputs:r"], coat.extension, scale)
+        elif material.coat > 0:
             surface += [f"float inputs:clearcoat = {material.coat:.9g}", _COAT_ROUGHNESS]
     if shaders:
         shaders = [

@@ -108,15 +108,16 @@ WRITERS: tuple[Writer, ...] = (
         "glTF mesh",
         write_gltf_mesh,
         "the mesh, posed or not, with images, UV map and normals where it has textures; other materials as "
-        "metallic-roughness textures, a place in them for each triangle; opacity, emission, specular and coat by its "
-        "alpha and KHR extensions",
+        "metallic-roughness textures, a place in them for each triangle; opacity, emission, specular and coat, of "
+        "images or vertices, by its alpha and KHR extensions",
         f"surfels; {_TEXTURES}; shared vertices, unless the mesh is of one material",
     ),
     Writer(
         "USD mesh",
         write_usd_mesh,
         "the mesh, posed or not, with images, UV map and normals where it has textures; other materials as the "
-        "textures of a UsdPreviewSurface; opacity, emission and coat among them; shared vertices",
+        "textures of a UsdPreviewSurface; opacity, emission and coat among them, of images or vertices; "
+        "shared vertices",
         f"surfels; specular; {_TEXTURES}",
         ("specular",),
     ),

@@ -108,7 +108,7 @@ def render(
     report(0.0, "Projecting")
     scene, lights = prepared.scene, prepared.lights
     visible = VisibleSurfaces(prepared, frame, parameters, backend)
-    film, numbers = Film(camera, settings, parameters), object_numbers(scene, frame)
+    film, numbers = Film(camera, settings, parameters), object_numbers(scene)
     mattes = [
         CryptoFilm(kind, scene, frame)
         for kind, name in KINDS.items()

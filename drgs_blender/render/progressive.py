@@ -261,7 +261,7 @@ class Progressive:
     def _develop(self, prepared: PreparedScene, check: Callable[[], None]) -> dict[str, Array]:
         camera, lights = self.frame.camera, prepared.lights
         film = Film(camera, self.frame.settings, self._parameters)
-        numbers = object_numbers(prepared.scene, self.frame)
+        numbers = object_numbers(prepared.scene)
         surfaces = SurfaceFilm(prepared.scene, self.frame, self._parameters, put_lobe_colours)
         groups = LightGroupFilm(prepared.scene, lights, self.frame, self._parameters)
         for strip in self._strips:

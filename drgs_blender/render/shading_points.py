@@ -44,6 +44,7 @@ class PointArrays(NamedTuple):
     size: Array
     smooth: Array
     terminator: Array
+    face: Array
 
 
 @dataclass(slots=True)
@@ -84,7 +85,7 @@ class ShadingPoints:
         rays start at ``origin``.
     face, instance : (n,) int32 array
         Face and instance of the mesh, as `interaction.nearest` numbers them; face -1: none. Empty where not known: then
-        all surfaces have two lobes.
+        all surfaces have two lobes of GGX.
     place : (n, 2) float32 array
         Barycentric coordinates of the face's second and third corner.
     """

@@ -72,6 +72,15 @@ def scene(tmp_path):
     return scene
 
 
+@pytest.fixture(scope="session")
+def kept_blenders():
+    """Processes that have baked, for the next test (`kept_blender`); they end with the suite."""
+    kept: list = []
+    yield kept
+    for process in kept:
+        process.close()
+
+
 @pytest.fixture
 def ball_file(tmp_path):
     """Path of a .drgs file: a sphere of radius 1 with surfels."""

@@ -141,6 +141,33 @@ def test_save_keeps_textures_and_what_factors_can_say(ball, tmp_path):
     assert (read(tmp_path / "hue.drgs").slots[:, 0] == -1).all()
 
 
+def test_images_of_optional_channels_are_shown_and_saved(scene, tmp_path):
+    """Alpha, emission, specular level and coat of the lower material; the upper one has what is at its vertices."""
+    asset = textured_ball()
+    slots, factors = asset.mesh.textures.slots.copy(), asset.mesh.textures.factors.copy()
+    slots[0, 4:], factors[0, 6:] = (1, 0, 1, 1), (0.8, 2.0, 1.0, 0.5, 0.6, 0.7)
+    asset.mesh.textures = replace(asset.mesh.textures, slots=slots, factors=factors)
+    coat = np.full(len(asset.mesh.vertices), 0.25, np.float32)
+    asset.mesh = replace(asset.mesh, coat=coat)
+    part("drgs_blender.core.asset.container").write_asset(tmp_path / "all.drgs", asset)
+    bpy.ops.import_scene.drgs(filepath=str(tmp_path / "all.drgs"))
+    obj = bpy.context.active_object
+    inputs = {}
+    for material in obj.data.materials[1:]:
+        surface = next(n for n in material.node_tree.nodes if n.type == "BSDF_PRINCIPLED")
+        linked = {s.name: s.links[0].from_node.type for s in surface.inputs if s.is_linked}
+        inputs[material.name] = linked, surface.inputs["Emission Strength"].default_value
+    (below, strength), (above, _) = inputs.values()
+    shown = {"Alpha", "Emission Color", "Specular IOR Level", "Coat Weight"}
+    assert shown <= below.keys() and "ATTRIBUTE" not in {below[name] for name in shown} and strength == 1
+    assert above["Coat Weight"] == "ATTRIBUTE" and not shown - {"Coat Weight"} & above.keys()
+    obj.drgs.adjustment.opacity = 0.5
+    bpy.ops.drgs.save_asset(filepath=str(tmp_path / "half.drgs"))
+    kept = read(tmp_path / "half.drgs")
+    np.testing.assert_array_equal(kept.slots, slots)
+    np.testing.assert_allclose(kept.factors[0, 6:], (0.4, 2.0, 1.0, 0.5, 0.6, 0.7), rtol=1e-6)
+
+
 def test_paint_takes_the_image_of_its_faces(ball, tmp_path):
     arrays = part("addon.mesh_arrays")
     values = arrays.read_channel(ball.data, "albedo").copy()

@@ -191,7 +191,7 @@ def test_what_cannot_be_exported_is_refused_in_words(ball, scene, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir() if p.suffix == ".ply") == ["folder.ply"]
 
 
-@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+@pytest.mark.parametrize("text", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["binary", "text"])
 def test_stl_that_blender_writes_becomes_an_object(scene, tmp_path, text):
     bpy.ops.mesh.primitive_uv_sphere_add(segments=12, ring_count=8, location=(1, 2, 3), rotation=(0.3, 0, 0.5))
     ball = bpy.context.active_object

@@ -103,6 +103,7 @@ def test_the_object_of_a_message_is_found_and_selected(ball, tmp_path):
     named_in = part("addon.messages").named_in
     objects = bpy.context.view_layer.objects
     assert named_in('Object "ball": modifier "X" changes', objects) == "ball"
+    assert named_in("ball: 2 faces have no area; light passes through them", objects) == "ball"
     assert named_in('"Y" is 3" wide', objects) == ""
     bpy.ops.import_scene.drgs(filepath=str(write_ball(tmp_path / "two.drgs")))
     assert bpy.ops.drgs.select_named(name="ball") == {"FINISHED"}

@@ -475,8 +475,10 @@ def test_loops_of_nodes_end(scene, export):
     tree.links.new(gammas[0].outputs[0], principled.inputs["Emission Color"])
     principled.inputs["Emission Strength"].default_value = 1
     swatch(bpy.data.materials["Material"])
-    found = export()[0].meshes[0].materials[0]
+    frame, warnings = export()
+    found = frame.meshes[0].materials[0]
     assert min(found.base_colour) > 0 and min(found.emission) > 0
+    assert any('node "Gamma' in w and "part of a loop" in w for w in warnings), warnings
 
 
 def test_nodes_that_share_a_source_are_worked_out_once(scene, export):
@@ -631,6 +633,46 @@ def test_missing_image_is_magenta_as_in_cycles_and_named(scene, export, tmp_path
     for state, pixel in zip(sorted(frame.meshes, key=lambda s: s.vertices[:, 0].min()), (theirs[0], theirs[2])):
         np.testing.assert_allclose(state.materials[0].emission, (1, 0, 1))
         np.testing.assert_allclose(pixel, (1, 0, 1), atol=1e-6)
+
+
+def test_images_that_are_missing_are_named_and_nothing_is_baked_for_them(scene, export, tmp_path):
+    export_frame, wanted = part("addon.export").export_frame, part("addon.bakes.requests").Wanted(64, 64)
+    image = picture("Gone")
+    image.source, image.filepath = "FILE", str(tmp_path / "gone.png")
+    for name, picked in (("Gone", image), ("None", None)):
+        tree, principled = material(name)
+        tree.links.new(texture_node(tree, picked).outputs["Color"], principled.inputs["Base Color"])
+        swatch(bpy.data.materials[name])
+    warnings: list[str] = []
+    frame = export_frame(bpy.context.evaluated_depsgraph_get(), str, warnings.append, wanted=wanted)
+    assert sorted('image "Gone" cannot be read' in w for w in warnings) == [False, True] and not wanted.requests
+    assert all(state.materials[0].base_colour == (1, 0, 1) for state in frame.meshes)
+    (tmp_path / "gone.png").write_bytes(b"no picture")  # Cycles may read part of it
+    warnings.clear()
+    export_frame(bpy.context.evaluated_depsgraph_get(), str, warnings.append, wanted=wanted)
+    assert sum('image "Gone" cannot be read' in w for w in warnings) == 1 and len(wanted.requests) == 1
+
+
+def test_attributes_that_are_missing_are_named_where_they_are_baked(scene, export):
+    export_frame, wanted = part("addon.export").export_frame, part("addon.bakes.requests").Wanted(64, 64)
+    tree, principled = material()
+    tree.links.new(add(tree, "Attribute", attribute_name="typo"), principled.inputs["Base Color"])
+    swatch(bpy.data.materials["Material"])
+    warnings: list[str] = []
+    export_frame(bpy.context.evaluated_depsgraph_get(), str, warnings.append, wanted=wanted)
+    assert len(wanted.requests) == 1 and sum('has no values "typo"' in text for text in warnings) == 1
+
+
+def test_shaders_that_are_clear_everywhere_may_be_added(scene, export):
+    tree, first = material("Clear")
+    second, added = tree.nodes.new("ShaderNodeBsdfPrincipled"), tree.nodes.new("ShaderNodeAddShader")
+    image = bpy.data.images.new("Black", 4, 4)
+    for i, node in enumerate((first, second)):
+        tree.links.new(texture_node(tree, image).outputs["Color"], node.inputs["Alpha"])
+        tree.links.new(node.outputs[0], added.inputs[i])
+    tree.links.new(added.outputs[0], output_of(tree).inputs["Surface"])
+    swatch(bpy.data.materials["Clear"])
+    assert not export()[0].meshes
 
 
 def test_unchanged_images_are_not_read_again(scene, export, tmp_path):

@@ -96,6 +96,8 @@ def test_passes_are_those_of_cycles(passes):
 @pytest.mark.judged
 @pytest.mark.slow
 def test_passes_of_glass_are_those_of_cycles(passes):
+    render = bpy.context.scene.render
+    render.resolution_x, render.resolution_y = 64, 36  # means alone are compared
     bpy.ops.mesh.primitive_cube_add(size=0.5, location=(-0.6, -1.0, 0.0), rotation=(0.3, 0.2, 0.5))
     glass = bpy.data.materials.new("glass")
     glass.use_nodes = True
@@ -114,6 +116,31 @@ def test_passes_of_glass_are_those_of_cycles(passes):
     for name, (a, b) in found.items():
         assert abs(a - b) < 0.03 * b + 1e-4, name
     assert found["transmission_indirect"][0] > 0.01
+
+
+@pytest.mark.judged
+@pytest.mark.slow
+def test_a_rough_pane_before_a_lamp_has_its_direct_light(passes, room):  # noqa: F811
+    """Light of the lamp that one surface lets pass is direct.
+
+    The lamp is straight behind it: far off the refracted directions Cycles evaluates microfacets that face away, too.
+    """
+    bpy.ops.mesh.primitive_plane_add(size=1.2, location=(-0.3, -1.2, 0.1), rotation=(1.4, 0.1, 0.2))
+    glass = bpy.data.materials.new("glass")
+    if glass.node_tree is None:
+        glass.use_nodes = True
+    inputs = next(n for n in glass.node_tree.nodes if n.type == "BSDF_PRINCIPLED").inputs
+    inputs["Base Color"].default_value = (0.5, 0.8, 0.6, 1.0)
+    inputs["Transmission Weight"].default_value, inputs["Roughness"].default_value = 0.8, 0.5
+    bpy.context.object.data.materials.append(glass)
+    lamp = bpy.data.objects["Lamp"]
+    lamp.location, lamp.rotation_euler, lamp.data.energy = (-0.2, 1.0, 0.2), (-1.57, 0, 0), 20
+    room.render.resolution_x, room.render.resolution_y = 48, 27
+    theirs, ours = (p["transmission_direct"][..., :3].astype(float) for p in (passes("CYCLES"), passes("DRGS")))
+    print(ours.mean(axis=(0, 1)), theirs.mean(axis=(0, 1)))
+    np.testing.assert_allclose(ours.mean(axis=(0, 1)), theirs.mean(axis=(0, 1)), rtol=0.03)
+    where = theirs.min(axis=2) > 0.05
+    assert where.sum() > 50 and np.median(np.abs(ours / np.maximum(theirs, 1e-6) - 1)[where]) < 0.05
 
 
 def test_passes_that_are_not_made_are_told(scene, ball, export):
@@ -139,6 +166,10 @@ def test_frame_has_mist_material_indices_and_the_map_that_renders(passes, room, 
     floor = next(mesh for mesh in frame.meshes if mesh.name == "floor")
     assert floor.uv_map.shape == (2, 3, 2) and floor.uv_map.max() == 2
     assert floor.materials[0].pass_index == bpy.data.materials["floor"].pass_index
+    if hasattr(room.view_layers[0], "world_override"):
+        other = room.view_layers[0].world_override = room.world.copy()
+        other.mist_settings.start = 2.0
+        assert export()[0].mist.start == 1.0, "as in Cycles, of the scene's world"
     room.view_layers[0].use_pass_uv = False
     frame, _ = export()
     assert all(mesh.uv_map is None for mesh in frame.meshes)

@@ -152,6 +152,7 @@ def test_a_bake_is_stopped_at_once_and_goes_on(body, scene):
 
 
 @pytest.mark.slow
+@pytest.mark.blender_api
 def test_pins_regions_and_colliders_take_part(body, scene):
     """Pinned at the top and carried aside by its own keys, while a table rises from below."""
     physics = body.drgs.physics
@@ -197,6 +198,7 @@ def test_pins_regions_and_colliders_take_part(body, scene):
 
 
 @pytest.mark.slow
+@pytest.mark.blender_api
 def test_force_fields_of_the_scene_act_on_it(body, scene):
     """A wind that turns up carries it along, a vortex of another collection does not, and a magnet is named."""
     physics = body.drgs.physics

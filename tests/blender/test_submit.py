@@ -52,6 +52,7 @@ def test_a_job_is_written_and_its_command_shown(settings, tmp_path, manager, fil
 
 
 @pytest.mark.slow
+@pytest.mark.blender_api
 def test_what_a_node_would_miss_is_told(settings, tmp_path):
     settings.use_check, settings.shared = True, str(tmp_path / "assets")
     with pytest.raises(RuntimeError, match="a node would miss"):

@@ -40,6 +40,7 @@ def test_the_picture_is_the_processors(session, warp_session, make_frame, change
         assert here[name].any() and psnr(here[name], there[name]) > 60.0
 
 
+@pytest.mark.slow
 def test_surfels_stay_on_a_device_from_deformation_to_picture(session, warp_session, make_frame, monkeypatch):
     """Two objects that move, tear, are mirrored, tinted and grainy; this processor poses the grains alone."""
     poses, pose = [], MeshDriven.pose
@@ -88,6 +89,7 @@ def test_without_a_card_a_frame_is_rendered_here_with_a_warning(session, make_fr
     np.testing.assert_array_equal(found["Combined"], expected["Combined"])
 
 
+@pytest.mark.slow
 def test_whoever_waits_is_told_that_kernels_are_made(warp_session, make_frame):
     """They take a minute, and an engine that says nothing for so long is taken for dead."""
     changes = []

@@ -15,8 +15,8 @@ from drgs_blender.core.asset.container import read_asset, write_asset
 from drgs_blender.core.asset.model import Asset, Mesh, neutral_values
 from drgs_blender.core.cryptomatte import name_hash
 from drgs_blender.core.errors import AssetError
-from drgs_blender.core.frame import Adjustment, Frame, Light, ObjectState, Visibility, World
-from drgs_blender.core.materials import Material
+from drgs_blender.core.frame import Adjustment, Frame, Layer, Light, MeshState, ObjectState, Visibility, World
+from drgs_blender.core.materials import Material, Texture
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.engine.session import Session
@@ -192,12 +192,107 @@ def test_bad_channels_are_named(save, make_frame) -> None:
         session.render(frame)
 
 
-def test_what_is_not_shown_is_said(save, make_frame) -> None:
-    frame = make_frame()
-    said = use(frame, save(specular=1.0, coat=0.5)).render(frame).warnings
-    assert said == ["Ball: its specular and coat are kept in the asset, but not rendered"]
-    said = use(frame, save(opacity=0.5)).render(frame).warnings
-    assert said == ["Ball: light passes it, so the camera sees its mesh, not its surfels"]
+def test_what_is_not_shown_or_otherwise_is_said(save, asset_path, make_frame, tmp_path) -> None:
+    varnished = save(specular=1.0, coat=0.5)
+
+    def said(path: Path, **settings: object) -> list[str]:
+        frame = make_frame(**settings)
+        return use(frame, path).render(frame).warnings
+
+    assert said(varnished, camera_sees="mesh") == []
+    assert said(varnished) == ["Ball: its specular and coat on surfels are taken from the mesh next to them"]
+    only = "its specular and coat are shown to the camera alone; other rays meet surfels without"
+    assert said(varnished, camera_sees="mesh", rays_see="surfels") == [f"Ball: {only}"]
+    (told,) = said(varnished, shading_model="paper")
+    assert told == "Ball: the shading model Cook-Torrance leaves out its specular and coat. Choose Principled"
+    assert said(save(opacity=0.5)) == ["Ball: light passes it, so the camera sees its mesh, not its surfels"]
+    asset = read_asset(asset_path)
+    own = replace(asset.surfels, coat=np.ones(len(asset.surfels), np.float32))
+    write_asset(tmp_path / "bare.drgs", Asset(own, Mesh.empty()))
+    frame = make_frame(rays_see="surfels")
+    frame.objects[0].vertices = None
+    told = use(frame, tmp_path / "bare.drgs").render(frame).warnings
+    assert "Ball: has no mesh, so its coat is not shown" in told
+
+
+@pytest.mark.parametrize("varied", [False, True])
+def test_specular_and_coat_are_those_of_a_mesh_of_that_material(save, mesh, make_frame, varied) -> None:
+    """Bit by bit, where an ordinary mesh has the same values at its vertices."""
+    frame = make_frame(camera_sees="mesh", samples=8, bounces=1)
+    frame.passes = ("Combined", "GlossCol", "GlossDir", "DiffDir")
+    n = len(mesh.vertices)
+    specular = np.linspace(0, 1, n, dtype=np.float32) if varied else np.full(n, 0.9, np.float32)
+    coat = specular[::-1] if varied else np.full(n, 0.5, np.float32)
+    path = save(specular=specular, coat=coat)
+    ours = use(frame, path).render(frame)
+    other = make_frame(camera_sees="mesh", samples=8, bounces=1)
+    other.passes = frame.passes
+
+    def layer(name: str, *values: np.ndarray) -> Layer:
+        corners = np.ones((len(mesh.faces), 3, 4), np.float32)
+        corners[..., : len(values)] = np.stack(values, -1)[mesh.faces]
+        return Layer(name, corners)
+
+    layers = [layer("colour", *mesh.albedo.T), layer("lobes", mesh.roughness, mesh.metallic, specular, coat)]
+    red, green, blue, alpha = (Texture("", c, layer="lobes") for c in "rgba")
+    paint = Material(
+        "Paint", (1, 1, 1), 1.0, 1.0, base_colour_texture=Texture("", layer="colour"), roughness_texture=red,
+        metallic_texture=green, specular_level=1.0, coat=1.0, textures={"specular_level": blue, "coat": alpha},
+    )  # fmt: skip
+    ball = MeshState(
+        "Ball", mesh.vertices, mesh.faces, np.eye(4)[None], np.zeros(1, np.int32), materials=[paint], layers=layers,
+    )  # fmt: skip
+    other.objects, other.meshes = [], [ball]
+    theirs = Session().render(other)
+    for name in frame.passes:
+        np.testing.assert_allclose(ours[name], theirs[name], atol=2e-5, err_msg=name)
+    plain = make_frame(camera_sees="mesh", samples=8, bounces=1)
+    plain.passes = frame.passes
+    without = use(plain, save()).render(plain)
+    assert np.abs(ours["GlossCol"] - without["GlossCol"]).max() > 0.02
+
+
+@pytest.mark.parametrize("rays_see", ["mesh", "surfels"])
+def test_surfels_have_the_lobes_of_their_mesh_and_their_own_colours(save, make_frame, rays_see) -> None:
+    """Red surfels on a mesh of other colours stay red under a coat, which adds what it adds to the mesh."""
+
+    def pictures(path: Path, **settings: object) -> dict[str, np.ndarray]:
+        frame = make_frame(samples=16, bounces=0, **settings)
+        frame.passes = ("Combined", "GlossCol", "DiffCol", "GlossDir")
+        return use(frame, path).render(frame)
+
+    def red(path: Path, *parts: str) -> Path:
+        asset = read_asset(path)
+        for part in parts:
+            own = getattr(asset, part)
+            setattr(asset, part, replace(own, albedo=np.zeros_like(own.albedo) + np.float32([0.9, 0, 0])))
+        write_asset(path, asset)
+        return path
+
+    bare, coated = red(save(), "surfels"), red(save(coat=1.0), "surfels")
+    before, after = pictures(bare, rays_see=rays_see), pictures(coated, rays_see=rays_see)
+    bare, coated = red(bare, "mesh"), red(coated, "mesh")
+    assert after["DiffCol"][..., 1:].max() == 0 and after["DiffCol"][..., 0].max() > 0.3
+    of_mesh = [pictures(p, camera_sees="mesh")["GlossCol"] for p in (bare, coated)]
+    middle = slice(12, 24), slice(16, 32)  # surfels overhang the silhouette
+    gain = (after["GlossCol"] - before["GlossCol"])[middle].mean()
+    assert gain == pytest.approx((of_mesh[1] - of_mesh[0])[middle].mean(), rel=0.08)
+    assert after["GlossDir"].mean() > 1.02 * before["GlossDir"].mean()
+    assert gain > 0.01
+
+
+def test_painted_lobes_take_the_place_of_the_assets(save, mesh, make_frame) -> None:
+    n = len(mesh.vertices)
+    frame = make_frame(camera_sees="mesh")
+    expected = use(frame, save(coat=0.5, specular=0.2)).render(frame)
+    other = make_frame(camera_sees="mesh")
+    session = use(other, save(coat=1.0))
+    other.objects[0].coat, other.objects[0].specular = np.full(n, 0.5, np.float32), np.full(n, 0.2, np.float32)
+    assert_same_bits(session.render(other), expected)
+    other.objects[0].coat, other.objects[0].specular = np.zeros(n, np.float32), np.full(n, 0.5, np.float32)
+    neutral = session.render(other)
+    plain = make_frame(camera_sees="mesh")
+    assert_same_bits(neutral, use(plain, save()).render(plain))
 
 
 def test_a_surface_of_an_object_moves_with_it(save, make_frame) -> None:
@@ -236,6 +331,7 @@ def test_neutral_values() -> None:
     assert ObjectState("a", "b").emission is None
 
 
+@pytest.mark.slow  # its kernels take a minute to compile
 def test_a_device_draws_the_same(save, make_frame, monkeypatch) -> None:
     """Warp's processor as the card."""
     pytest.importorskip("warp", reason="warp-lang is not installed")

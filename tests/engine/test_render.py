@@ -104,7 +104,7 @@ def test_progress_is_told_on_the_calling_thread_and_grows(client, make_frame):
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize("delay", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("delay", [0.0, 0.3, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_cancel_is_quick_and_the_engine_goes_on(client, make_frame, expected, delay):
     client.render(make_frame())
     pid, asked = client.pid, []
@@ -123,6 +123,7 @@ def test_cancel_is_quick_and_the_engine_goes_on(client, make_frame, expected, de
 
 
 @pytest.mark.alone
+@pytest.mark.slow
 @posix
 def test_engine_that_does_not_obey_is_ended(client, make_frame, expected):
     client.render(make_frame())

@@ -62,7 +62,7 @@ def lit(frame):
     [
         {},
         {"camera_sees": "mesh", "bounces": 2},
-        {"samples": 12, "subpixel_samples": 3},
+        pytest.param({"samples": 12, "subpixel_samples": 3}, marks=pytest.mark.slow),
         {"samples": 3, "subpixel_samples": 2},  # not divisible: one part a sub-pixel sample
         {"denoise": "svgf", "samples": 4},
         {"film_transparent": False},
@@ -82,7 +82,7 @@ def test_last_picture_is_the_final_one(session, make_frame, settings):
     [
         {"samples": 64, "subpixel_samples": 4},
         {"samples": 128, "subpixel_samples": 2, "denoise": "svgf"},
-        {"samples": 32, "subpixel_samples": 3, "strategy_samples": (32, 32, 32)},
+        pytest.param({"samples": 32, "subpixel_samples": 3, "strategy_samples": (32, 32, 32)}, marks=pytest.mark.slow),
         {"samples": 64, "camera_sees": "mesh"},
     ],
 )
@@ -268,6 +268,7 @@ def test_new_engine_begins_the_view_again(client, make_frame):
 
 
 @pytest.mark.alone
+@pytest.mark.slow
 def test_newer_frame_interrupts_within_tens_of_milliseconds(client, make_frame):
     """From the moment something newer is there until the engine is free, with `wake`; median of some."""
     endless = make_frame(size=(400, 300), samples=4096)

@@ -11,7 +11,7 @@ from drgs_blender.render.integrator.bsdf.albedo_tables import albedo_tables
 from drgs_blender.render.integrator.bsdf.lobes import DELTA, LOBE, MOST_LOBES, evaluate, normalise_probabilities, sample
 from drgs_blender.render.integrator.bsdf.microfacet import fresnel
 from drgs_blender.render.integrator.bsdf.principled import add_material
-from drgs_blender.render.scene.material_rows import KINDS, material_rows
+from drgs_blender.render.scene.material_rows import KINDS, TEXTURES, material_rows
 
 F = np.float32
 WHITE = (1.0, 1.0, 1.0)
@@ -358,4 +358,4 @@ def test_textures_of_parameters_get_rows():
 
     material = Material("m", coat=1.0, textures={"coat": Texture("i")}, base_colour_texture=Texture("i"))
     rows = material_rows([material], add, lambda *_: None, [])
-    assert sorted(added) == ["m, base colour", "m, coat"] and (rows.ints[0, 6:] >= 0).sum() == 2
+    assert sorted(added) == ["m, base colour", "m, coat"] and (rows.ints[0, TEXTURES:] >= 0).sum() == 2

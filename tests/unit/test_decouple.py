@@ -250,7 +250,7 @@ def test_albedo_along_edges_of_metal_is_evened_out_but_for_its_patterns_and_pain
     assert not blotches((ends[:, 0] - ends[:, 1]).abs().detach(), metallic, alike[:, None]).requires_grad
 
 
-@pytest.mark.parametrize("weight", ["metal_smoothness", "metal_albedo_prior"])
+@pytest.mark.parametrize("weight", ["metal_smoothness", pytest.param("metal_albedo_prior", marks=pytest.mark.slow)])
 def test_what_is_said_of_metals_begins_late_and_counts_for_nothing_else(ball, capture, weight, monkeypatch):
     def alike(**other: str) -> bool:
         settings = replace(SMALL, metal_smoothness=0.0, metal_albedo_prior=0.0, **other)
@@ -424,6 +424,7 @@ def test_materials_and_light_are_found_again(ball, capture):
     assert found.report["views"] == 14 and found.report["unseen_vertices"] < 0.2 * len(ball.vertices)
 
 
+@pytest.mark.slow
 def test_the_hue_of_all_photographs_is_that_of_the_object_not_of_the_light(ball):
     """Bronze in grey light: only a start from its own hue keeps the light, which learns faster, from turning bronze."""
     bronze = replace(ball, albedo=np.where(ball.vertices[:, :1] > 0, 0.5, 0.3) * np.float32([[1.0, 0.55, 0.2]]))
@@ -488,6 +489,7 @@ def test_exposures_of_photographs_are_found_again(ball, capture):
     assert np.median(found[0::2]) / np.median(found[1::2]) == pytest.approx(2**0.25, rel=0.04)
 
 
+@pytest.mark.slow
 def test_grids_and_a_coarse_light_carry_what_many_pixels_agree_on(ball, capture):
     """With as many steps, what is learned on grids is nearer to the photographs; light begins with few rows."""
     psnr = [decouple(capture, ball, replace(SMALL, iterations=40, coarse=n)).report["psnr"] for n in (0, 2)]
@@ -511,7 +513,13 @@ def test_without_shadows_a_room_around_all_does_not_stand_before_the_light(ball,
     assert lit > dark + 10, (dark, lit)
 
 
-@pytest.mark.parametrize("more", [{}, {"normals": True, "exposure": True, "parametrisation": "specular"}])
+@pytest.mark.parametrize(
+    "more",
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        {"normals": True, "exposure": True, "parametrisation": "specular"},
+    ],
+)
 def test_an_interrupted_run_ends_where_an_undisturbed_one_does(ball, capture, tmp_path, more):
     settings = replace(SMALL, **more)
     whole = decouple(capture, ball, settings)

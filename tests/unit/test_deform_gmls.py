@@ -220,7 +220,9 @@ def test_surfels_and_mesh_follow_particles_exactly_under_affine_motion():
     assert np.abs(np.linalg.norm(posed.normal, axis=1) - 1).max() < 1e-6
 
 
-@pytest.mark.parametrize("kind", ["cage", "lattice", "cloth"])
+@pytest.mark.parametrize(
+    "kind", ["cage", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("lattice", "cloth"))]
+)
 def test_any_deformed_object_drives(kind):
     """A cage around the asset, a lattice of points through it, and a sheet that it lies on: turned and stretched."""
     vertices, faces = box_mesh((-0.4, -0.4, -0.1), (0.4, 0.4, 0.1))

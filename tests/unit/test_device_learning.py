@@ -33,6 +33,8 @@ from drgs_blender.reconstruct.optim.train import Training  # noqa: E402
 from drgs_blender.reconstruct.pipeline import Settings, reconstruct  # noqa: E402
 
 HEIGHT, WIDTH = 23, 31
+#: Where a device fails, and of what, in fast tests.
+FAST_FAULTS = {("forth", "device"), ("back", "memory")}
 
 
 @pytest.fixture(scope="module")
@@ -162,6 +164,7 @@ def test_first_steps_are_the_processors(capture: Capture, region: Region, on_dev
     assert alike(learned(capture, region, CPU, 3), learned(capture, region, on_device, 3)) < 1e-5
 
 
+@pytest.mark.slow
 def test_a_device_learns_as_well_as_the_processor(
     capture: Capture, region: Region, on_device: WarpLearningBackend
 ) -> None:
@@ -187,8 +190,16 @@ def test_a_state_of_one_processor_is_of_use_to_the_other(
         assert alike(begun, going_on) < 1e-5
 
 
-@pytest.mark.parametrize("error", [DeviceError("device cuda", "failed"), RuntimeError("CUDA out of memory")])
-@pytest.mark.parametrize("kernel", [kernels.PROJECT, kernels.SUM_PIXELS, losses.ROWS], ids=["forth", "back", "loss"])
+@pytest.mark.parametrize(
+    ("kernel", "error"),
+    [
+        pytest.param(kernel, error, id=f"{name}-{word}", marks=[] if (name, word) in FAST_FAULTS else pytest.mark.slow)
+        for name, kernel in {"forth": kernels.PROJECT, "back": kernels.SUM_PIXELS, "loss": losses.ROWS}.items()
+        for word, error in {
+            "device": DeviceError("device cuda", "failed"), "memory": RuntimeError("CUDA out of memory")
+        }.items()
+    ],
+)  # fmt: skip
 def test_a_device_that_fails_is_a_warning_and_the_processor_goes_on(
     capture: Capture, region: Region, kernel: WarpKernel, error: Exception, monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,

@@ -84,7 +84,8 @@ def units(count: int, seed: int = 0) -> list[np.ndarray]:
 
 @njit
 def _evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic, a2, norm, shading_model):  # type: ignore[no-untyped-def]
-    return brdf.evaluate((nl, nv, vl, nh2, sin2), (r, g, b), kd, metallic, a2, norm, shading_model)
+    weights = kd, (metallic, metallic, metallic), sampling.ONE - metallic
+    return brdf.evaluate((nl, nv, vl, nh2, sin2), (r, g, b), weights, a2, norm, shading_model)
 
 
 KEYS = [np.random.default_rng(1).integers(0, 2**32, 2000, dtype=np.uint32) for _ in range(2)]
@@ -109,7 +110,13 @@ RENDERER: dict[str, tuple[Any, list[np.ndarray]]] = {
 }
 
 
-@pytest.mark.parametrize("name", RENDERER)
+#: Short ones: the others hold more of the language, and each takes a second to compile, here and there.
+SHORT = {"unit", "scrambled", "fast_acos", "fast_atan2_turns", "basis", "cosine_hemisphere"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SHORT else []) for name in RENDERER]
+)
 def test_the_renderers_arithmetic_is_the_same_to_the_last_bit(name: str) -> None:
     function, columns = RENDERER[name]
     expected, found = here(function, columns), on_device(function, columns)

@@ -49,6 +49,14 @@ def test_the_version_is_that_of_the_packages() -> None:
     assert f'"warp-lang>={VERSION[:-1]},' in text
 
 
+def test_started_again_it_keeps_its_kernels_where_they_were() -> None:
+    """Else all of them would be compiled a second time."""
+    pytest.importorskip("warp", reason="warp-lang is not installed")
+    first = warp().config.kernel_cache_dir
+    warp.cache_clear()
+    assert warp().config.kernel_cache_dir == first
+
+
 @pytest.mark.slow
 def test_warp_prints_nothing_where_programs_read(tmp_path: Path) -> None:
     pytest.importorskip("warp", reason="warp-lang is not installed")

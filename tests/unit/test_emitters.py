@@ -191,8 +191,14 @@ EMITTERS = {
 }
 
 
-@pytest.mark.parametrize("name", list(EMITTERS))
-@pytest.mark.parametrize("bounces", [0, 2])
+@pytest.mark.parametrize(
+    ("bounces", "name"),
+    [
+        pytest.param(bounces, name, marks=[pytest.mark.slow] if bounces and name in ("soup", "places", "bulbs") else [])
+        for bounces in (0, 2)
+        for name in EMITTERS
+    ],
+)
 def test_sampled_light_is_the_light_that_rays_find(name: str, bounces: int) -> None:
     wall = mesh_state(SQUARE, FACES, matrix((1.5, 0, 1), turn=2), materials=[Material("wall", (0.9, 0.6, 0.3), 0.4)])
     meshes = [*EMITTERS[name], wall]

@@ -67,7 +67,7 @@ def of_nobody() -> Iterator[Path]:
         shutil.rmtree(folder)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def double() -> Iterator[Callable[..., str]]:
     """Runs `DOUBLE`, whose source is a file that all may read, with a folder of kernels."""
     place = Path(tempfile.mkdtemp())
@@ -80,6 +80,14 @@ def double() -> Iterator[Callable[..., str]]:
 
     yield started
     shutil.rmtree(place)
+
+
+@pytest.fixture(scope="module")
+def compiled(double: Callable[..., str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the kernel of `double`, to be copied."""
+    folder = tmp_path_factory.mktemp("compiled") / "kernels"
+    assert double(folder) == "42 compiled\n"
+    return folder
 
 
 def age(path: Path) -> None:
@@ -159,23 +167,25 @@ def test_what_is_of_the_future_is_not_old(monkeypatch: pytest.MonkeyPatch, tmp_p
 
 
 def test_kernels_of_a_sealed_disk_are_used(
-    double: Callable[..., str], small_disk: Callable[[str], Path], tmp_path: Path
+    double: Callable[..., str], compiled: Path, small_disk: Callable[[str], Path], tmp_path: Path
 ) -> None:
     """As those in a container's image are; that no more can be kept is said once."""
     disk, scratch = small_disk("size=4m"), tmp_path / "scratch"
     kernels = disk / "kernels"
     scratch.mkdir()
-    assert double(kernels) == "42 compiled\n"
+    shutil.copytree(compiled, kernels)
     small_disk("ro")
     said = double(kernels, TMPDIR=str(scratch))
     assert "42 found" in said and len(said.splitlines()) == 2 and f"{kernels} (Read-only file system)" in said
     assert not list(scratch.iterdir())
 
 
-def test_kernels_in_a_folder_without_the_right_to_write_are_used(double: Callable[..., str], of_nobody: Path) -> None:
-    kernels = of_nobody / "kernels"
-    assert double(kernels, NOBODY) == "42 compiled\n"
+def test_kernels_in_a_folder_without_the_right_to_write_are_used(
+    double: Callable[..., str], compiled: Path, of_nobody: Path
+) -> None:
+    kernels = shutil.copytree(compiled, of_nobody / "kernels")
     for path in (*kernels.rglob("*"), kernels):
+        os.chown(path, NOBODY, NOBODY)
         path.chmod(0o500 if path.is_dir() else 0o400)
     said = double(kernels, NOBODY)
     assert "42 found" in said and f"{kernels} (Permission denied)" in said
@@ -184,14 +194,14 @@ def test_kernels_in_a_folder_without_the_right_to_write_are_used(double: Callabl
 @posix
 @pytest.mark.parametrize("owner", ["own", "another"])
 def test_kernels_that_another_user_puts_in_place_of_ours_are_not_used(
-    double: Callable[..., str], tmp_path: Path, owner: str
+    double: Callable[..., str], compiled: Path, tmp_path: Path, owner: str
 ) -> None:
     """The folder is looked at when a process starts; whoever may turn a link on the way to it can do so later."""
     if os.geteuid() != 0:
         pytest.skip("only root may give files away")
     ours, theirs, link = tmp_path / "ours", tmp_path / "theirs", tmp_path / "link"
-    assert double(ours) == "42 compiled\n"
-    shutil.copytree(ours, theirs)
+    for copy in (ours, theirs):
+        shutil.copytree(compiled, copy)
     for path in theirs.rglob("*.kernel" if owner == "another" else "nothing"):
         os.chown(path, NOBODY, NOBODY)
     link.symlink_to(ours)

@@ -352,7 +352,7 @@ def test_an_interrupted_write_leaves_the_old_file_alone(tmp_path: Path) -> None:
         assert [p.name for p in tmp_path.iterdir()] == ["a.bin"] and path.read_bytes() == b"old"
 
 
-@pytest.mark.parametrize("suffix", [".usda", ".usdc", ".exr"])
+@pytest.mark.parametrize("suffix", [pytest.param(".usda", marks=pytest.mark.slow), ".usdc", ".exr"])
 def test_libraries_need_no_other_disk_and_say_when_it_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
 ) -> None:

@@ -189,6 +189,20 @@ def test_what_is_damaged_or_of_another_kind_is_refused_by_name(name: str) -> Non
         decode_image(data, "a.tif")
 
 
+def test_large_pictures_are_refused_by_our_limit_alone(tmp_path: Path) -> None:
+    """Pillow has a limit of its own, below that of 16384 x 16384, and other words."""
+    head = png16(np.zeros((1, 1, 3), np.uint16))
+
+    def sized(side: int) -> bytes:
+        chunk = b"IHDR" + struct.pack(">2I", side, side) + head[24:29]
+        return head[:12] + chunk + struct.pack(">I", zlib.crc32(chunk)) + head[33:]
+
+    (tmp_path / "a.png").write_bytes(sized(16384))
+    assert image_size(tmp_path / "a.png") == (16384, 16384)
+    with pytest.raises(AssetError, match=r"^a.png: is 30000 x 30000 pixels. Use a smaller image"):
+        decode_image(sized(30000), "a.png")
+
+
 def test_sizes_are_not_believed() -> None:
     data = bytearray(tiff(np.ones((4, 4, 3), np.float32)))
     with pytest.raises(AssetError, match="is 4 x 4 pixels"):

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from drgs_blender.core.color import srgb_to_linear
 from drgs_blender.core.errors import AssetError
 from drgs_blender.formats.axes import vectors_to_z_up
+from drgs_blender.formats.files import MaterialFile
 from drgs_blender.formats.gltf import read_gltf
 from drgs_blender.formats.gltf_materials import uv_transform
 from drgs_blender.formats.registry import read_mesh
@@ -527,6 +528,17 @@ def test_bad_obj_lines_are_named(tmp_path: Path, line: str) -> None:
     (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n{line}\n")
     with pytest.raises(AssetError, match="line 5"):
         read_mesh(tmp_path / "a.obj")
+
+
+@pytest.mark.parametrize(
+    "line", ["Kd nan 0 0", "Kd 1e39 0 0", "Ns", "Ns 1e400", "Pr", "Pr nan", "Pm inf", "Pc", "d nan"]
+)
+def test_bad_lines_of_obj_materials_are_named_and_left_out(tmp_path: Path, line: str) -> None:
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (tmp_path / "a.mtl").write_text(f"newmtl red\n{line}\nKe 1 2 3\n")
+    mesh = read_mesh(tmp_path / "a.obj")
+    assert mesh.notes == [f"a.mtl: line {line!r} not understood"]
+    assert mesh.materials[0].emission == (1, 2, 3) and mesh.materials[0].base_colour == MaterialFile("").base_colour
 
 
 def test_a_real_obj_with_texture(shared_data: Path) -> None:

@@ -476,7 +476,7 @@ def test_compressed_gltf_splats_say_so(tmp_path: Path) -> None:
         read_surfels(tmp_path / "a.glb")
 
 
-@pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usd"])
+@pytest.mark.parametrize("suffix", [".usda", ".usdc", pytest.param(".usd", marks=pytest.mark.slow)])
 def test_usd_keeps_everything(tmp_path: Path, suffix: str) -> None:
     pytest.importorskip("pxr", reason="usd-core is not installed")
     splats = random_splats(60, 9)

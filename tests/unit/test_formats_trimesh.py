@@ -142,6 +142,7 @@ def test_collada_keeps_textures_normals_and_colours(tmp_path: Path) -> None:
     assert mesh.materials[0].base_colour == (1, 1, 1) and mesh.face_material.tolist() == [0, 0, 0]
 
 
+@pytest.mark.slow
 def test_collada_has_base_colours_axes_and_mirrors(tmp_path: Path) -> None:
     mesh = read(tmp_path, "a.dae", collada(TRIANGLE, [[0, 1, 2]], up="X_UP", place="<scale>1 1 -1</scale>"))
     np.testing.assert_allclose(mesh.materials[0].base_colour, (0.2, 0.4, 0.6), atol=1 / 509)  # of 8 bits in between
@@ -150,6 +151,7 @@ def test_collada_has_base_colours_axes_and_mirrors(tmp_path: Path) -> None:
     assert mesh.corner_uvs is None and mesh.corner_normals is None and mesh.vertex_colours is None
 
 
+@pytest.mark.slow
 def test_textures_are_read_through_the_guards_alone(tmp_path: Path) -> None:
     (tmp_path / "bad.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
     for name, said in (("/etc/passwd", "texture /etc/passwd not found"), ("bad.png", "texture left out")):
@@ -203,7 +205,15 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize(("name", "number"), [(name, i) for name, cases in BAD.items() for i in range(len(cases))])
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        # those read apart start a process
+        pytest.param(name, i, marks=[pytest.mark.slow] if name in ("a.3mf", "a.dae") and i else [])
+        for name, cases in BAD.items()
+        for i in range(len(cases))
+    ],
+)
 def test_damaged_files_are_refused_by_name(tmp_path: Path, name: str, number: int) -> None:
     data, problem = BAD[name][number]
     with pytest.raises(AssetError, match=rf"{name}: .*({problem})") as caught:

@@ -461,6 +461,7 @@ def test_preparing_says_what_is_wrong(tmp_path, variable, value, code):
     assert value in done.stderr and "Traceback" not in done.stderr and "ready" not in done.stdout
 
 
+@pytest.mark.slow
 def test_an_engine_is_not_called_ready_whose_kernels_cannot_be_kept(tmp_path):
     (tmp_path / "file").write_text("")
     environment = os.environ | {"DRGS_CACHE_DIR": str(tmp_path / "file"), "PYTHONPATH": str(ROOT)}

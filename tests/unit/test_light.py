@@ -100,7 +100,7 @@ def test_the_density_integrates_to_one(kind: str) -> None:
     assert light.cells.runs[-1, 0] == 2**32 - 1
 
 
-@pytest.mark.parametrize("size", [(1000, 2000), (1024, 2048), (1448, 2896)])
+@pytest.mark.parametrize("size", [(1000, 2000), (1024, 2048), pytest.param((1448, 2896), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("sky", ["white", "gradient", "sun"])
 def test_every_lit_cell_of_a_large_map_has_its_density(size: tuple[int, int], sky: str) -> None:
     image = np.ones((*size, 3), np.float32)

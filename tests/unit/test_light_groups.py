@@ -47,7 +47,11 @@ def test_groups_add_up_and_change_no_sample(grouped: Scene) -> None:
     assert all(np.array_equal(some[name], found[name]) for name in GROUPS[1:3])
 
 
-@pytest.mark.parametrize("parts", ["linked", "adaptive", "surfels", "transparent", "glass"])
+#: Those that have the integrator compiled once more.
+COMPILED = [pytest.param(parts, marks=pytest.mark.slow) for parts in ("linked", "glass")]
+
+
+@pytest.mark.parametrize("parts", ["adaptive", "surfels", "transparent", *COMPILED])
 def test_groups_add_up_everywhere(grouped: Scene, parts: str) -> None:
     settings, changes = grouped[1].settings, {}
     if parts == "linked":

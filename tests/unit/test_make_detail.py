@@ -20,6 +20,9 @@ from drgs_blender.deform.face_frames import Faces, shading_frames
 from drgs_blender.formats.files import Image, MaterialFile, MeshFile
 from drgs_blender.formats.registry import read_mesh
 
+#: Density at which a square has two thousand surfels, where each of them is to be right.
+FEW = 30.0
+
 
 def shading_normals(asset: Asset) -> np.ndarray:
     """(n, 3) normals with which surfels are shaded at rest, object space."""
@@ -55,7 +58,7 @@ def bumped(normal: tuple[float, float, float], uvs=None, strength: float = 1.0) 
 def test_normal_maps_turn_with_their_texture_coordinates(uvs, turn: np.ndarray) -> None:
     """The first axis of the map is where u grows, the second where v does."""
     normal = np.array((0.5, 0.2, 0.8))
-    asset = make_asset(bumped(tuple(normal), uvs))
+    asset = make_asset(bumped(tuple(normal), uvs), density=FEW)
     expected = np.tile(turn @ normal / np.linalg.norm(normal), (len(asset.surfels), 1))
     np.testing.assert_allclose(shading_normals(asset), expected, atol=2e-3)
 
@@ -66,7 +69,7 @@ def test_strength_is_that_of_blenders_node(strength: float) -> None:
     normal = np.array((0.5, 0.0, 0.8))
     normal /= np.linalg.norm(normal)
     z = 1 + (normal[2] - 1) * min(strength, 1)
-    found = shading_normals(make_asset(bumped((0.5, 0.0, 0.8), strength=strength)))
+    found = shading_normals(make_asset(bumped((0.5, 0.0, 0.8), strength=strength), density=FEW))
     np.testing.assert_allclose(found[:, 0] / found[:, 2], strength * normal[0] / z, rtol=5e-3, atol=2e-3)
 
 
@@ -162,7 +165,7 @@ def test_tangents_are_shared_across_faces_but_not_across_mirrored_ones() -> None
 def test_bad_texture_coordinates_do_no_harm() -> None:
     """All at one place, or not finite."""
     for uvs in (lambda uv: np.zeros_like(uv), lambda uv: np.full_like(uv, np.nan), lambda uv: uv * 1e8):
-        asset = make_asset(bumped((0.5, 0.2, 0.8), uvs))
+        asset = make_asset(bumped((0.5, 0.2, 0.8), uvs), density=FEW)
         found = shading_normals(asset)
         np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-3)
         assert (found[:, 2] > 0).all()
@@ -187,7 +190,8 @@ def alpha_image(alpha: np.ndarray) -> Image:
 @pytest.mark.parametrize("said", [True, False])
 def test_cut_out_cards_keep_the_leaf_alone(said: bool) -> None:
     """Whether the file says so, or only that it has alpha."""
-    asset = make_asset(card(MaterialFile("leaf", alpha_image=alpha_image(leaf()), cut_out=said)))
+    file = card(MaterialFile("leaf", alpha_image=alpha_image(leaf()), cut_out=said))
+    asset = make_asset(file, max_texture=0)
     mesh = asset.mesh
     area = Faces.of(mesh.vertices, mesh.faces).area.sum()
     assert area == pytest.approx(np.pi * 0.09, rel=0.01)
@@ -197,15 +201,22 @@ def test_cut_out_cards_keep_the_leaf_alone(said: bool) -> None:
     assert asset.surfels.opacity[inside].min() > 0.95
     assert mesh.source_count == 9 and len(mesh.in_own_order(np.ones((9, 3)))) == len(mesh.vertices)
     assert any("cut out" in note for note in asset.provenance["report"]["notes"])
+    # With the image, whose alpha cuts, faces that the edge crosses stay; surfels beyond it show nothing.
+    whole = make_asset(file)
+    kept = Faces.of(whole.mesh.vertices, whole.mesh.faces).area.sum()
+    assert area < kept < 2 * area and whole.mesh.textures is not None
+    assert whole.mesh.textures.optional == ("opacity",)
+    far = np.hypot(*(whole.surfels.centre[:, :2] - 0.5).T)
+    assert whole.surfels.opacity[far > 0.32].max() < 0.05 and whole.surfels.opacity[far < 0.28].min() > 0.95
 
 
 def test_glass_keeps_its_opacity() -> None:
-    asset = make_asset(card(MaterialFile("lens", alpha=0.3)))
+    asset = make_asset(card(MaterialFile("lens", alpha=0.3)), density=FEW)
     assert asset.surfels.opacity.min() > 0.95 and (asset.mesh.opacity == np.float32(0.3)).all()
-    veil = make_asset(card(MaterialFile("veil", alpha_image=alpha_image(np.full((4, 4), 0.4)))))
+    veil = make_asset(card(MaterialFile("veil", alpha_image=alpha_image(np.full((4, 4), 0.4)))), density=FEW)
     assert veil.surfels.opacity.min() > 0.95 and len(veil.mesh.faces) == 8
     np.testing.assert_allclose(veil.mesh.opacity, 0.4, atol=1e-6)
-    assert make_asset(card(MaterialFile("solid"))).mesh.opacity is None
+    assert make_asset(card(MaterialFile("solid")), density=FEW).mesh.opacity is None
 
 
 def test_emission_specular_and_coat_are_kept(tmp_path) -> None:

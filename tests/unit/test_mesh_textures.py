@@ -428,15 +428,15 @@ def test_no_textures_where_none_are_wanted_or_there(tmp_path: Path) -> None:
 def test_faces_without_images_lose_their_material() -> None:
     textures = textured(uniform((1, 2, 3))).mesh.textures
     assert textures is not None
-    some = np.zeros((288, 4), bool)
+    some = np.zeros((288, 8), bool)
     some[:10] = True
     some[10:20, ALBEDO] = True
     kept = without(textures, some)
     assert kept is not None and kept.names == ["paint", "paint"]
     assert (kept.material[:10] == -1).all() and (kept.material[10:20] == kept.material[10]).all()
-    assert kept.slots[kept.material[10]].tolist() == [-1, 1, 1, -1]
-    assert kept.slots[kept.material[20]].tolist() == [0, 1, 1, -1]
-    assert without(textures, np.ones((288, 4), bool)) is None
+    assert kept.slots[kept.material[10], :4].tolist() == [-1, 1, 1, -1]
+    assert kept.slots[kept.material[20], :4].tolist() == [0, 1, 1, -1]
+    assert without(textures, np.ones((288, 8), bool)) is None
 
 
 def converted(tmp_path: Path, asset: Asset, name: str) -> MeshFile:
@@ -463,7 +463,7 @@ def test_gltf_has_the_images_and_an_atlas_for_the_rest(tmp_path: Path, capsys) -
     asset = slanted(textured(images, (0, 1, 1, 2), albedo=np.random.default_rng(2).random((169, 3))))
     textures = asset.mesh.textures
     assert textures is not None
-    textures.factors[0] = 0.5, 0.75, 1, 0.5, 0.25, 0.7
+    textures.factors[0, :6] = 0.5, 0.75, 1, 0.5, 0.25, 0.7
     file = converted(tmp_path, asset, "a.glb")
     assert "1 materials with the images" in (out := capsys.readouterr().out) and "144 others" in out
     own = file.face_material == 0
@@ -504,6 +504,16 @@ def test_gltf_has_images_with_opacity_and_emission_that_are_alike_in_a_material(
     asset.mesh.opacity = np.linspace(0, 1, n).astype(np.float32)
     assert len(converted(tmp_path, asset, "b.glb").materials) == 1
     assert "0 materials with the images" in capsys.readouterr().out
+
+
+def test_an_image_that_cannot_be_read_is_named_where_its_alpha_goes(tmp_path: Path, capsys) -> None:
+    asset = textured(uniform((200, 100, 50)), opacity=np.full(169, 0.5))
+    assert asset.mesh.textures is not None
+    asset.mesh.textures.images["albedo"] = np.frombuffer(b"\x89PNG\r\n\x1a\njunk", np.uint8)
+    write_asset(tmp_path / "a.drgs", asset)
+    assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.glb")]) == 65
+    assert "image albedo.png: is no image that can be read" in capsys.readouterr().err
+    assert not (tmp_path / "a.glb").exists()
 
 
 def test_gltf_of_channels_that_vary_at_vertices_is_an_atlas(tmp_path: Path, capsys) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,7 @@ def length(path: Path) -> int:
     return count
 
 
+@functools.cache
 def lengths() -> dict[str, int]:
     folders = ("drgs_blender", "addon", "operators", "tools")
     paths = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]

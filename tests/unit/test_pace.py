@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable
 
 import pace
@@ -79,6 +80,22 @@ def test_programs_that_a_test_runs_count(outcome, monkeypatch) -> None:
     assert outcome(text, "--part=fast")[0] == {"failed": 1}
     monkeypatch.setattr(pace, "slowness", lambda: 20.0)
     assert outcome(text, "--part=fast")[0] == {"passed": 1}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere programs that run are not known")
+def test_a_program_that_others_kept_busy_costs_the_test_that_ends_it_nothing(outcome) -> None:
+    """As an engine that has rendered for many tests; what it does for the last one counts."""
+    program = "import sys, time\nfor _ in sys.stdin:\n    end = time.process_time() + 0.3\n"
+    program += "    while time.process_time() < end: pass\n    print(flush=True)\n"
+    text = (
+        f"import subprocess, sys\nprogram = subprocess.Popen([sys.executable, '-c', {program!r}], text=True,\n"
+        "    stdin=subprocess.PIPE, stdout=subprocess.PIPE)\n"
+        "def ask():\n    print(file=program.stdin, flush=True)\n    program.stdout.readline()\n"
+        "ask()\n"
+        "def test_end():\n    {}program.communicate()\n"
+    )
+    assert outcome(text.format(""), "--part=fast")[0] == {"passed": 1}
+    assert outcome(text.format("ask(); "), "--part=fast")[0] == {"failed": 1}
 
 
 def test_slowness_is_that_of_the_loop(monkeypatch) -> None:

@@ -32,7 +32,9 @@ def _evaluate_many(cosines, albedo, roughness, metallic, shading_model, table, o
         kd = kernel.diffuse_weight(roughness[i], metallic[i], nv, shading_model, table)
         _, norm = kernel.vndf_terms(nv, a2)
         r, g, b = albedo[i]
-        values = kernel.evaluate(angles, (r, g, b), kd, metallic[i], a2, norm, shading_model)
+        metal = metallic[i], metallic[i], metallic[i]
+        weights = kd, metal, np.float32(1) - metallic[i]
+        values = kernel.evaluate(angles, (r, g, b), weights, a2, norm, shading_model)
         for k in range(7):
             out[i, k] = values[k]
 

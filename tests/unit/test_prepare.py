@@ -91,6 +91,7 @@ def early() -> list[subprocess.Popen[str]]:
         return list(started)
 
 
+@pytest.mark.slow
 def test_processes_are_started_early_only_into_an_empty_cache(small, monkeypatch) -> None:
     """Where some kernels are there, likely all are: then nothing is started, and nothing waits for it."""
     started = early()
@@ -158,6 +159,7 @@ def test_processes_or_threads_that_cannot_be_started_leave_nothing_behind(small,
         claim.close()
 
 
+@pytest.mark.slow
 def test_what_another_process_has_begun_is_compiled_here_after_some_minutes_without_progress(small) -> None:
     """It may hang, or hold its lock on a machine that is gone."""
     taken = claims(small)
@@ -196,7 +198,7 @@ def kill_over(pool: worker_pool.Pool, names: set[str], times: int = 100) -> list
     return killed
 
 
-@pytest.mark.parametrize("most", [1, 2])
+@pytest.mark.parametrize("most", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_process_that_ends_is_replaced(small, caplog, most: int) -> None:
     """As one does that the system kills for lack of memory."""
     with contextlib.closing(worker_pool.Pool(small, most)) as pool:

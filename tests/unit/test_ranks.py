@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -78,18 +78,20 @@ def cycle(graph: dict[str, set[str]]) -> list[str]:
     return next((found for node in sorted(graph) if (found := descend(node, []))), [])
 
 
-def imports(path: Path, root: Path) -> Iterator[tuple[int, str, int]]:
+@functools.cache  # several rules are about the same files
+def imports(path: Path, root: Path) -> list[tuple[int, str, int]]:
     """(line, absolute dotted module, level) of every import of a file, wherever in the file it stands."""
-    package = path.relative_to(root).with_suffix("").parts[:-1]
+    found, package = [], path.relative_to(root).with_suffix("").parts[:-1]
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             for alias in node.names:
-                yield node.lineno, alias.name, 0
+                found.append((node.lineno, alias.name, 0))
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else ()
             stem = (*base, *((node.module or "").split(".") if node.module else ()))
             for alias in node.names:
-                yield node.lineno, ".".join((*stem, alias.name)), node.level
+                found.append((node.lineno, ".".join((*stem, alias.name)), node.level))
+    return found
 
 
 def sources(folder: Path) -> list[Path]:

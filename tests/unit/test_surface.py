@@ -387,3 +387,18 @@ def test_material_indices_beyond_the_materials_take_the_last() -> None:
     scene.update([], [mesh_state(vertices, faces, matrix((5, 0, 0))), state])
     _, _, out = meet(scene, [[0, 0, 5], [5, 0, 5]], [[0, 0, -1]] * 2)
     np.testing.assert_allclose(out[:, ALBEDO], [[1, 1, 1], [0.8, 0.8, 0.8]])
+
+
+def test_texture_coordinates_that_are_not_finite_are_named_and_0() -> None:
+    square = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    uvs = np.float32([[[0.2, np.nan], [1, 0], [np.inf, 1]], [[0, 0], [1, 1], [0, 1]]])
+    state = mesh_state(square, [[0, 1, 2], [0, 2, 3]], name="wall", uvs=uvs)
+    scene = TraceScene()
+    for _ in range(2):  # also where nothing has changed
+        scene.update([], [state])
+        assert [w for w in scene.mesh_materials.warnings if "coordinates" in w] == [
+            "wall: 2 texture coordinates are not finite; 0 is used"
+        ]
+    np.testing.assert_array_equal(scene.mesh_materials.uvs[0], np.float32([[0.2, 0], [1, 0], [0, 1]]))
+    scene.update([], [mesh_state(square, [[0, 1, 2], [0, 2, 3]], uvs=np.zeros((2, 3, 2), np.float32))])
+    assert not scene.mesh_materials.warnings

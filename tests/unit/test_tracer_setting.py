@@ -161,7 +161,7 @@ def test_a_ray_meets_the_blend_of_all_surfels_or_the_mesh_behind(backed: bool) -
     directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
     out = np.zeros((80, 400, 16), np.float32)
     tracer = intersect.MixedTracer(*scene.tracer, *tracer_of(bvh))
-    traits = Traits(F(10), False, False, False, False, False, False, False)
+    traits = Traits(F(10), *[False] * 8)
     _meet_all(Scene(tracer, scene.geometry, 0, 0, traits), origins, directions, out.shape[1], out)
     stop = (0.2 - origins[:, 2]) / directions[:, 2] if backed else np.full(80, np.inf)
     share = []

@@ -63,7 +63,9 @@ def warp() -> Any:
     folder = _folder()
     wp.config.log_level = wp.LOG_WARNING  # else it greets on stdout, which is read by programs
     # Not the folder itself: Warp would take the sources there for what an older Warp has left, and warn.
-    wp.config.kernel_cache_dir = str(folder / "kernels")
+    kernels = folder / "kernels"
+    if kernels not in Path(wp.config.kernel_cache_dir or "").parents:  # else it has started, and added its version
+        wp.config.kernel_cache_dir = str(kernels)
     try:
         wp.init()
         folder.mkdir(parents=True, exist_ok=True)

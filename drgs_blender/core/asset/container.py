@@ -133,7 +133,9 @@ def read_asset(path: PathLike, verify: bool = True, faults: list[str] | None = N
         except AssetError as error:
             if faults is None:
                 raise
-            faults.append(f"{error}; its textures are left out, the materials of its vertices are shown")
+            faults.append(
+                f"{str(error).rstrip('.')}; its textures are left out, the materials of its vertices are shown"
+            )
     return asset
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from .model import BASE_CHANNELS, OPTIONAL_CHANNELS, SURFEL_CHANNELS
 
 #: Newest version of the layout. A reader refuses higher ones, because it cannot know what they mean.
-SCHEMA = 4
+SCHEMA = 5
 #: Conventions of all numbers in the file; a file that states others is refused.
 CONVENTIONS = {
     "units": "metre",
@@ -18,6 +18,10 @@ CONVENTIONS = {
     "quaternions": "wxyz",
 }
 TEXTURES = "textures.safetensors"
+#: Its tensors of the optional channels' slots.
+_SLOTS = {
+    "optional_slots": "I32", "optional_factors": "F32", "optional_transforms": "F32", "optional_extensions": "I32",
+}  # fmt: skip
 #: member -> tensor -> dtype; names that end in "/" are families (extras of any name).
 TENSORS: dict[str, dict[str, str]] = {
     "surfels.safetensors": {
@@ -35,7 +39,7 @@ TENSORS: dict[str, dict[str, str]] = {
     "source.safetensors": {"index": "I32", "weights": "F32", "count": "I32", "transform": "F32"},
     TEXTURES: {
         "uvs": "F32", "material": "I32", "slots": "I32", "factors": "F32", "transforms": "F32", "extensions": "I32",
-        "names": "U8", "normals": "F32", "images/": "U8",
+        "names": "U8", "normals": "F32", "images/": "U8", **_SLOTS,
     },
 }  # fmt: skip
 #: (member, tensor) -> the first schema that has it.
@@ -44,12 +48,14 @@ SINCE = {
     **{("mesh.safetensors", name): 3 for name in OPTIONAL_CHANNELS},
     **{("source.safetensors", name): 2 for name in TENSORS["source.safetensors"]},
     **{(TEXTURES, name): 4 for name in TENSORS[TEXTURES]},
+    **{(TEXTURES, name): 5 for name in _SLOTS},
 }
 OPTIONAL_TENSORS = {
     *[("surfels.safetensors", name) for name in ("sh", *SURFEL_CHANNELS)],
     *[("mesh.safetensors", name) for name in OPTIONAL_CHANNELS],
     ("source.safetensors", "transform"),
     (TEXTURES, "normals"),
+    *[(TEXTURES, name) for name in _SLOTS],
 }
 
 

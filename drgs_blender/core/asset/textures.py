@@ -12,9 +12,21 @@ from ..errors import AssetError
 Array = np.ndarray
 
 #: What images of a material are for. Of the roughness the green channel counts, of the metallic the blue one (glTF);
-#: normals are in tangent space (MikkTSpace), 2 RGB - 1, green upwards.
-SLOTS = ("albedo", "roughness", "metallic", "normal")
-ALBEDO, ROUGHNESS, METALLIC, NORMAL = range(4)
+#: normals are in tangent space (MikkTSpace), 2 RGB - 1, green upwards; of opacity and specular the alpha counts where
+#: an image has any, else the red channel; of the coat the red one.
+SLOTS = ("albedo", "roughness", "metallic", "normal", "opacity", "emission", "specular", "coat")
+ALBEDO, ROUGHNESS, METALLIC, NORMAL, OPACITY, EMISSION, SPECULAR, COAT = range(len(SLOTS))
+#: Those whose images are colours, in sRGB; others are linear.
+COLOURED = (ALBEDO, EMISSION)
+#: Columns of the factors of each slot.
+FACTORS = (
+    slice(0, 3), slice(3, 4), slice(4, 5), slice(5, 6), slice(6, 7), slice(7, 10), slice(10, 11), slice(11, 12),
+)  # fmt: skip
+FACTOR_COUNT = FACTORS[-1].stop
+#: Arrays with a column a slot or factor: how many there are of the first four slots, which files had before others.
+_FIRST = {"slots": 4, "factors": 6, "transforms": 4, "extensions": 4}
+#: Before the name of such an array of the other slots in a file, which has them where any material has one.
+OPTIONAL = "optional_"
 #: How images go on outside [0, 1], in the words of `core.materials.Texture`.
 EXTENSIONS = ("repeat", "extend", "mirror")
 #: First bytes of the files that images may be.
@@ -32,18 +44,19 @@ class MeshTextures:
         Coordinates at the corners; v = 0 is the bottom edge of an image.
     material : (m,) int32 array
         Of each face; -1: its materials are those of its vertices.
-    slots : (k, 4) int32 array
+    slots : (k, 8) int32 array
         Images for `SLOTS`, by their order in `images`; -1: values of the vertices, or no normal map.
-    factors : (k, 6) float32 array
-        Times the images: albedo (linear Rec.709), roughness, metallic, strength of the normal map.
-    transforms : (k, 4, 2, 3) float32 array
+    factors : (k, 12) float32 array
+        Times the images: albedo (linear Rec.709), roughness, metallic, strength of the normal map, opacity, emission
+        (linear Rec.709 radiance), specular level, coat.
+    transforms : (k, 8, 2, 3) float32 array
         Map (u, v, 1) to coordinates of each slot's image.
-    extensions : (k, 4) int32 array
-        Rows of `EXTENSIONS`.
+    extensions : (k, 8) int32 array
+        Rows of `EXTENSIONS`. These four arrays may be given of the first four slots alone.
     names : list of str
         Of the materials.
     images : dict of str to (bytes,) uint8 array
-        PNG or JPEG files by name: albedo in sRGB, others linear; alpha is not looked at.
+        PNG or JPEG files by name: albedo and emission in sRGB, others linear; alpha counts where `SLOTS` says so.
     normals : (m, 3, 3) float32 array, optional
         Unit shading normals at the corners, object space, at rest; None: smooth ones of the vertices.
     """
@@ -62,10 +75,15 @@ class MeshTextures:
         self.material = _as(self.material, np.int32, (-1,), "material")
         m, k = len(self.material), len(self.names)
         self.uvs = _as(self.uvs, np.float32, (m, 3, 2), "uvs")
-        self.slots = _as(self.slots, np.int32, (k, 4), "slots")
-        self.factors = _as(self.factors, np.float32, (k, 6), "factors")
-        self.transforms = _as(self.transforms, np.float32, (k, 4, 2, 3), "transforms")
-        self.extensions = _as(self.extensions, np.int32, (k, 4), "extensions")
+        n = len(SLOTS)
+        for name, width, neutral, dtype in (
+            ("slots", n, np.array(-1), np.int32),
+            ("factors", FACTOR_COUNT, np.array(1), np.float32),
+            ("transforms", n, np.eye(2, 3), np.float32),
+            ("extensions", n, np.array(0), np.int32),
+        ):
+            array = _whole(np.asarray(getattr(self, name)), _FIRST[name], width, neutral)
+            setattr(self, name, _as(array, dtype, (k, width, *neutral.shape), name))
         self.images = {name: _as(data, np.uint8, (-1,), f"images/{name}") for name, data in self.images.items()}
         if self.normals is not None:
             self.normals = _as(self.normals, np.float32, (m, 3, 3), "normals")
@@ -77,6 +95,11 @@ class MeshTextures:
             if values.size and (values.min() < low or values.max() >= high):
                 worst = values.min() if values.min() < low else values.max()
                 raise AssetError(f"textures {name}", f"refer to number {int(worst)} of {high}", _REMEDY)
+
+    @property
+    def optional(self) -> tuple[str, ...]:
+        """Optional channels of which a material has an image."""
+        return tuple(SLOTS[slot] for slot in range(OPACITY, len(SLOTS)) if (self.slots[:, slot] >= 0).any())
 
     @property
     def files(self) -> list[tuple[str, Array]]:
@@ -100,6 +123,10 @@ def check_textures(textures: MeshTextures, faces: int, where: str) -> None:
 def tensors_of(textures: MeshTextures) -> dict[str, Array]:
     """All arrays by the names they have in a file."""
     numbers = {name: getattr(textures, name) for name in MeshTextures.__slots__ if name not in ("names", "images")}
+    others = {OPTIONAL + name: numbers[name][:, first:] for name, first in _FIRST.items()}
+    numbers |= {name: numbers[name][:, :first] for name, first in _FIRST.items()}
+    if (others[f"{OPTIONAL}slots"] >= 0).any():
+        numbers |= others
     names = "\n".join(name.replace("\n", " ") for name in textures.names).encode()
     fields = {name: array for name, array in numbers.items() if array is not None}
     fields |= {"names": np.frombuffer(names, np.uint8)}
@@ -110,6 +137,17 @@ def textures_of(tensors: dict[str, Array], faces: int, where: str) -> MeshTextur
     """The inverse of `tensors_of`, for a mesh of `faces`. Raises AssetError where they do not fit."""
     numbers = {name: array for name, array in tensors.items() if "/" not in name and name != "names"}
     images = {name.removeprefix("images/"): data for name, data in tensors.items() if name.startswith("images/")}
+    others = {name: numbers.pop(OPTIONAL + name, None) for name in _FIRST}
+    if any(other is not None for other in others.values()):
+        for name, other in others.items():
+            first = numbers[name]
+            if (
+                other is None
+                or other.ndim < 2
+                or other.shape[:1] + other.shape[2:] != first.shape[:1] + first.shape[2:]
+            ):
+                raise AssetError(f"{where}, {OPTIONAL}{name}", f"does not fit its {name}", _REMEDY)
+            numbers[name] = np.concatenate([first, other], axis=1)
     names = tensors["names"].tobytes().decode(errors="replace").split("\n") if len(tensors["slots"]) else []
     try:
         textures = MeshTextures(**numbers, names=names, images=images)
@@ -124,17 +162,32 @@ def image_suffix(data: Array | bytes) -> str:
     return next((suffix for suffix, magic in _MAGIC.items() if bytes(data[: len(magic)]) == magic), "")
 
 
+def channel_of(slot: int, data: Array) -> str:
+    """Channel that counts of an image file in a slot: "rgb", "r", "g", "b" or "a"."""
+    if slot in (OPACITY, SPECULAR):
+        return "a" if _has_alpha(data.tobytes()) else "r"
+    return {ROUGHNESS: "g", METALLIC: "b", COAT: "r"}.get(slot, "rgb")
+
+
+def _has_alpha(data: bytes) -> bool:
+    """Whether an image file has alpha: of PNG (RFC 2083) the type of its colours says it, or a chunk before these."""
+    if not data.startswith(_MAGIC[".png"]) or len(data) < 26:
+        return False
+    return data[25] in (4, 6) or b"tRNS" in data[: data.find(b"IDAT")]
+
+
 def without(textures: MeshTextures, faces: Array) -> MeshTextures | None:
     """Textures with values of the vertices in some slots of some faces; None where no face has an image left.
 
     Parameters
     ----------
     textures : MeshTextures
-    faces : (m, 4) bool array
+    faces : (m, 8) bool array
         Which slots of which faces.
     """
-    kept, number = split(textures, faces @ (1 << np.arange(4)))
-    parted = (number[:, None] >> np.arange(4)) & 1 > 0
+    bits = np.arange(len(SLOTS))
+    kept, number = split(textures, faces @ (1 << bits))
+    parted = (number[:, None] >> bits) & 1 > 0
     slots = np.where(parted, -1, kept.slots)
     return _used(replace(kept, slots=slots.astype(np.int32)))
 
@@ -168,6 +221,13 @@ def _used(textures: MeshTextures) -> MeshTextures | None:
         names=[name for name, keep in zip(textures.names, used, strict=True) if keep],
         **{name: getattr(textures, name)[used] for name in ("slots", "factors", "transforms", "extensions")},
     )
+
+
+def _whole(array: Array, first: int, count: int, neutral: Array) -> Array:
+    """An array of the `first` columns with neutral ones of the others; any other as it is."""
+    if array.ndim < 2 or array.shape[1] != first or array.shape[2:] != neutral.shape:
+        return array
+    return np.concatenate([array, np.broadcast_to(neutral, (len(array), count - first, *neutral.shape))], axis=1)
 
 
 def _as(values: Any, dtype: type, shape: tuple[int, ...], name: str) -> Array:

@@ -25,7 +25,7 @@ from .world_frame import AXES, check_positions, check_silhouettes, turn_upright
 
 logger = logging.getLogger(__name__)
 
-__all__ = ["AXES", "LAYOUTS", "Reader", "read_capture"]
+__all__ = ["AXES", "LAYOUTS", "Reader", "has_cameras", "read_capture"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +144,15 @@ def find_layout(path: Path) -> Reader:
     if captures:
         raise AssetError(str(path), f"is no capture, but holds some: {first_of(captures)}", "Give one of them")
     raise AssetError(str(path), "is no capture", understood)
+
+
+def has_cameras(path: Path) -> bool:
+    """Whether there are photographs with cameras at `path`, in a layout of `LAYOUTS`, or in a folder below it."""
+    try:
+        inner = [one for one in path.iterdir() if one.is_dir()] if path.is_dir() else []
+        return any(_known(one) for one in (path, *inner))
+    except OSError:
+        return False
 
 
 def _known(path: Path) -> Reader | None:

@@ -6,6 +6,7 @@ and a Z-up world; the others give focal lengths, per file or per frame, and any 
 
 from __future__ import annotations
 
+import logging
 import math
 from collections import Counter
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 
 from ...core.errors import AssetError
 from ...formats.images import image_size
+from ...formats.ply import read_ply
 from .layout import (
     PICTURES,
     Layout,
@@ -27,6 +29,10 @@ from .layout import (
 )
 from .lens import Lens, lens_of
 
+logger = logging.getLogger(__name__)
+
+#: Sparse points that are kept at most.
+MOST_POINTS = 1_000_000
 #: nerfstudio's names of models -> (model, keys of its coefficients)
 _MODELS = {
     "SIMPLE_PINHOLE": ("PINHOLE", ()),
@@ -59,7 +65,7 @@ def read(path: Path) -> Layout:
     """Read a folder, or one file. Raises AssetError."""
     if path.is_file():
         photographs, synthetic = _read_file(path, False, prefix=False)
-        return Layout(photographs, upright=synthetic)
+        return Layout(photographs, synthetic, _points(path))
     row = next(row for row in _FILES if any((path / name).is_file() for name, _ in row))
     photographs, synthetic = [], True
     present = [(path / name, test) for name, test in row if (path / name).is_file()]
@@ -67,11 +73,26 @@ def read(path: Path) -> Layout:
         found, of_blender = _read_file(file, test, prefix=len(present) > 1)
         photographs += found
         synthetic = synthetic and of_blender
-    return Layout(photographs, upright=synthetic)
+    return Layout(photographs, synthetic, _points(present[0][0]))
+
+
+def _points(path: Path) -> np.ndarray | None:
+    """(n, 3) float64 sparse points of the file that `path` names as nerfstudio does, None where it names none."""
+    name = read_json(path).get("ply_file_path")
+    if name is None:
+        return None
+    try:
+        columns = read_ply(path.parent / str(name))[1]["vertex"].columns
+        points = np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=1)
+    except (AssetError, OSError, KeyError) as error:  # they only start a reconstruction
+        logger.warning("%s: names sparse points, %s, that cannot be read and are not used (%s)", path, name, error)
+        return None
+    points = points[np.isfinite(points).all(axis=1)]
+    return points[:: len(points) // MOST_POINTS + 1] if len(points) else None
 
 
 def _read_file(path: Path, test: bool, prefix: bool) -> tuple[list[Photograph], bool]:
-    """(photographs, whether the file is NeRF-synthetic's)."""
+    """(photographs, whether the world is Z up: NeRF-synthetic's, or nerfstudio's that is to stay as it is)."""
     data = read_json(path)
     frames = data.get("frames")
     if isinstance(frames, dict):
@@ -106,7 +127,7 @@ def _read_file(path: Path, test: bool, prefix: bool) -> tuple[list[Photograph], 
         for index, photograph in enumerate(photographs):
             photograph.name = f"{index:04d}-{photograph.name}"
     synthetic = "camera_angle_x" in data and "fl_x" not in data and "fl_x" not in frames[0]
-    return photographs, synthetic
+    return photographs, synthetic or data.get("orientation_override") == "none"
 
 
 def _check_shapes(photographs: list[Photograph], path: Path) -> None:

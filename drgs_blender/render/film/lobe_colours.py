@@ -8,7 +8,7 @@ import numpy as np
 
 from ...compute.jit import njit
 from ...compute.threads import ELEMENTS, over_range
-from ..integrator.bsdf.albedo_tables import albedo_tables, read_2d, read_3d
+from ..integrator.bsdf.albedo_tables import albedo_tables, read_3d
 from ..integrator.bsdf.lobes import (
     AX,
     AY,
@@ -26,6 +26,7 @@ from ..integrator.bsdf.lobes import (
     reflectance,
 )  # fmt: skip
 from ..integrator.bsdf.surface_lobes import put_lobes
+from ..integrator.multiscatter import read_2d
 from ..memory import load_int32
 from ..sampling import ONE, TWO, ZERO
 from ..scene.interaction import Geometry

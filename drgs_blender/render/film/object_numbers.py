@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.frame import Frame
 from ..scene.trace_scene import TraceScene
 
 Array = np.ndarray
@@ -35,16 +34,9 @@ class ObjectNumbers(NamedTuple):
     name: Array
 
 
-def object_numbers(scene: TraceScene, frame: Frame) -> ObjectNumbers:
-    """The numbers of the objects of a frame.
-
-    Parameters
-    ----------
-    scene : TraceScene
-        Brought up to date with the frame.
-    frame : Frame
-    """
-    names = [item.name for item in frame.objects] + [mesh.name for mesh in frame.meshes]
+def object_numbers(scene: TraceScene) -> ObjectNumbers:
+    """The numbers of the objects of a scene."""
+    names = [fault.name for fault in scene.faults]
     numbers = np.array([zlib.crc32(name.encode()) % (_MOST - 1) + 1 for name in names], np.int32)
     return ObjectNumbers(np.arange(len(scene.source), dtype=np.int32), scene.pass_index, numbers[scene.source])
 

@@ -21,6 +21,8 @@ from ...core.passes import AOV_VALUE, AOVS, COLOURS, pass_of
 from ..camera import POSITION
 from ..gbuffer.gbuffer import GBuffer
 from ..integrator import brdf
+from ..integrator.multiscatter import energy_tables, has_multiscatter, lobe_albedo, lobe_weights
+from ..integrator.records import Settings
 from ..sampling import ONE, ZERO, F
 from ..scene.interaction import Geometry
 from ..scene.material_rows import MaterialRows
@@ -94,11 +96,13 @@ class SurfaceFilm:
         points = buffer.points
         diffuse, glossy, passed = (np.zeros((len(points), 3), np.float32) for _ in range(3))
         model = brdf.SHADING_MODELS[self._frame.settings.shading_model]
-        tables = brdf.layer_table(), brdf.schlick_table()
-        over_range(_lobe_colours, len(points), points.arrays, model, tables, diffuse, glossy, fewest=ELEMENTS)
+        geometry = self._scene.geometry
+        settings = Settings(0, model, brdf.layer_table(), *energy_tables(), np.float32(0), 0)
+        given = points.arrays, geometry, settings, brdf.schlick_table()
+        over_range(_lobe_colours, len(points), *given, diffuse, glossy, fewest=ELEMENTS)
         rows = self._scene.mesh_materials.table.rows
         if rows is not None and self._frame.settings.shading_model == "principled":
-            self._put_colours(points, self._scene.geometry, rows, (diffuse, glossy, passed))
+            self._put_colours(points, geometry, rows, (diffuse, glossy, passed))
         unlit = points.flags & UNLIT != 0  # they emit alone
         if unlit.any():
             diffuse[unlit] = glossy[unlit] = passed[unlit] = 0.0
@@ -151,9 +155,11 @@ class SurfaceFilm:
 
 
 @njit
-def _lobe_colours(first, last, points, shading_model, tables, diffuse, glossy):  # type: ignore[no-untyped-def]
-    """Directional albedo of both lobes at some points; diffuse is exactly what the integrator multiplies with."""
-    layers, schlick = tables
+def _lobe_colours(first, last, points, geometry, settings, schlick, diffuse, glossy):  # type: ignore[no-untyped-def]
+    """Directional albedo of both lobes at some points; diffuse is exactly what the integrator multiplies with.
+
+    As in Cycles, glossy is that of the first microfacet's reflection, less what Multiscatter GGX does not make up for.
+    """
     normal, geometric, view = points.normal, points.geometric_normal, points.viewer
     for i in range(first, last):
         vx, vy, vz = view[i, 0], view[i, 1], view[i, 2]
@@ -161,18 +167,20 @@ def _lobe_colours(first, last, points, shading_model, tables, diffuse, glossy): 
             normal[i, 0], normal[i, 1], normal[i, 2], geometric[i, 0], geometric[i, 1], geometric[i, 2], vx, vy, vz
         )
         nv, rough, metal = mx * vx + my * vy + mz * vz, points.roughness[i], points.metallic[i]
-        kd = brdf.diffuse_weight(rough, metal, nv, shading_model, layers)
+        own = points.albedo[i, 0], points.albedo[i, 1], points.albedo[i, 2]
+        multiscatter = len(points.face) > 0 and has_multiscatter(points.face[i], geometry)
+        kd, metals, dielectric = lobe_weights(nv, rough, metal, own, multiscatter, settings)
+        kept = lobe_albedo(nv, rough, settings) if multiscatter else ONE
         s = brdf.layer_albedo(rough, nv, schlick)
         for c in range(3):
-            albedo = points.albedo[i, c]
-            diffuse[i, c] = kd * albedo
-            cut = min(albedo, ONE)
-            if shading_model == brdf.PAPER:
+            diffuse[i, c] = kd * own[c]
+            cut = min(own[c], ONE)
+            if settings.shading_model == brdf.PAPER:
                 base = F(0.04) * (ONE - metal) + metal * cut
                 glossy[i, c] = base + (ONE - base) * s
             else:
-                layer = brdf.layer_albedo(rough, nv, layers)
-                glossy[i, c] = (ONE - metal) * layer + metal * (cut + (ONE - cut) * s)
+                layer = brdf.layer_albedo(rough, nv, settings.layers)
+                glossy[i, c] = dielectric * kept * layer + metals[c] * kept * (cut + (ONE - cut) * s)
 
 
 @njit

@@ -122,38 +122,41 @@ def diffuse_weight(roughness, metallic, nv, shading_model, table):  # type: igno
 
 
 @inlined
-def fresnel(vh, r, g, b, metallic, shading_model):  # type: ignore[no-untyped-def]
+def fresnel(vh, albedo, metal, dielectric, shading_model):  # type: ignore[no-untyped-def]
     """Fresnel reflectance of the specular lobes, dielectric and metallic together; metals end at white, as in Cycles.
 
     Parameters
     ----------
     vh : float32
         Cosine between viewer and half vector.
-    r, g, b : float32
-        Albedo, linear Rec.709; cut at 1.
-    metallic : float32
-        In [0, 1].
+    albedo : tuple of float32
+        Linear Rec.709; cut at 1.
+    metal : tuple of float32
+        Weight of the metal by channel: metallic, in [0, 1], or more of it (`multiscatter.lobe_weights`).
+    dielectric : float32
+        Weight of the dielectric, one minus metallic, or more of it.
     shading_model : int64
         PAPER or PRINCIPLED.
 
     Returns
     -------
     fr, fg, fb : float32
-        In [0, 1], linear Rec.709.
+        Linear Rec.709; in [0, 1] where the weights add up to 1.
     """
-    r, g, b = min(r, ONE), min(g, ONE), min(b, ONE)
+    r, g, b = min(albedo[0], ONE), min(albedo[1], ONE), min(albedo[2], ONE)
+    mr, mg, mb = metal
     x = max(ZERO, ONE - vh)
     s = x * x
     s = s * s * x
     if shading_model == PAPER:
-        dielectric = (ONE - metallic) * _F0
-        r, g, b = dielectric + metallic * r, dielectric + metallic * g, dielectric + metallic * b
+        base = dielectric * _F0
+        r, g, b = base + mr * r, base + mg * g, base + mb * b
         return r + (ONE - r) * s, g + (ONE - g) * s, b + (ONE - b) * s
-    dielectric = (ONE - metallic) * fresnel_dielectric(vh)
+    base = dielectric * fresnel_dielectric(vh)
     return (
-        dielectric + metallic * (r + (ONE - r) * s),
-        dielectric + metallic * (g + (ONE - g) * s),
-        dielectric + metallic * (b + (ONE - b) * s),
+        base + mr * (r + (ONE - r) * s),
+        base + mg * (g + (ONE - g) * s),
+        base + mb * (b + (ONE - b) * s),
     )
 
 
@@ -282,7 +285,7 @@ def sample_vndf(u, v, ix, iy, iz, alpha, bound):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def evaluate(angles, albedo, kd, metallic, a2, norm, shading_model):  # type: ignore[no-untyped-def]
+def evaluate(angles, albedo, weights, a2, norm, shading_model):  # type: ignore[no-untyped-def]
     """Diffuse and specular (RGB each) BRDF values and the pdf of ``sample_vndf``; all without the cosine.
 
     Without branches, so that loops over it vectorise.
@@ -294,10 +297,8 @@ def evaluate(angles, albedo, kd, metallic, a2, norm, shading_model):  # type: ig
         half vector and n. nl > 0; where nv <= 0 the specular lobe is black, as in Cycles.
     albedo : tuple of float
         (r, g, b), linear Rec.709.
-    kd : float32
-        `diffuse_weight`.
-    metallic : float32
-        In [0, 1].
+    weights : tuple
+        (kd, metal, dielectric): `diffuse_weight`, and the weights of `fresnel`.
     a2 : float32
         `alpha_squared`.
     norm : float32
@@ -314,10 +315,11 @@ def evaluate(angles, albedo, kd, metallic, a2, norm, shading_model):  # type: ig
     """
     nl, nv, vl, nh2, sin2 = angles
     r, g, b = albedo
+    kd, metal, dielectric = weights
     k = kd * INVERSE_PI
     value, d = ggx(nl, nv, nh2, sin2, a2)
     value, d = value if nv > ZERO else ZERO, d if nv > ZERO else ZERO
-    fr, fg, fb = fresnel(math.sqrt(max(ZERO, HALF + HALF * vl)), r, g, b, metallic, shading_model)
+    fr, fg, fb = fresnel(math.sqrt(max(ZERO, HALF + HALF * vl)), albedo, metal, dielectric, shading_model)
     return k * r, k * g, k * b, value * fr, value * fg, value * fb, d * norm
 
 

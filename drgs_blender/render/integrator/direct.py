@@ -183,6 +183,7 @@ def _trace_envmap(rays, count, scene, settings, sums):  # type: ignore[no-untype
     if scene.traits.detailed:
         w.soften(rays, count)
     if scene.geometry.terminators != 0:
+        mis.terminator_weights(rays, count, settings, scene.envmap)
         w.terminate(rays, count)
     if scene.traits.lobes_apart:
         mis.balance_heuristic_per_lobe(rays, count)
@@ -255,6 +256,8 @@ def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: igno
             _see_lights(rays, slot, reach, hit, (cosine, ggx), scene, sums)
             mis.balance_heuristic_at(s, i, cosine, ggx)
         s[i + w.LIVE] = through
+        if scene.geometry.terminators != 0:
+            s[i + w.LIVE] *= mis.terminator_part(s, i, cosine, ggx, settings, envmap)
         if through == ONE or settings.bounces == 0:
             continue
         # Light of surfaces is found by these strategies alone: the density of the environment's samples goes out again.

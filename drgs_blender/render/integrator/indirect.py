@@ -17,7 +17,7 @@ from ..lights.light_groups import group_of_environment, group_of_hit, group_of_s
 from ..lights.light_links import emits_to, lights_of, set_of
 from ..lights.light_sampler import emission_along, lights_along
 from ..lights.light_shapes import DIFFUSE, GLOSSY
-from ..lights.product_sampling import product_row
+from ..lights.product_sampling import SIDE, product_row
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
 from ..scene.terminator import terminator_at
@@ -25,6 +25,7 @@ from . import brdf, mis
 from . import wavefront as w
 from .group_sums import clear_groups, credit_lamps_of_path, credit_path
 from .intersect import FAR, light_radiance, meet, passed, put_hit, surface_of
+from .multiscatter import has_multiscatter, lobe_weights
 
 Array = np.ndarray
 
@@ -63,7 +64,6 @@ def _surfaces(rays, count, scene, settings):  # type: ignore[no-untyped-def]
     """Normals and materials where the rays hit. Emission was already added (`direct`, `_onwards`)."""
     s, ints = rays
     tracer, geometry, envmap, extent = scene.tracer, scene.geometry, scene.envmap, scene.traits.extent
-    shading_model, layers = settings.shading_model, settings.layers
     for slot in range(count):
         a, c = w.at(slot)
         vx, vy, vz = s[a + w.VX], s[a + w.VY], s[a + w.VZ]
@@ -85,8 +85,12 @@ def _surfaces(rays, count, scene, settings):  # type: ignore[no-untyped-def]
         s[a + w.OX], s[a + w.OY], s[a + w.OZ] = lifted(s[a + w.OX], s[a + w.OY], s[a + w.OZ], gx, gy, gz, extent)
         s[a + w.AR], s[a + w.AG], s[a + w.AB] = r, g, b
         s[a + w.PATH_SET] = set_of(scene.lights, np.int32(ints[c + w.N0]), np.int32(ints[c + w.OWN]), geometry)
-        s[a + w.METALLIC], s[a + w.A2] = metallic, brdf.alpha_squared(roughness)
-        s[a + w.KD] = brdf.diffuse_weight(roughness, metallic, mx * vx + my * vy + mz * vz, shading_model, layers)
+        s[a + w.A2] = brdf.alpha_squared(roughness)
+        multiscatter = scene.traits.multiscatter and has_multiscatter(np.int32(ints[c + w.N0]), geometry)
+        s[a + w.KD], metal, s[a + w.FD] = lobe_weights(
+            mx * vx + my * vy + mz * vz, roughness, metallic, (r, g, b), multiscatter, settings
+        )
+        s[a + w.FR], s[a + w.FG], s[a + w.FB] = metal
 
 
 @njit
@@ -183,7 +187,11 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
         if through > ZERO:
             u, v = map_at(*direction, envmap)
             red, green, blue = envmap_radiance(u, v, envmap)
-            weight = through / (s[i + w.PG] + envmap_pdf(u, v, ints[c + w.ROW], envmap))
+            density, light = s[i + w.PG], envmap_pdf(u, v, ints[c + w.ROW], envmap)
+            weight = through / (density + light)
+            if scene.geometry.terminators != 0 and w.grazing(s, i) > ZERO:
+                light = envmap_pdf(u, v, U(SIDE * SIDE), envmap)
+                weight = through * density / (density * density + light * light)
             group = group_of_environment(scene.lights)
             _find(scene.lights, found, owner, group, fr * red * weight, fg * green * weight, fb * blue * weight)
         if through < ONE and not last:
@@ -234,6 +242,7 @@ def trace_paths(rays, count, scene, settings, found):  # type: ignore[no-untyped
             w.environment_directions(rays, count, envmap)
             _evaluate(rays, count, scene, shading_model)
             if scene.geometry.terminators != 0:
+                mis.terminator_weights(rays, count, settings, envmap)
                 w.terminate(rays, count)
             mis.path_weights(rays, count, ONE)
             _towards_envmap(rays, count, scene, shift, found)

@@ -31,6 +31,7 @@ from .direct import BATCH, KIND, KINDS, deliver, finish, trace_batch
 from .group_sums import FOUND, MOMENTS, group_columns
 from .indirect import trace_paths
 from .intersect import meshes_alone
+from .multiscatter import energy_tables
 from .records import Sampler, Scene, Settings, Traits
 from .sample_allocation import ALPHA, COUNTS, POINT_STATE, put_sample, write_point_states
 from .variance import variances
@@ -142,10 +143,11 @@ def integrate(
     apart = scene.rays_differ and (auto or min(counts[:2]) > 0)
     shines = not environment.black, lights.count > 0, emissive
     table = scene.mesh_materials.table
-    traits = Traits(extent, *shines, lights.rays_differ, apart, table.detailed, table.clear)
+    traits = Traits(extent, *shines, lights.rays_differ, apart, table.detailed, table.clear, table.multiscatter)
     given = Scene(tracer, geometry, envmap, light_tables, traits)
     clamp = F(settings.clamp_indirect * settings.subpixel_count * part[1] / sum(counts))
-    how = Settings(settings.bounces, brdf.SHADING_MODELS[settings.shading_model], brdf.layer_table(), clamp, 0)
+    tables = brdf.layer_table(), *energy_tables()
+    how = Settings(settings.bounces, brdf.SHADING_MODELS[settings.shading_model], *tables, clamp, 0)
     seed, sequence = U(hash_seed(settings.seed, noise_index)), sampling.point_set(sum(counts) + 1)
     shares = F(environment_part), F(lights_part), _MAX_LIGHT_SHARE if scene.rays_differ else ONE
     sampler = Sampler._make([seed, sequence, settings.subpixel_count, *part, auto, *map(F, counts), *shares])

@@ -336,7 +336,7 @@ def put_hit(tracer, rays, slot, start, hit, key, owner):  # type: ignore[no-unty
     i, c = w.at(slot)
     s[i + w.NX], s[i + w.NY], s[i + w.NZ] = hit.nx, hit.ny, hit.nz
     s[i + w.AR], s[i + w.AG], s[i + w.AB] = hit.r, hit.g, hit.b
-    s[i + w.A2], s[i + w.METALLIC], s[i + w.SIZE] = hit.roughness, hit.metallic, hit.size
+    s[i + w.A2], s[i + w.FR], s[i + w.SIZE] = hit.roughness, hit.metallic, hit.size
     ints[c + w.OWN] = U(hit.owner)
 
 
@@ -399,7 +399,7 @@ def surface_of(tracer, rays, slot, geometry):  # type: ignore[no-untyped-def]
         return _face_of(rays, slot, geometry)
     return (
         s[i + w.NX], s[i + w.NY], s[i + w.NZ], s[i + w.GX], s[i + w.GY], s[i + w.GZ],
-        s[i + w.AR], s[i + w.AG], s[i + w.AB], s[i + w.A2], s[i + w.METALLIC], ZERO, ZERO, ZERO,
+        s[i + w.AR], s[i + w.AG], s[i + w.AB], s[i + w.A2], s[i + w.FR], ZERO, ZERO, ZERO,
         s[i + w.NX], s[i + w.NY], s[i + w.NZ],
     )  # fmt: skip
 

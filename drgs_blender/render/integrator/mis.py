@@ -1,7 +1,8 @@
 """Multiple importance sampling (MIS): the balance heuristic, which joins strategies that sample the same integral.
 
 A sample is divided by the sum, over the strategies that might have drawn it, of number of samples times pdf (Veach
-1997; PBRT 2.2.3): that is its weight over its pdf. The power heuristic, which squares both, is not used. The strategies
+1997; PBRT 2.2.3): that is its weight over its pdf. The power heuristic, which squares both, is used where a picture
+depends on the weights: at the shadow terminator. The strategies
 are cosine and GGX sampling (two lobes of a BRDF), the environment, and lights, whose weight `intersect.light_radiance`
 has, since their visibility is found there.
 """
@@ -9,7 +10,10 @@ has, since their visibility is found there.
 from __future__ import annotations
 
 from ...compute.jit import inlined, njit
-from ..sampling import ONE, F
+from ..lights.environment import envmap_pdf
+from ..lights.product_sampling import SIDE
+from ..sampling import ONE, ZERO, F, U, luminance
+from . import brdf
 from . import wavefront as w
 
 _TINY = F(1e-30)
@@ -88,6 +92,69 @@ def balance_heuristic_per_lobe(rays, count):  # type: ignore[no-untyped-def]
             s[i + w.QR], s[i + w.QG], s[i + w.QB] = s[i + w.QR] * k, s[i + w.QG] * k, s[i + w.QB] * k
             k = ONE / max(s[i + w.WG] * s[i + w.PG] + light, _TINY)
             s[i + w.SR], s[i + w.SG], s[i + w.SB] = s[i + w.SR] * k, s[i + w.SG] * k, s[i + w.SB] * k
+
+
+@njit
+def _light_weight(s, i, settings, envmap):  # type: ignore[no-untyped-def]
+    """Weight that Cycles gives the environment's sample along the direction of the slot at i, by the power heuristic.
+
+    Cycles has one sample by the environment's power alone, and one of the BRDF, with lobes picked by what they reflect
+    towards the viewer.
+    """
+    mv = max(s[i + w.MX] * s[i + w.VX] + s[i + w.MY] * s[i + w.VY] + s[i + w.MZ] * s[i + w.VZ], ZERO)
+    albedo, metal = (s[i + w.AR], s[i + w.AG], s[i + w.AB]), (s[i + w.FR], s[i + w.FG], s[i + w.FB])
+    fr, fg, fb = brdf.fresnel(mv, albedo, metal, s[i + w.FD], settings.shading_model)
+    diffuse, glossy = s[i + w.KD] * luminance(albedo[0], albedo[1], albedo[2]), luminance(fr, fg, fb)
+    density = (diffuse * s[i + w.PC] + glossy * s[i + w.PG]) / max(diffuse + glossy, _TINY)
+    light = envmap_pdf(s[i + w.MU], s[i + w.MV], U(SIDE * SIDE), envmap)
+    return light * light / max(light * light + density * density, _TINY)
+
+
+@njit
+def terminator_weights(rays, count, settings, envmap):  # type: ignore[no-untyped-def]
+    """MIS weights of environment samples whose shadow rays start off the surface (`scene.terminator`).
+
+    Rays of cosine and GGX samples start on the surface and meet other things, so what is seen depends on the weights:
+    they are those of Cycles. No other strategy takes part, see `terminator_part`.
+
+    Parameters
+    ----------
+    rays : Batch
+        As `wavefront.evaluate` left it; both lobes are scaled by the weight, PC and PG set to 0.
+    count : int64
+        Slots.
+    settings : Settings
+    envmap : EnvMap
+    """
+    s = rays.floats
+    for slot in range(count):
+        i, _ = w.at(slot)
+        if w.grazing(s, i) > ZERO:
+            _scale(s, i, _light_weight(s, i, settings, envmap))
+            s[i + w.PC] = s[i + w.PG] = ZERO
+
+
+@njit
+def terminator_part(s, i, cosine, ggx, settings, envmap):  # type: ignore[no-untyped-def]
+    """Factor of the environment's light along a cosine or GGX sample, for the weights of `terminator_weights`.
+
+    Parameters
+    ----------
+    s, i, cosine, ggx : float32 array, int64 or float32
+        As of `balance_heuristic_at`.
+    settings : Settings
+    envmap : EnvMap
+
+    Returns
+    -------
+    float32
+        1 where shadow rays start on the surface.
+    """
+    if not w.grazing(s, i) > ZERO:
+        return ONE
+    others = cosine * s[i + w.WC] * s[i + w.PC] + ggx * s[i + w.WG] * s[i + w.PG]
+    own = ONE - _light_weight(s, i, settings, envmap)
+    return own * (ONE + s[i + w.WE] * s[i + w.PE] / max(others, _TINY))
 
 
 @njit

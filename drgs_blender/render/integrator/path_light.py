@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import inlined, njit
 from ..lights.environment import cell_at, cell_end, direction_in_cell, envmap_pdf, envmap_radiance, first_cell, map_at
 from ..lights.light_groups import group_of_environment, group_of_hit, group_of_sample
 from ..lights.light_links import emits_to, lights_of
 from ..lights.light_sampler import emission_along, lights_along, sample_light
 from ..lights.light_shapes import DIFFUSE, GLOSSY
-from ..lights.product_sampling import block_of, in_cells_order
+from ..lights.product_sampling import SIDE, block_of, in_cells_order
 from ..sampling import ONE, TWO, ZERO, U, mix
 from ..scene import ray_masks
 from ..scene.terminator import terminator_at
@@ -57,6 +57,12 @@ class Scratch(NamedTuple):
     direct: Array
     indirect: Array
     grouped: Array
+
+
+@inlined
+def _power_weight(light, brdf):  # type: ignore[no-untyped-def]
+    """MIS weight of a light sample by the power heuristic, see `mis.terminator_weights`."""
+    return light * light / (light * light + brdf * brdf)
 
 
 @njit
@@ -174,7 +180,8 @@ def weigh_lit(at, direction, scratch, count, scene):  # type: ignore[no-untyped-
     s, value, extent, geometry = scratch.rays.floats, scratch.value, scene.traits.extent, scene.geometry
     pdf = weigh(scratch, count, view, facing, normals, direction, scene.traits.detailed)
     aim(scratch.rays, position, facing, direction, extent)
-    s[w.MOVED] = ZERO
+    s[w.MOVED] = s[w.LIMIT] = s[w.UX] = s[w.UY] = s[w.UZ] = ZERO
+    s[w.PG] = pdf
     if geometry.terminators == 0:
         return pdf
     (gx, gy, gz), (dx, dy, dz), (ux, uy, uz) = facing, direction, normals[1]
@@ -182,6 +189,7 @@ def weigh_lit(at, direction, scratch, count, scene):  # type: ignore[no-untyped-
     if above <= ZERO:
         gx, gy, gz, flat = -gx, -gy, -gz, -flat
     s[w.HX], s[w.HY], s[w.HZ], limit = terminator_at(place[0], place[1], place[2], place[3], gx, gy, gz, geometry)
+    s[w.LIMIT], s[w.NX], s[w.NY], s[w.NZ] = limit, ux, uy, uz
     if not limit > ZERO:
         return pdf
     if above <= ZERO and flat <= ZERO:
@@ -194,7 +202,7 @@ def weigh_lit(at, direction, scratch, count, scene):  # type: ignore[no-untyped-
         s[w.GX], s[w.GY], s[w.GZ] = gx, gy, gz
         if not pdf > ZERO:
             shadow = bump_shadow(normals[0], normals[1], direction) if scene.traits.detailed else ONE
-            evaluate_below(scratch.lobes, count, view, direction, shadow, value)
+            s[w.PG] = evaluate_below(scratch.lobes, count, view, direction, shadow, value)
     part = TWO - (flat + above) / limit if above < limit else ONE - flat / limit
     s[w.MOVED] = min(max(part, ZERO), ONE)
     return pdf
@@ -241,7 +249,7 @@ def towards_envmap(numbers, at, row, throughput, first, scratch, count, scene, s
     scene : Scene
     settings : Settings
     """
-    envmap = scene.envmap
+    envmap, s = scene.envmap, scratch.rays.floats
     n0, n1, n2 = numbers
     block = np.int64(block_of(row, n2, envmap))
     inside, ratio = in_cells_order(row, block, n2, mix(n2), envmap)
@@ -260,6 +268,8 @@ def towards_envmap(numbers, at, row, throughput, first, scratch, count, scene, s
     through = passed(scene, scratch.rays, 0, FAR, np.int32(ray_masks.SHADOW << settings.shift))
     if through > ZERO:
         k = through / (own + pdf)
+        if w.grazing(s, 0) > ZERO:
+            k = through * _power_weight(envmap_pdf(u, v, U(SIDE * SIDE), envmap), s[w.PG]) / own
         light = (r * k, g * k, b * k)
         gather(light, light, throughput, first, group_of_environment(scene.lights), scene.lights, scratch)
 
@@ -359,6 +369,8 @@ def light_along(ray, densities, receiver, row, diffuse, throughput, first, scrat
         u, v = map_at(direction[0], direction[1], direction[2], scene.envmap)
         r, g, b = envmap_radiance(u, v, scene.envmap)
         k = through / (pdf + share * envmap_pdf(u, v, row, scene.envmap))
+        if share > ZERO and w.grazing(scratch.rays.floats, 0) > ZERO:
+            k = through * (ONE - _power_weight(envmap_pdf(u, v, U(SIDE * SIDE), scene.envmap), pdf)) / pdf
         light = k * r, k * g, k * b
         if light[0] + light[1] + light[2] > ZERO:
             gather(light, light, throughput, first, group_of_environment(lights), lights, scratch)

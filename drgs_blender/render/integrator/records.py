@@ -34,6 +34,8 @@ class Traits(NamedTuple):
         Whether surfaces have normal or bump maps.
     clear : bool
         Whether light may pass surfaces.
+    multiscatter : bool
+        Whether surfaces have Multiscatter GGX.
     """
 
     extent: np.float32
@@ -44,6 +46,7 @@ class Traits(NamedTuple):
     lobes_apart: bool
     detailed: bool
     clear: bool
+    multiscatter: bool
 
 
 class Scene(NamedTuple):
@@ -77,6 +80,10 @@ class Settings(NamedTuple):
         One of ``brdf.SHADING_MODELS``.
     layers : (16, 16) float32 array
         ``brdf.layer_table()``.
+    energy : (32, 32) float32 array
+        ``multiscatter.energy_tables()``.
+    mean_energy : (32,) float32 array
+        Their second.
     clamp : np.float32
         Limit of the mean of an indirect sample's channels; 0: none.
     shift : int
@@ -86,6 +93,8 @@ class Settings(NamedTuple):
     bounces: int
     shading_model: int
     layers: Array
+    energy: Array
+    mean_energy: Array
     clamp: np.float32
     shift: int
 

@@ -13,13 +13,15 @@ from . import brdf
 from . import wavefront as w
 from .indirect import lifted
 from .intersect import put_start
+from .multiscatter import has_multiscatter, lobe_weights
 
 #: Strategies in the order of ``RenderSettings``' counts; the samples of the last are divided between environment and
 # lights.
 COSINE, GGX, ENVIRONMENT, LIGHTS = range(4)
-#: Columns of a point's state: start of the rays, alpha squared, diffuse weight, normal m, samples of each strategy.
-ALPHA, WEIGHT, NORMAL, COUNTS = 3, 4, 5, 8
-POINT_STATE = 12
+#: Columns of a point's state: start of the rays, alpha squared, normal m, samples of each strategy, weights of the
+#: lobes (diffuse, metal by channel, dielectric).
+ALPHA, NORMAL, COUNTS, WEIGHTS = 3, 4, 7, 11
+POINT_STATE = 16
 #: Part of the samples that go to the light where the surface is all diffuse, and for a specular lobe; less where that
 #: is narrow: the part is `_LIGHT_GLOSSY` from this alpha on.
 _LIGHT_DIFFUSE, _LIGHT_GLOSSY, _WIDE = F(0.75), F(0.5), F(0.03)
@@ -86,7 +88,7 @@ def write_point_states(first, last, points, scene, settings, sampler, scratch): 
     albedo, roughness, metallic = points.albedo, points.roughness, points.metallic
     state, row = scratch.state, scratch.row
     envmap, extent = scene.envmap, scene.traits.extent
-    shading_model, layers = settings.shading_model, settings.layers
+    shading_model = settings.shading_model
     for i in range(first, last):
         h = i - first
         check = roughness[i] + metallic[i]
@@ -99,12 +101,17 @@ def write_point_states(first, last, points, scene, settings, sampler, scratch): 
         state[h, 0], state[h, 1], state[h, 2] = lifted(origin[i, 0], origin[i, 1], origin[i, 2], gx, gy, gz, extent)
         mx, my, mz = brdf.glossy_normal(normal[i, 0], normal[i, 1], normal[i, 2], gx, gy, gz, vx, vy, vz)
         mv = mx * vx + my * vy + mz * vz
-        weight = brdf.diffuse_weight(roughness[i], metallic[i], mv, shading_model, layers)
-        state[h, ALPHA], state[h, WEIGHT] = brdf.alpha_squared(roughness[i]), weight
+        own = albedo[i, 0], albedo[i, 1], albedo[i, 2]
+        multiscatter = False
+        if scene.traits.multiscatter and len(points.face) > 0:
+            multiscatter = has_multiscatter(points.face[i], scene.geometry)
+        weights = lobe_weights(mv, roughness[i], metallic[i], own, multiscatter, settings)
+        state[h, ALPHA] = brdf.alpha_squared(roughness[i])
+        state[h, WEIGHTS], metal, state[h, WEIGHTS + 4] = weights
+        state[h, WEIGHTS + 1], state[h, WEIGHTS + 2], state[h, WEIGHTS + 3] = metal
         state[h, NORMAL], state[h, NORMAL + 1], state[h, NORMAL + 2] = mx, my, mz
-        r, g, b = albedo[i, 0], albedo[i, 1], albedo[i, 2]
         row[h] = U(product_row(normal[i, 0], normal[i, 1], normal[i, 2], envmap))
-        _allocate(state, h, w.diffuse_share(mv, r, g, b, weight, metallic[i], shading_model), sampler)
+        _allocate(state, h, w.diffuse_share(mv, own, weights, shading_model), sampler)
 
 
 @njit
@@ -130,7 +137,7 @@ def put_sample(scene, rays, slot, points, i, state, h, rate):  # type: ignore[no
     """
     s, ints = rays
     normal, flat, view = points.normal, points.geometric_normal, points.viewer
-    albedo, metallic = points.albedo, points.metallic
+    albedo = points.albedo
     a, c = w.at(slot)
     s[a + w.OX], s[a + w.OY], s[a + w.OZ] = state[h, 0], state[h, 1], state[h, 2]
     s[a + w.NX], s[a + w.NY], s[a + w.NZ] = normal[i, 0], normal[i, 1], normal[i, 2]
@@ -138,7 +145,8 @@ def put_sample(scene, rays, slot, points, i, state, h, rate):  # type: ignore[no
     s[a + w.GX], s[a + w.GY], s[a + w.GZ] = flat[i, 0], flat[i, 1], flat[i, 2]
     s[a + w.VX], s[a + w.VY], s[a + w.VZ] = view[i, 0], view[i, 1], view[i, 2]
     s[a + w.AR], s[a + w.AG], s[a + w.AB] = albedo[i, 0], albedo[i, 1], albedo[i, 2]
-    s[a + w.METALLIC], s[a + w.A2], s[a + w.KD] = metallic[i], state[h, ALPHA], state[h, WEIGHT]
+    s[a + w.A2], s[a + w.KD], s[a + w.FD] = state[h, ALPHA], state[h, WEIGHTS], state[h, WEIGHTS + 4]
+    s[a + w.FR], s[a + w.FG], s[a + w.FB] = state[h, WEIGHTS + 1], state[h, WEIGHTS + 2], state[h, WEIGHTS + 3]
     s[a + w.WC], s[a + w.WG] = state[h, COUNTS + COSINE] * rate, state[h, COUNTS + GGX] * rate
     s[a + w.WE], s[a + w.WL] = state[h, COUNTS + ENVIRONMENT] * rate, state[h, COUNTS + LIGHTS] * rate
     ints[c + w.OWNER] = U(h)

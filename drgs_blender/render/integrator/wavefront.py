@@ -29,21 +29,21 @@ LANES = 16
 # float32 fields, in units of LANES. Position and frame of the surface that a ray leaves (N shading normal, M normal of
 # the specular lobe, G geometric normal, V towards the viewer) ...
 OX, OY, OZ, NX, NY, NZ, MX, MY, MZ, GX, GY, GZ, VX, VY, VZ = (LANES * i for i in range(15))
-# ... its albedo, metallic, alpha squared, weight of the diffuse lobe
-AR, AG, AB, METALLIC, A2, KD = (LANES * i for i in range(15, 21))
+# ... its albedo, weight of the metal by channel and of the dielectric layer, alpha squared, weight of the diffuse lobe
+AR, AG, AB, FR, FG, FB, FD, A2, KD = (LANES * i for i in range(15, 24))
 # the ray's direction, whether there is one (1 or 0), BRDF times cosine (diffuse, specular), density of cosine and GGX
-LX, LY, LZ, LIVE, QR, QG, QB, SR, SG, SB, PC, PG = (LANES * i for i in range(21, 33))
+LX, LY, LZ, LIVE, QR, QG, QB, SR, SG, SB, PC, PG = (LANES * i for i in range(24, 36))
 # where the direction meets the map of the environment, and the density of light sampling
-MU, MV, PE = (LANES * i for i in range(33, 36))
+MU, MV, PE = (LANES * i for i in range(36, 39))
 # of paths: throughput, part of the diffuse lobe in sampling; of light samples: radiance (distance in MU, density in MV)
-TR, TG, TB, SHARE, ER, EG, EB = (LANES * i for i in range(36, 43))
+TR, TG, TB, SHARE, ER, EG, EB = (LANES * i for i in range(39, 46))
 # of a point's samples: how many each strategy draws there; where rays meet surfels: size of those that they start on
-WC, WG, WE, WL, SIZE = (LANES * i for i in range(43, 48))
+WC, WG, WE, WL, SIZE = (LANES * i for i in range(46, 51))
 # where there are normal or bump maps: the shading normal without them, 0 where it is N
-UX, UY, UZ = (LANES * i for i in range(48, 51))
+UX, UY, UZ = (LANES * i for i in range(51, 54))
 # where smooth meshes have a terminator offset: see `scene.terminator`, and the part of it that a shadow ray gets
-HX, HY, HZ, LIMIT, MOVED = (LANES * i for i in range(51, 56))
-PACKET_FLOATS = 56 * LANES
+HX, HY, HZ, LIMIT, MOVED = (LANES * i for i in range(54, 59))
+PACKET_FLOATS = 59 * LANES
 #: Where lights are linked, the set of the surface: of a point's samples, which have no throughput, and of paths.
 POINT_SET, PATH_SET = TR, WL
 # uint32 fields: three random numbers, the key of more, the owner (a point, or a path), a place in a table, the row of
@@ -54,7 +54,7 @@ PACKET_INTS = 8 * LANES
 IN_LANES = (
     "LANES", "PACKET_FLOATS", "PACKET_INTS",
     "OX", "OY", "OZ", "NX", "NY", "NZ", "MX", "MY", "MZ", "GX", "GY", "GZ", "VX", "VY", "VZ",
-    "AR", "AG", "AB", "METALLIC", "A2", "KD",
+    "AR", "AG", "AB", "FR", "FG", "FB", "FD", "A2", "KD",
     "LX", "LY", "LZ", "LIVE", "QR", "QG", "QB", "SR", "SG", "SB", "PC", "PG",
     "MU", "MV", "PE", "TR", "TG", "TB", "SHARE", "ER", "EG", "EB", "WC", "WG", "WE", "WL", "SIZE",
     "UX", "UY", "UZ", "HX", "HY", "HZ", "LIMIT", "MOVED", "POINT_SET", "PATH_SET",
@@ -69,7 +69,7 @@ class Batch(NamedTuple):
 
     Attributes
     ----------
-    floats : (packets * 56 * LANES,) float32 array
+    floats : (packets * 59 * LANES,) float32 array
         Fields from OX to MOVED.
     ints : (packets * 8 * LANES,) uint32 array
         Fields from N0 to OWN.
@@ -389,9 +389,8 @@ def evaluate(rays, count, shading_model):  # type: ignore[no-untyped-def]
             a2 = s[i + A2]
             _, norm = brdf.vndf_terms(max(mv, ZERO), a2)
             angles, albedo = (ml, mv, vl, mh2, sin2), (s[i + AR], s[i + AG], s[i + AB])
-            qr, qg, qb, sr, sg, sb, pg = brdf.evaluate(
-                angles, albedo, s[i + KD], s[i + METALLIC], a2, norm, shading_model
-            )
+            weights = s[i + KD], (s[i + FR], s[i + FG], s[i + FB]), s[i + FD]
+            qr, qg, qb, sr, sg, sb, pg = brdf.evaluate(angles, albedo, weights, a2, norm, shading_model)
             s[i + QR], s[i + QG], s[i + QB] = qr * nl, qg * nl, qb * nl
             above = ml > ZERO
             s[i + SR] = sr * ml if above else ZERO
@@ -429,18 +428,62 @@ def soften(rays, count):  # type: ignore[no-untyped-def]
             s[i + QR], s[i + QG], s[i + QB] = s[i + QR] * g, s[i + QG] * g, s[i + QB] * g
 
 
+@inlined
+def moved_part(above, flat, limit):  # type: ignore[no-untyped-def]
+    """Part of its terminator offset by which the start of a shadow ray is moved.
+
+    Parameters
+    ----------
+    above, flat : float32
+        Cosine between light and smooth normal, and between light and geometric normal.
+    limit : float32
+        Of `terminator.terminator_at`; 0: it is not moved.
+
+    Returns
+    -------
+    float32
+        In [0, 1].
+    """
+    inverse = ONE / max(limit, _TINY)
+    part = TWO - (flat + above) * inverse if above < limit else ONE - flat * inverse
+    return min(max(part, ZERO), ONE) if limit > ZERO and above > ZERO else ZERO
+
+
+@inlined
+def grazing(s, i):  # type: ignore[no-untyped-def]
+    """`moved_part` of light along the direction of the slot at i.
+
+    Parameters
+    ----------
+    s : (packets * 59 * LANES,) float32 array
+        `Batch.floats`.
+    i : int64
+        Index of the slot in it, see `at`.
+
+    Returns
+    -------
+    float32
+        In [0, 1].
+    """
+    lx, ly, lz = s[i + LX], s[i + LY], s[i + LZ]
+    ux, uy, uz = s[i + UX], s[i + UY], s[i + UZ]
+    own = ux * ux + uy * uy + uz * uz > ZERO
+    ux, uy, uz = ux if own else s[i + NX], uy if own else s[i + NY], uz if own else s[i + NZ]
+    return moved_part(ux * lx + uy * ly + uz * lz, s[i + GX] * lx + s[i + GY] * ly + s[i + GZ] * lz, s[i + LIMIT])
+
+
 @njit
 def terminate(rays, count):  # type: ignore[no-untyped-def]
     """Light samples of smooth meshes: where their shadow rays start, and whether there is light below the face.
 
-    As in Cycles the diffuse lobe gets light that is above the smooth normal alone, as far as the shadow ray passes; the
-    other strategies draw none of it. See `scene.terminator`.
+    As in Cycles lobes get light that is above the smooth normal alone, as far as the shadow ray passes; the other
+    strategies draw none of it. See `scene.terminator`.
 
     Parameters
     ----------
     rays : Batch
         G, N or U, LIMIT and LX, LY, LZ are read, and the results of `evaluate`. Written: MOVED, LIVE, and where light
-        is below the face SR, SG, SB, PC, PG.
+        is below the face PC, PG.
     count : int64
         Slots.
     """
@@ -452,18 +495,13 @@ def terminate(rays, count):  # type: ignore[no-untyped-def]
             own = ux * ux + uy * uy + uz * uz > ZERO
             ux, uy, uz = ux if own else s[i + NX], uy if own else s[i + NY], uz if own else s[i + NZ]
             nl, gl = ux * lx + uy * ly + uz * lz, s[i + GX] * lx + s[i + GY] * ly + s[i + GZ] * lz
-            inverse = ONE / max(limit, _TINY)
-            moved = TWO - (gl + nl) * inverse if nl < limit else ONE - gl * inverse
-            moved = min(max(moved, ZERO), ONE)
             any_light = limit > ZERO and nl > ZERO
-            s[i + MOVED] = moved if any_light else ZERO
+            s[i + MOVED] = moved_part(nl, gl, limit)
             below = any_light and gl <= ZERO
-            s[i + SR] = ZERO if below else s[i + SR]
-            s[i + SG] = ZERO if below else s[i + SG]
-            s[i + SB] = ZERO if below else s[i + SB]
             s[i + PC] = ZERO if below else s[i + PC]
             s[i + PG] = ZERO if below else s[i + PG]
-            live = (ONE if s[i + QR] + s[i + QG] + s[i + QB] > ZERO else ZERO) if below else s[i + LIVE]
+            bright = s[i + QR] + s[i + QG] + s[i + QB] + s[i + SR] + s[i + SG] + s[i + SB] > ZERO
+            live = (ONE if bright else ZERO) if below else s[i + LIVE]
             s[i + LIVE] = ZERO if limit > ZERO and nl <= ZERO else live
 
 
@@ -487,19 +525,17 @@ def drop(rays, count, lobe):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def diffuse_share(mv, r, g, b, kd, metallic, shading_model):  # type: ignore[no-untyped-def]
+def diffuse_share(mv, albedo, weights, shading_model):  # type: ignore[no-untyped-def]
     """Probability of sampling the diffuse lobe, from the luminance that both lobes reflect towards the viewer.
 
     Parameters
     ----------
     mv : float32
         Cosine between viewer and normal of the specular lobe.
-    r, g, b : float32
-        Albedo, linear Rec.709.
-    kd : float32
-        `brdf.diffuse_weight`.
-    metallic : float32
-        In [0, 1].
+    albedo : tuple of float32
+        Linear Rec.709.
+    weights : tuple
+        `multiscatter.lobe_weights`.
     shading_model : int64
         One of `brdf.SHADING_MODELS`.
 
@@ -508,8 +544,9 @@ def diffuse_share(mv, r, g, b, kd, metallic, shading_model):  # type: ignore[no-
     float32
         From 0.1 to 0.8; 1 where the viewer is below the normal, 0 without a diffuse lobe.
     """
-    fr, fg, fb = brdf.fresnel(max(mv, ZERO), r, g, b, metallic, shading_model)
-    diffuse = kd * luminance(r, g, b)
+    kd, metal, dielectric = weights
+    fr, fg, fb = brdf.fresnel(max(mv, ZERO), albedo, metal, dielectric, shading_model)
+    diffuse = kd * luminance(albedo[0], albedo[1], albedo[2])
     share = min(max(diffuse / max(diffuse + luminance(fr, fg, fb), _TINY), F(0.1)), F(0.8))
     share = share if mv > ZERO else ONE
     return share if kd > ZERO else ZERO
@@ -532,7 +569,8 @@ def lobe_shares(rays, count, shading_model):  # type: ignore[no-untyped-def]
     for p in range(packets(count)):
         for i in range(p * PACKET_FLOATS, p * PACKET_FLOATS + LANES):
             mv = s[i + MX] * s[i + VX] + s[i + MY] * s[i + VY] + s[i + MZ] * s[i + VZ]
-            s[i + SHARE] = diffuse_share(mv, s[i + AR], s[i + AG], s[i + AB], s[i + KD], s[i + METALLIC], shading_model)
+            weights = s[i + KD], (s[i + FR], s[i + FG], s[i + FB]), s[i + FD]
+            s[i + SHARE] = diffuse_share(mv, (s[i + AR], s[i + AG], s[i + AB]), weights, shading_model)
 
 
 @njit

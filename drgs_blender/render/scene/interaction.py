@@ -67,7 +67,7 @@ class Geometry(NamedTuple):
     instance_object : int
         (p,) int32.
     materials : int
-        (11,) int64, ``mesh_materials.MeshMaterials.addresses``.
+        (12,) int64, ``mesh_materials.MeshMaterials.addresses``.
     terminators : int
         (4,) int64, addresses of `terminator`, or 0 where no object has an offset.
     """

@@ -27,8 +27,9 @@ PARAMETER_COUNT = sum(PARAMETERS.values())
 #: Kinds of materials.
 KINDS = ("principled", "glass", "refraction", "glossy", "diffuse", "translucent", "sheen")
 #: Columns of a row's integers: kind, whether it is thin-walled, Multiscatter GGX, whether the coat has the normal's
-#: details, layer of the directions that highlights follow, whether the weight's texture is inverted; textures.
-KIND, THIN, MULTISCATTER, COAT_DETAILS, ALONG, INVERTED, TEXTURES = range(7)
+#: details, layer of the directions that highlights follow, whether the weight's texture is inverted, whether base
+#: colour, roughness and metallic are those of the shading point; textures.
+KIND, THIN, MULTISCATTER, COAT_DETAILS, ALONG, INVERTED, OF_POINT, TEXTURES = range(8)
 _NAMES = tuple(PARAMETERS)
 INTS = TEXTURES + len(_NAMES)
 #: Largest values of parameters; 1 of what is not here.
@@ -142,7 +143,7 @@ def _ints(
     if material.kind not in KINDS:
         warnings.append(f"{material.name}: kind {material.kind!r} of BSDF is unknown, taken as principled")
     found[THIN], found[MULTISCATTER], found[INVERTED] = material.thin_walled, material.multiscatter, part.inverted
-    found[COAT_DETAILS] = material.coat_details
+    found[COAT_DETAILS], found[OF_POINT] = material.coat_details, material.of_point
     for i, name in enumerate(_NAMES):
         texture = _texture(part, name)
         if texture is not None:

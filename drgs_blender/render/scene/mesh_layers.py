@@ -173,10 +173,7 @@ class MeshLayers:
             if count not in (2, 4):
                 raise UsageError(subject, f"have shape {np.shape(given)}", "Give two or four numbers a corner")
             values = as_float(given, (len(part.faces), 3, count), subject)
-            with np.errstate(over="ignore", invalid="ignore"):
-                bad = 0 if np.isfinite(values.sum()) else int(np.count_nonzero(~np.isfinite(values)))
-            if bad:
-                values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
+            values, bad = finite(values)
             if tangents:
                 assert part.own_normals is not None
                 normals = _at_corners(part, part.own_normals)
@@ -187,6 +184,13 @@ class MeshLayers:
             what = f'values "{name}"' if name else "texture coordinates"
             self.warnings.append(f"{mesh.name}: {known.bad} {what} are not finite; 0 is used")
         return known
+
+
+def finite(values: Array) -> tuple[Array, int]:
+    """`values` with 0 for each that is not finite, and how many these are."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        bad = 0 if np.isfinite(values.sum()) else int(np.count_nonzero(~np.isfinite(values)))
+    return (np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0), bad) if bad else (values, 0)
 
 
 def _given(mesh: MeshState, name: str) -> Array | None:

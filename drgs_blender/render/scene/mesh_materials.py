@@ -14,7 +14,7 @@ from ...core.errors import UsageError
 from ...core.frame import MeshState
 from ...core.materials import Image, Material
 from ..memory import AddressOf, address
-from .mesh_layers import MeshLayers, Placements
+from .mesh_layers import MeshLayers, Placements, finite
 from .object_mesh import ObjectMesh
 from .textures import MaterialTable
 from .trace_mesh import Part, TraceObject
@@ -57,7 +57,7 @@ class MeshMaterials:
         All materials.
     layers : MeshLayers
         What textures and normal maps refer to.
-    addresses : (11,) int64 array
+    addresses : (12,) int64 array
         Of the arrays of `table`, then of the frames of `layers`.
     index : (k,) int32 array
         Material of each face, in `table`.
@@ -76,6 +76,9 @@ class MeshMaterials:
         self._first: list[int] = []  # of each mesh, in `table`
         self._names: list[Any] = []  # of the layers of each mesh
         self._shapes: list[tuple[slice, MeshState]] = []  # and the faces of each
+        #: Texture coordinates by identity, and how many of their numbers are not finite.
+        self._bad_uvs: dict[int, tuple[Array, int]] = {}
+        self._uv_warnings: list[str] = []
         self.clear(0)
 
     def clear(self, count: int) -> None:
@@ -91,7 +94,7 @@ class MeshMaterials:
     @property
     def warnings(self) -> list[str]:
         """Problems of materials, images and layers, in words."""
-        return self.table.warnings + self.layers.warnings
+        return self.table.warnings + self.layers.warnings + self._uv_warnings
 
     def addresses_at(self, address_of: AddressOf) -> Array:
         """`addresses` of arrays that lie elsewhere; who calls it keeps what it returns."""
@@ -157,6 +160,7 @@ class MeshMaterials:
         if any(mesh.uvs is not None for mesh in meshes) and not len(self.uvs):
             self.uvs = np.zeros((len(self.index), 3, 2), np.float32)
             before = [None] * len(before)
+        known, self._bad_uvs, self._uv_warnings = self._bad_uvs, {}, []
         for part, old in zip(parts, before):
             mesh = part.item
             if not isinstance(mesh, MeshState):
@@ -167,7 +171,13 @@ class MeshMaterials:
             if mesh.uvs is None and len(self.uvs):
                 self.uvs[rows] = 0.0
             elif mesh.uvs is not None and (not isinstance(old, MeshState) or old.uvs is not mesh.uvs):
-                self.uvs[rows] = as_float(mesh.uvs, (len(part.faces), 3, 2), f"texture coordinates of {mesh.name}")
+                values = as_float(mesh.uvs, (len(part.faces), 3, 2), f"texture coordinates of {mesh.name}")
+                self.uvs[rows], bad = finite(values)
+                known[id(mesh.uvs)] = mesh.uvs, bad
+            if mesh.uvs is not None and id(mesh.uvs) in known:
+                self._bad_uvs[id(mesh.uvs)] = found = known[id(mesh.uvs)]
+                if found[1]:
+                    self._uv_warnings.append(f"{mesh.name}: {found[1]} texture coordinates are not finite; 0 is used")
         self._first = first
         of_mesh = {part.source - first_source: part for part in parts if isinstance(part.item, MeshState)}
         detailed = [any(_has_frame(material) for material in mesh.materials) for mesh in meshes]

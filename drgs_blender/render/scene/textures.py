@@ -136,13 +136,16 @@ class MaterialTable:
         layers (l, 2) int64, see `mesh_layers.MeshLayers`, which fills it;
         steps (d, 4) int32, kind, texture or -1, layer of the tangents or -1, nothing;
         numbers (d, 8) float32, strength, distance, colour;
-        alphas (k,) float32, without texture.
+        alphas (k,) float32, without texture;
+        multiscatter (k,) int32, whether they have Multiscatter GGX.
     clear : bool
         Whether light may pass anything.
     detailed : bool
         Whether anything has a normal or a bump map.
     emissive : bool
         Whether anything emits light.
+    multiscatter : bool
+        Whether anything has Multiscatter GGX.
     aovs : dict of str to (tuple of array)
         Of `shader_aovs.aov_tables`.
     rows : MaterialRows or None
@@ -196,7 +199,9 @@ class MaterialTable:
             np.array([step for step, _ in self._steps], np.int32).reshape(-1, STEP_INTS),
             np.array([numbers for _, numbers in self._steps], np.float32).reshape(-1, STEP_FLOATS),
             np.array([self._alpha(material) for material in materials] or [1.0], np.float32),
+            np.array([material.multiscatter for material in materials] or [False], np.int32),
         )
+        self.multiscatter = any(material.multiscatter for material in materials)
         self.clear = any(material.clear for material in materials)
         self.emissive = bool((constants[:, 5:] > 0.0).any())
         self.addresses = self.addresses_at(address)[:7]

@@ -28,7 +28,20 @@ def _put(x, y, z, target, i):  # type: ignore[no-untyped-def]
 
 @njit
 def copy_vertices(first, last, source, target):  # type: ignore[no-untyped-def]
-    """Copy usable vertices, put the others at the origin: how many those are, how many moved, largest coordinate."""
+    """Copy usable vertices, put the others at the origin: how many those are, how many moved, largest coordinate.
+
+    Parameters
+    ----------
+    first, last : int
+        Rows, of all.
+    source, target : (n, 3) float32 array
+        Metres; `target` is written.
+
+    Returns
+    -------
+    bad, moved : int
+    reach : float32
+    """
     bad = moved = 0
     reach = np.float32(0.0)
     for i in range(first, last):
@@ -39,7 +52,20 @@ def copy_vertices(first, last, source, target):  # type: ignore[no-untyped-def]
 
 @njit
 def move_vertices(first, last, source, matrix, target):  # type: ignore[no-untyped-def]
-    """As `copy_vertices`, moved by a (3, 4) float64 matrix."""
+    """As `copy_vertices`, moved by a (3, 4) float64 matrix.
+
+    Parameters
+    ----------
+    first, last : int
+        Rows, of all.
+    source, target : (n, 3) float32 array
+    matrix : (3, 4) float64 array
+
+    Returns
+    -------
+    bad, moved : int
+    reach : float32
+    """
     bad = moved = 0
     reach = np.float32(0.0)
     m00, m01, m02, m03 = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]
@@ -66,7 +92,22 @@ def _doubled_area(vertices, faces, f):  # type: ignore[no-untyped-def]
 
 @njit
 def corner_normals(first, last, normals, vertices, faces, out):  # type: ignore[no-untyped-def]
-    """Fill (3 m, 3) `out` with the (m, 3, 3) normals made unit; count the faces without area."""
+    """Fill (3 m, 3) `out` with the (m, 3, 3) normals made unit; count the faces without area.
+
+    Parameters
+    ----------
+    first, last : int
+        Faces, of all.
+    normals : (m, 3, 3) float32 array
+    vertices : (n, 3) float32 array
+    faces : (m, 3) int32 array
+    out : (3 m, 3) float32 array
+        Written; a face's own normal where the given one is unusable.
+
+    Returns
+    -------
+    int
+    """
     empty = 0
     for f in range(first, last):
         gx, gy, gz = _doubled_area(vertices, faces, f)
@@ -90,7 +131,15 @@ def corner_normals(first, last, normals, vertices, faces, out):  # type: ignore[
 
 @njit
 def unit_normals(first, last, normals, out):  # type: ignore[no-untyped-def]
-    """Fill (n, 3) `out` with the normals made unit."""
+    """Fill (n, 3) `out` with the normals made unit.
+
+    Parameters
+    ----------
+    first, last : int
+        Rows, of all.
+    normals, out : (n, 3) float32 array
+        `out` is written, (0, 0, 1) where a normal is unusable.
+    """
     for i in range(first, last):
         x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
         length = np.sqrt(x * x + y * y + z * z)
@@ -104,7 +153,19 @@ def unit_normals(first, last, normals, out):  # type: ignore[no-untyped-def]
 
 @njit
 def count_empty(first, last, vertices, faces):  # type: ignore[no-untyped-def]
-    """Faces without area."""
+    """Faces without area.
+
+    Parameters
+    ----------
+    first, last : int
+        Faces, of all.
+    vertices : (n, 3) float32 array
+    faces : (m, 3) int32 array
+
+    Returns
+    -------
+    int
+    """
     empty = 0
     for f in range(first, last):
         gx, gy, gz = _doubled_area(vertices, faces, f)
@@ -114,7 +175,16 @@ def count_empty(first, last, vertices, faces):  # type: ignore[no-untyped-def]
 
 @njit
 def turn_normals(first, last, normals, matrix, out):  # type: ignore[no-untyped-def]
-    """Unit normals through a (3, 3) matrix of normals; (0, 0, 1) where they have no direction."""
+    """Unit normals through a (3, 3) matrix of normals; (0, 0, 1) where they have no direction.
+
+    Parameters
+    ----------
+    first, last : int
+        Rows, of all.
+    normals, out : (n, 3) float32 array
+        `out` is written.
+    matrix : (3, 3) float64 array
+    """
     for i in range(first, last):
         x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
         a = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z
@@ -131,7 +201,19 @@ def turn_normals(first, last, normals, matrix, out):  # type: ignore[no-untyped-
 
 @njit
 def copy_materials(first, last, vertex, albedo, roughness, metallic, rows):  # type: ignore[no-untyped-def]
-    """Copy the material of vertex[i] to shading row i, within [0, 1]; NaN becomes 0."""
+    """Copy the material of vertex[i] to shading row i, within [0, 1]; NaN becomes 0.
+
+    Parameters
+    ----------
+    first, last : int
+        Shading rows, of all.
+    vertex : (k,) int32 array
+    albedo : (n, 3) float32 array
+        Linear Rec.709.
+    roughness, metallic : (n,) float32 array
+    rows : (k, VERTEX) float32 array
+        Written.
+    """
     for i in range(first, last):
         v = vertex[i]
         for k in range(3):

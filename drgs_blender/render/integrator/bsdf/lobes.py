@@ -265,25 +265,43 @@ def evaluate(b, count, view, light, facing, out):  # type: ignore[no-untyped-def
 
 @njit
 def evaluate_below(b, count, view, light, share, out):  # type: ignore[no-untyped-def]
-    """Add a share of what diffuse lobes make of light below a face that is above their normal.
+    """Add what lobes make of light below a face that is above their normal, a share of it of diffuse ones.
 
     Parameters
     ----------
     b, count, view, light, out : array, int64 or tuple
         As of `evaluate`; `sample` draws no such light.
     share : float32
+
+    Returns
+    -------
+    float32
+        Pdf that `evaluate` would give, sr^-1.
     """
+    pdf = ZERO
     for lobe in range(count):
         k = lobe * LOBE
-        if b[k + KIND] == DIFFUSE:
-            r, g, c, _ = _diffuse(b, k, view[0], view[1], view[2], light[0], light[1], light[2])
-        elif b[k + KIND] == SHEEN:
-            r = g = c = _sheen(b, k, light[0], light[1], light[2])
-        else:
+        kind, place, part = b[k + KIND], 3 * DIFFUSE_CLASS, share
+        if kind == TRANSLUCENT or b[k + DELTA] > ZERO:
             continue
-        out[0] += share * b[k + WEIGHT] * r
-        out[1] += share * b[k + WEIGHT + 1] * g
-        out[2] += share * b[k + WEIGHT + 2] * c
+        if kind == DIFFUSE:
+            r, g, c, own = _diffuse(b, k, view[0], view[1], view[2], light[0], light[1], light[2])
+        elif kind == SHEEN:
+            r = g = c = own = _sheen(b, k, light[0], light[1], light[2])
+        else:
+            r, g, c, own, passes = _microfacets(
+                b, k, local(b, k, view[0], view[1], view[2]), local(b, k, light[0], light[1], light[2])
+            )
+            if passes:
+                continue
+            place, part = 3 * GLOSSY_CLASS, ONE
+        if not own > ZERO:
+            continue
+        out[place] += part * b[k + WEIGHT] * r
+        out[place + 1] += part * b[k + WEIGHT + 1] * g
+        out[place + 2] += part * b[k + WEIGHT + 2] * c
+        pdf += b[k + PROBABILITY] * own
+    return pdf
 
 
 @njit

@@ -6,7 +6,8 @@ import math
 
 from ....compute.jit import inlined, njit
 from ...sampling import ONE, PI, TWO, ZERO, F, basis, luminance
-from .albedo_tables import read_1d, read_2d, read_3d
+from ..multiscatter import read_1d, read_2d
+from .albedo_tables import read_3d
 from .lobes import (
     AX,
     AY,

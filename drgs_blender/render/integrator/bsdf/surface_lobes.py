@@ -11,13 +11,14 @@ from ...memory import load_float, load_int32, load_int64
 from ...sampling import ONE, ZERO, F
 from ...scene.detailed_normal import FRAME, FRAME_INTS, FRAME_TABLE, SLOTS, TURNS
 from ...scene.interaction import place_of, tables_of
-from ...scene.material_rows import ALONG, COAT_DETAILS, MULTISCATTER, THIN
+from ...scene.material_rows import ALONG, COAT_DETAILS, MULTISCATTER, OF_POINT, THIN
 from ...scene.material_rows import KIND as ROW_KIND
 from ...scene.texture_lookup import blend, layer_at
 from .. import brdf
+from ..multiscatter import has_multiscatter
 from .lobes import DIFFUSE, KIND, LOBE, METAL, MIRROR, SHEEN, normalise_probabilities
 from .principled import add_material
-from .surface_parameters import parameters_at, plain_parameters
+from .surface_parameters import parameters_at, plain_parameters, put_base
 
 
 @njit
@@ -88,7 +89,7 @@ def put_lobes(place, base, normals, facing, view, geometry, rows, tables, p, b):
     place : tuple
         Face, instance, and barycentric coordinates of its second and third corner; a face below 0 is of surfels.
     base : tuple of float32
-        Albedo, roughness and metallic of a surface without further lobes.
+        Albedo, roughness and metallic of a surface without further lobes, or of one that has those of its points.
     normals : tuple of tuple
         Shading normal, and that without normal and bump maps; unit, world.
     facing, view : tuple of float32
@@ -121,7 +122,8 @@ def put_lobes(place, base, normals, facing, view, geometry, rows, tables, p, b):
         plain_parameters(base[0], base[1], base[2], base[3], base[4], rows, p)
         all_normals, nowhere = (normal, specular, specular), (ZERO, ZERO, ZERO)
         never = parts < 0  # of the types of the other call, so that one form of `add_material` is compiled
-        count = add_material(b, count, p, np.int32(0), (never, never), all_normals, nowhere, view, ONE, tables)
+        flags = (never, has_multiscatter(face, geometry))
+        count = add_material(b, count, p, np.int32(0), flags, all_normals, nowhere, view, ONE, tables)
         normalise_probabilities(b, count)
         return count, False
     side = side_of(place, facing, geometry)
@@ -129,6 +131,8 @@ def put_lobes(place, base, normals, facing, view, geometry, rows, tables, p, b):
     for part in range(parts):
         row = np.int64(rows.first[material]) + part
         parameters_at(row, where, addresses, rows, p)
+        if rows.ints[row, OF_POINT] == 1:
+            put_base(base, p)
         coated = specular if rows.ints[row, COAT_DETAILS] == 1 else _specular(smooth, facing, view)
         flags = (rows.ints[row, THIN] == 1, rows.ints[row, MULTISCATTER] == 1)
         along = _along(row, material, where, instance, rows, geometry)

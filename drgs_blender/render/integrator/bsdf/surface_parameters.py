@@ -61,5 +61,18 @@ def plain_parameters(r, g, b, roughness, metallic, rows, p):  # type: ignore[no-
     """
     for i in range(PARAMETER_COUNT):
         p[i] = rows.neutral[i]
-    p[COLOUR], p[COLOUR + 1], p[COLOUR + 2] = r, g, b
-    p[ROUGHNESS], p[METALLIC] = roughness, metallic
+    put_base((r, g, b, roughness, metallic), p)
+
+
+@njit
+def put_base(base, p):  # type: ignore[no-untyped-def]
+    """Put base colour, roughness and metallic among parameters.
+
+    Parameters
+    ----------
+    base : tuple of float32
+    p : (PARAMETER_COUNT,) float32 array
+        Written.
+    """
+    p[COLOUR], p[COLOUR + 1], p[COLOUR + 2] = base[0], base[1], base[2]
+    p[ROUGHNESS], p[METALLIC] = base[3], base[4]

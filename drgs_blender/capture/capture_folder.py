@@ -1,0 +1,130 @@
+"""The folder of a capture: pictures, masks, `transforms.json` as nerfstudio has it, sparse points, the report."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image as Pillow
+
+from ..core.asset.archive import replace_by, replace_file
+from ..core.errors import UsageError, WriteError
+from ..reconstruct.readers.layout import decode_mask
+from .pictures import Picture, write_picture
+from .registration import Registration
+from .report import draw_cameras, write_report
+
+#: Files of a finished capture; the last is written last.
+REPORT, DRAWING, POINTS, CAMERAS = "capture.json", "capture.png", "sparse_points.ply", "transforms.json"
+#: Folder of what a run needs to go on; removed when the capture is complete.
+WORK = "registration"
+
+
+def open_folder(folder: Path, source: Path) -> None:
+    """Make the folder of a capture.
+
+    Raises
+    ------
+    UsageError
+        It is the input or inside it, or has files that are not a capture's of ours.
+    WriteError
+        It cannot be made.
+    """
+    if folder.resolve() == source.resolve() or source.resolve() in folder.resolve().parents:
+        raise UsageError(f"--out {folder}", "is the input, or inside it", "Choose another folder")
+    try:
+        if folder.exists() and any(folder.iterdir()) and not _is_ours(folder):
+            raise UsageError(f"--out {folder}", "holds other files", "Choose a new or empty folder")
+        (folder / WORK).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise WriteError(str(folder), f"cannot be made ({error.strerror or error})", "Choose another folder") from error
+
+
+def _is_ours(folder: Path) -> bool:
+    return (folder / WORK).is_dir() or (folder / REPORT).is_file()
+
+
+def complete(folder: Path, digest: str) -> bool:
+    """Whether `folder` has a finished capture of these inputs and settings."""
+    try:
+        report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
+        return bool(report["digest"] == digest and (folder / CAMERAS).is_file())
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def write_capture(
+    folder: Path, pictures: dict[str, Picture], found: Registration, said: list[str], more: dict[str, Any]
+) -> None:
+    """Write the pictures with their cameras, and the report; `transforms.json` comes last.
+
+    Parameters
+    ----------
+    folder : Path
+    pictures : dict of str to Picture
+        Registered file -> picture.
+    found : Registration
+        Z up, ground at 0, metres.
+    said : list of str
+        Lines of the report's drawing.
+    more : dict
+        Further entries of `capture.json`.
+
+    Raises
+    ------
+    WriteError
+        A file cannot be written.
+    """
+    images, masks = folder / "images", folder / "masks"
+    for old in (images, masks):
+        shutil.rmtree(old, ignore_errors=True)
+    (folder / CAMERAS).unlink(missing_ok=True)
+    images.mkdir()
+    frames, notes = [], {}
+    for file, matrix in sorted(found.matrices.items()):
+        picture = pictures[file]
+        lens = found.lenses[file].scaled(*picture.size)
+        found.lenses[file] = lens
+        written = write_picture(picture, images)
+        k = [*lens.coefficients, 0.0, 0.0, 0.0, 0.0]
+        frame: dict[str, Any] = {
+            "file_path": f"images/{written.name}",
+            "transform_matrix": matrix.tolist(),
+            "camera_model": "OPENCV",
+        }
+        frame |= {"w": lens.width, "h": lens.height, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
+        frame |= dict(zip(("k1", "k2", "p1", "p2"), k))
+        if picture.mask is not None:
+            masks.mkdir(exist_ok=True)
+            target = masks / f"{written.stem}.png"
+            drawn = Pillow.fromarray(np.asarray(decode_mask(picture.mask) * 255 + 0.5, np.uint8))
+            replace_by(target, partial(drawn.save, format="PNG"))
+            frame["mask_path"] = f"masks/{target.name}"
+        frames.append(frame)
+        if picture.notes:
+            notes[picture.path.name] = "; ".join(picture.notes)
+        if picture.exif.exposure is not None:
+            frame["exposure_value"] = picture.exif.exposure
+    (folder / POINTS).unlink(missing_ok=True)
+    if len(found.points):
+        _write_points(folder / POINTS, found)
+    draw_cameras(folder / DRAWING, found, said)
+    write_report(folder / REPORT, found, {"notes": notes, **more})
+    # nerfstudio's keys: the world stays as it is (Z up); the points that surfels begin at.
+    text: dict[str, Any] = {"camera_model": "OPENCV", "orientation_override": "none", "frames": frames}
+    if len(found.points):
+        text["ply_file_path"] = POINTS
+    replace_file(folder / CAMERAS, [json.dumps(text, indent=1).encode()])
+
+
+def _write_points(path: Path, found: Registration) -> None:
+    """Sparse points as binary PLY."""
+    rows = np.empty(len(found.points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    rows["xyz"], rows["rgb"] = found.points, found.colours
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [f"property float {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
+    replace_file(path, ["\n".join([*header, "end_header\n"]).encode("ascii"), rows.tobytes()])

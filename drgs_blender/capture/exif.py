@@ -1,0 +1,93 @@
+"""EXIF metadata of photographs: orientation, focal length, exposure, camera."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from PIL import ExifTags
+from PIL import Image as Pillow
+
+#: Diagonal of a full-frame sensor, mm: "35 mm equivalent" focal lengths mean the angle of view along it (CIPA DCG-001).
+_FULL_FRAME = math.hypot(36.0, 24.0)
+#: Focal-plane resolution units in mm; EXIF 2.3 table 8.
+_UNITS = {2: 25.4, 3: 10.0, 4: 1.0}
+
+
+@dataclass(frozen=True, slots=True)
+class Metadata:
+    """Metadata of one photograph.
+
+    Attributes
+    ----------
+    orientation : int
+        1 to 8, EXIF's; 1 without.
+    focal : float, optional
+        Focal length in parts of the picture's longer side; None where it is not known.
+    camera : str
+        Maker, model, lens and focal length; "" where nothing is known. Equal texts are one lens.
+    exposure : float, optional
+        Exposure value at ISO 100, stops: log2(N^2 / t) - log2(ISO / 100). Larger lets in less light.
+    """
+
+    orientation: int = 1
+    focal: float | None = None
+    camera: str = ""
+    exposure: float | None = None
+
+
+def read_exif(image: Pillow.Image) -> Metadata:
+    """The metadata of an open picture; damaged ones count as none."""
+    try:
+        base = image.getexif()
+        details = base.get_ifd(ExifTags.IFD.Exif)
+    except Exception:  # damaged metadata raise almost anything; the pixels are sound
+        return Metadata()
+    orientation = base.get(ExifTags.Base.Orientation, 1)
+    focal = _focal(details, *image.size)
+    names = [base.get(ExifTags.Base.Make), base.get(ExifTags.Base.Model), details.get(ExifTags.Base.LensModel)]
+    words = [str(name).strip("\0 ") for name in names if name]
+    millimetres = _number(details.get(ExifTags.Base.FocalLength))
+    if words and millimetres:
+        words.append(f"{millimetres:g} mm")
+    return Metadata(
+        orientation if orientation in range(1, 9) else 1,
+        focal if focal is not None and 0.2 < focal < 50 else None,
+        " ".join(words),
+        _exposure(details),
+    )
+
+
+def _number(value: Any) -> float | None:
+    """A finite number above zero, else None."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def _focal(details: Any, width: int, height: int) -> float | None:
+    """Focal length in parts of the longer side."""
+    equivalent = _number(details.get(ExifTags.Base.FocalLengthIn35mmFilm))
+    longer = max(width, height)
+    if equivalent:
+        return equivalent / _FULL_FRAME * math.hypot(width, height) / longer
+    millimetres = _number(details.get(ExifTags.Base.FocalLength))
+    density = _number(details.get(ExifTags.Base.FocalPlaneXResolution))
+    unit = _UNITS.get(details.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
+    across = _number(details.get(ExifTags.Base.ExifImageWidth)) or longer
+    if millimetres and density and unit:
+        return millimetres * density / unit / max(across, _number(details.get(ExifTags.Base.ExifImageHeight)) or 0)
+    return None
+
+
+def _exposure(details: Any) -> float | None:
+    aperture = _number(details.get(ExifTags.Base.FNumber))
+    seconds = _number(details.get(ExifTags.Base.ExposureTime))
+    speed = details.get(ExifTags.Base.ISOSpeedRatings)
+    iso = _number(speed[0] if isinstance(speed, tuple) and speed else speed)
+    if not (aperture and seconds and iso):
+        return None
+    return math.log2(aperture**2 / seconds) - math.log2(iso / 100)

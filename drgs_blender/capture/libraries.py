@@ -1,0 +1,50 @@
+"""Optional libraries of the front end: structure from motion, markers, video, camera raw."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from typing import Any, NamedTuple
+
+import PIL.Image  # noqa: F401 - before pycolmap: loaded after it, Pillow waits for a lock of its own libraries forever
+
+from ..core.errors import DeviceError
+
+
+class Library(NamedTuple):
+    """A library: its module, its package with the versions that are known to work, its purpose."""
+
+    module: str
+    package: str
+    purpose: str
+
+
+#: The table; versions as in the extra "capture" of pyproject.toml.
+LIBRARIES = {
+    "pycolmap": Library("pycolmap", "pycolmap>=4.2,<4.3", "structure from motion"),
+    "opencv": Library("cv2", "opencv-python-headless>=4.10", "marker sheets"),
+    "av": Library("av", "av>=14", "video"),
+    "rawpy": Library("rawpy", "rawpy>=0.24", "camera raw files"),
+}
+
+
+def load(name: str) -> Any:
+    """The module of a row of `LIBRARIES`.
+
+    Raises
+    ------
+    DeviceError
+        It is not installed; the message has the command that installs it.
+    """
+    library = LIBRARIES[name]
+    try:
+        module = importlib.import_module(library.module)
+    except ImportError as error:
+        raise DeviceError(
+            library.purpose,
+            f"needs {name}, which cannot be loaded ({error})",
+            f'Install it: "{sys.executable}" -m pip install "{library.package}"',
+        ) from error
+    if name == "pycolmap":
+        module.logging.minloglevel = module.logging.Level.FATAL.value  # its errors arrive as exceptions
+    return module

@@ -1,0 +1,297 @@
+"""Pictures of a folder: found with their masks, decoded to upright sRGB, written as a capture's."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import logging
+import re
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import tifffile
+from PIL import Image as Pillow
+from PIL import UnidentifiedImageError
+
+from ..core.arrays import Array
+from ..core.asset.archive import replace_by
+from ..core.color import linear_to_srgb, to_unit
+from ..core.errors import AssetError, first_of
+from ..formats.exr import read_exr
+from ..formats.images import load_image
+from ..reconstruct.readers.layout import PICTURES, decode_mask, find_mask
+from . import libraries
+from .exif import Metadata, read_exif
+
+logger = logging.getLogger(__name__)
+
+#: Extensions, lower case.
+PHOTOGRAPHS = frozenset(end.lower() for end in PICTURES)
+RAW = frozenset((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"))
+LINEAR = frozenset((".exr",))
+VIDEOS = frozenset((".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts"))
+#: Of other programs' photographs: named, not read.
+UNREAD = frozenset((".heic", ".heif", ".avif", ".hdr", ".jxl"))
+#: Where the photographs of a folder are, the first that has some.
+_FOLDERS = ("images", "photos", "input", ".")
+_QUALITY = 97
+#: EXIF orientation -> (quarter turns counter-clockwise, mirrored left to right afterwards); EXIF 2.3 figure 19.
+_TURNS = {1: (0, 0), 2: (0, 1), 3: (2, 0), 4: (2, 1), 5: (3, 1), 6: (3, 0), 7: (1, 1), 8: (1, 0)}
+
+
+@dataclass(slots=True)
+class Picture:
+    """One photograph of the input.
+
+    Attributes
+    ----------
+    path : Path
+        File.
+    name : str
+        Stem, unique in the input.
+    mask : Path, optional
+        File of its mask.
+    exif : Metadata
+    size : tuple of int
+        Width and height, pixels, upright.
+    notes : list of str
+        What is unusual about it, for the report.
+    """
+
+    path: Path
+    name: str
+    mask: Path | None = None
+    exif: Metadata = field(default_factory=Metadata)
+    size: tuple[int, int] = (0, 0)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def lens(self) -> tuple[int, int, str]:
+        """Pictures with equal values share one lens: size and camera."""
+        return (*self.size, self.exif.camera)
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """Sorting key by which r_2 comes before r_10."""
+    return [(int(part or -1), text) for text, part in re.findall(r"(\D*)(\d*)", name)]
+
+
+def find_video(source: Path) -> Path | None:
+    """The video that is `source`, or the only one in that folder where it has no photographs."""
+    if source.is_file():
+        return source if source.suffix.lower() in VIDEOS else None
+    if not source.is_dir() or _photographs(source):
+        return None
+    videos = [path for path in sorted(source.iterdir()) if path.suffix.lower() in VIDEOS]
+    if len(videos) > 1:
+        raise AssetError(str(source), f"has {len(videos)} videos ({first_of([v.name for v in videos])})", "Give one")
+    return videos[0] if videos else None
+
+
+def has_pictures(source: Path) -> bool:
+    """Whether there are photographs, or a video, without cameras at `source`."""
+    try:
+        return bool(_photographs(source)) or find_video(source) is not None
+    except (OSError, AssetError):
+        return False
+
+
+def _photographs(source: Path) -> list[Path]:
+    """The photographs of a folder in the order of their names, those that cannot be read left out and named."""
+    if not source.is_dir():
+        return []
+    for folder in (source / name for name in _FOLDERS):
+        if folder.is_dir():
+            files = [p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")]
+            found = [p for p in files if p.suffix.lower() in PHOTOGRAPHS | RAW | LINEAR]
+            if found:
+                return sorted(found, key=lambda path: natural(path.name))
+    return []
+
+
+def find_pictures(source: Path) -> list[Picture]:
+    """The photographs of a folder (or of its `images`) with their masks (of `masks`).
+
+    Raises
+    ------
+    AssetError
+        There are none, or masks have another shape than their photographs.
+    """
+    paths = _photographs(source)
+    if not paths:
+        raise AssetError(
+            str(source), "has no photographs", f"Known are {', '.join(sorted(PHOTOGRAPHS | LINEAR | RAW))}"
+        )
+    unread = [p.name for p in sorted(paths[0].parent.iterdir()) if p.suffix.lower() in UNREAD]
+    if unread:
+        logger.warning(
+            "%s: %d files cannot be read and are left out: %s. Convert them to JPEG, PNG, TIFF or EXR",
+            source, len(unread), first_of(unread),
+        )  # fmt: skip
+    raw = [path.name for path in paths if path.suffix.lower() in RAW]
+    beside = {path.stem for path in paths if path.suffix.lower() not in RAW}
+    paths = [path for path in paths if path.suffix.lower() not in RAW or path.stem not in beside]
+    if raw and not _has_rawpy():
+        logger.warning(
+            "%s: %d camera raw files are left out%s: %s. Reading them needs rawpy (pip install rawpy)",
+            source, len(raw), " where no developed picture is beside them" if beside else "", first_of(raw),
+        )  # fmt: skip
+        paths = [path for path in paths if path.suffix.lower() not in RAW]
+    root = paths[0].parent.parent if paths and paths[0].parent.name in _FOLDERS else source
+    pictures, broken, names = [], [], set()
+    for path in paths:
+        name = path.stem if path.stem not in names else path.name.replace(".", "_")
+        names.add(name)
+        mask = find_mask(root / "masks", path) or find_mask(source / "masks", path)
+        try:
+            pictures.append(_described(Picture(path, name, mask)))
+        except AssetError as error:
+            broken.append(f"{path.name} ({error.problem})")
+    if broken:
+        if 2 * len(broken) > len(paths):
+            raise AssetError(
+                str(source), f"has {len(broken)} of {len(paths)} pictures that cannot be read: {first_of(broken)}"
+            )
+        logger.warning("%s: %d pictures cannot be read and are left out: %s", source, len(broken), first_of(broken))
+    _check_masks(pictures, source)
+    return pictures
+
+
+def _has_rawpy() -> bool:
+    try:
+        libraries.load("rawpy")
+    except Exception:  # also where its own library does not load
+        return False
+    return True
+
+
+def _described(picture: Picture) -> Picture:
+    """The picture with its metadata and size, from the header alone where that has them."""
+    suffix = picture.path.suffix.lower()
+    if suffix in LINEAR or suffix in RAW:
+        height, width = decode(picture).shape[:2]
+        picture.size = width, height
+        return picture
+    try:
+        with Pillow.open(picture.path) as image:
+            picture.exif = read_exif(image)
+            width, height = image.size
+    except UnidentifiedImageError:  # TIFF with floats
+        height, width = decode(picture).shape[:2]
+    except (OSError, ValueError, SyntaxError) as error:
+        raise AssetError(str(picture.path), f"is no image that can be read ({error})") from error
+    picture.size = (height, width) if picture.exif.orientation >= 5 else (width, height)
+    return picture
+
+
+def _check_masks(pictures: list[Picture], source: Path) -> None:
+    """Raise AssetError where a mask has another shape than its photograph; name those without one."""
+    masked = [picture for picture in pictures if picture.mask]
+    for picture in masked:
+        assert picture.mask is not None
+        height, width = decode_mask(picture.mask).shape
+        w, h = picture.size
+        if abs(width / w - height / h) * max(w, h) > 2:
+            turned = abs(width / h - height / w) * max(w, h) <= 2
+            problem = f"is {width} x {height} pixels, {picture.path.name} {w} x {h}"
+            remedy = "Draw the mask over the turned picture" if turned else "Draw it over the whole photograph"
+            raise AssetError(str(picture.mask), problem, remedy)
+    if masked and len(masked) < len(pictures):
+        without = [picture.path.name for picture in pictures if not picture.mask]
+        logger.warning("%s: %d of %d pictures have no mask: %s", source, len(without), len(pictures), first_of(without))
+
+
+def decode(picture: Picture) -> Array:
+    """(h, w, 3 or 4) uint8, uint16 (sRGB-encoded) or float32 (linear Rec.709), upright, row 0 at the top.
+
+    Raises
+    ------
+    AssetError
+        The file cannot be read.
+    """
+    suffix = picture.path.suffix.lower()
+    if suffix in LINEAR:
+        pixels = read_exr(picture.path)[0]
+    elif suffix in RAW:
+        with libraries.load("rawpy").imread(str(picture.path)) as raw:
+            return np.asarray(raw.postprocess(use_camera_wb=True, no_auto_bright=True))
+    else:
+        pixels = load_image(picture.path)
+    if pixels.dtype.kind == "f":
+        return pixels  # already turned where it is TIFF
+    return upright(pixels, picture.exif.orientation)
+
+
+def upright(pixels: Array, orientation: int) -> Array:
+    """Pixels (h, w, ...) turned as EXIF's `orientation` says."""
+    turns, mirrored = _TURNS[orientation]
+    pixels = np.rot90(pixels, turns)
+    return np.ascontiguousarray(pixels[:, ::-1] if mirrored else pixels)
+
+
+def shown(pixels: Array) -> Array:
+    """(h, w, 3) uint8 sRGB of `decode`: floats are clipped at white, alpha is laid on black."""
+    if pixels.dtype.kind == "f":
+        colour = linear_to_srgb(np.clip(pixels[..., :3], 0, 1))
+    else:
+        colour = to_unit(pixels[..., :3])
+    if pixels.shape[2] == 4:
+        alpha = pixels[..., 3:]
+        colour = colour * (to_unit(alpha) if alpha.dtype.kind == "u" else np.clip(alpha, 0, 1))
+    return np.asarray(colour * 255 + 0.5, np.uint8)
+
+
+def reduced(pixels: Array, longest: int) -> Array:
+    """(h, w, 3) uint8 at most `longest` pixels on the longer side, by area."""
+    height, width = pixels.shape[:2]
+    factor = longest / max(width, height)
+    if factor >= 1:
+        return pixels
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    return np.asarray(Pillow.fromarray(pixels).resize(size, Pillow.Resampling.BOX))
+
+
+def write_picture(picture: Picture, folder: Path) -> Path:
+    """Write a photograph into `folder`, upright; the file's path.
+
+    A file that is upright already is copied as it is. Others stay JPEG, or become PNG, of more than 8 bits TIFF.
+    """
+    suffix = picture.path.suffix.lower()
+    plain = suffix in PHOTOGRAPHS and picture.exif.orientation == 1
+    if plain:
+        target = folder / f"{picture.name}{suffix}"
+        replace_by(target, lambda path: shutil.copyfile(picture.path, path))
+        return target
+    pixels = decode(picture)
+    if pixels.dtype == np.uint8 and suffix in (".jpg", ".jpeg"):
+        target = folder / f"{picture.name}.jpg"
+        encoded = io.BytesIO()
+        Pillow.fromarray(pixels).save(encoded, "JPEG", quality=_QUALITY, subsampling=0)
+        replace_by(target, lambda path: path.write_bytes(encoded.getvalue()))
+        return target
+    if pixels.dtype == np.uint8:
+        target = folder / f"{picture.name}.png"
+        replace_by(target, lambda path: Pillow.fromarray(pixels).save(path, "PNG"))
+        return target
+    if pixels.dtype.kind == "f":
+        above = float((pixels[..., :3].max(axis=2) > 1).mean())
+        if above > 1e-3:
+            picture.notes.append(f"{above:.1%} of its pixels are brighter than white and clipped")
+        colour = linear_to_srgb(np.clip(pixels[..., :3], 0, 1))
+        pixels = np.asarray(np.dstack([colour, np.clip(pixels[..., 3:], 0, 1)]) * 65535 + 0.5, np.uint16)
+    target = folder / f"{picture.name}.tif"
+    replace_by(target, lambda path: tifffile.imwrite(path, pixels, photometric="rgb", compression="zlib"))
+    return target
+
+
+def digest(pictures: list[Picture], *settings: object) -> str:
+    """Fingerprint of the inputs: names, sizes and times of pictures and masks, and settings."""
+    found = hashlib.sha256(repr(settings).encode())
+    for picture in pictures:
+        for path in (picture.path, picture.mask):
+            if path is not None:
+                stat = path.stat()
+                found.update(f"{path.resolve()}|{stat.st_size}|{stat.st_mtime_ns}|{picture.name}\n".encode())
+    return found.hexdigest()

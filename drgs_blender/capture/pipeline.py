@@ -1,0 +1,257 @@
+"""From photographs or a video to a capture: frames, inspection, cameras, world, folder."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..core.errors import AssetError, UsageError, first_of
+from . import capture_folder, features, marker_poses, pictures, video
+from .features import Photo, Tell
+from .inspection import inspect
+from .marker_sheet import MarkerSheet, recognise
+from .pictures import Picture
+from .preparation import Prepared, has_opencv, prepare
+from .registration import FEWEST, Registration, register
+from .world_alignment import Alignment, align_to_ground, align_to_markers
+
+logger = logging.getLogger(__name__)
+
+POSES = ("auto", "markers", "features")
+#: Part of the pictures that must show the sheet for it alone to give the cameras.
+_MARKED = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Settings of `make_capture`.
+
+    Attributes
+    ----------
+    frames : int
+        Of a video that are used, about.
+    size : int
+        Pixels of the longer side at which features are found.
+    poses : str
+        One of `POSES`: cameras from a marker sheet or from features; auto: the sheet, where most pictures show it.
+    marker_length : float, optional
+        Side of the sheet's black squares as measured, mm; None: printed in true size.
+    distance : float, optional
+        Median distance of the cameras from the object, metres, where no sheet gives the scale.
+    """
+
+    frames: int = video.DEFAULT_FRAMES
+    size: int = 1600
+    poses: str = "auto"
+    marker_length: float | None = None
+    distance: float | None = None
+
+
+@dataclass(slots=True)
+class Made:
+    """A capture that was made: how many pictures, of how many, what was left out and why, what it rests on."""
+
+    folder: Path
+    pictures: int
+    of: int
+    left_out: dict[str, str]
+    method: str
+    error: float
+    alignment: Alignment | None = None
+    kept: bool = False
+    lines: list[str] = field(default_factory=list)
+
+
+def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, cancelled: Callable[[], bool]) -> Made:
+    """Make a capture with cameras, in a folder that `reconstruct` reads.
+
+    A run that was stopped goes on where it was when it is called again with the same inputs and settings.
+
+    Parameters
+    ----------
+    source : Path
+        Folder of photographs (or with `images`, and `masks` beside it), video, or folder with one.
+    folder : Path
+        To write.
+    settings : Settings
+    tell : callable
+        Called as (phase, part done).
+    cancelled : callable
+
+    Raises
+    ------
+    AssetError
+        Pictures cannot be used, or too few can be registered.
+    UsageError
+        `folder` is not free.
+    DeviceError
+        A library is not installed.
+    Cancelled
+        `cancelled` said so.
+    """
+    if not source.exists():
+        raise AssetError(str(source), "does not exist", "Check the path")
+    capture_folder.open_folder(folder, source)
+    work = folder / capture_folder.WORK
+    film = pictures.find_video(source)
+    given = pictures.find_pictures(source) if film is None else [Picture(film, film.stem)]
+    digest = pictures.digest(given, settings)
+    if capture_folder.complete(folder, digest):
+        shutil.rmtree(work, ignore_errors=True)
+        return Made(folder, 0, 0, {}, "", 0.0, kept=True, lines=[f"{folder}: is made of the same pictures already"])
+    _keep_work(work, digest)
+    if film is not None:
+        given = _frames(film, work, settings.frames, _part(tell, 0.0, 0.1), cancelled)
+    seek = settings.poses != "features"
+    ready = prepare(given, work, settings.size, seek, _part(tell, 0.1, 0.2), cancelled)
+    fit, left_out = inspect(ready.pictures, ready.looks, str(source))
+    left_out |= ready.broken
+    photos = [photo for photo, picture in zip(ready.photos, ready.pictures) if any(picture is one for one in fit)]
+    by_file = {photo.file: picture for photo, picture in zip(ready.photos, ready.pictures)}
+    found, alignment = _cameras(ready, photos, film is not None, source, settings, _part(tell, 0.2, 0.95), cancelled)
+    alignment.apply(found)
+    for photo in photos:
+        if photo.file not in found.matrices:
+            left_out[by_file[photo.file].path.name] = "not registered"
+    made = Made(folder, len(found.matrices), len(given), left_out, found.method, 0.0, alignment)
+    made.error = sum(found.errors.values()) / len(found.errors)
+    made.lines = _lines(made)
+    _tell_left_out(found, photos, by_file, source)
+    tell("writing the capture", 0.96)
+    more = {
+        "digest": digest,
+        "method": found.method,
+        "left_out": left_out,
+        "scale": alignment.scale_from,
+        "up": alignment.up_from,
+        "ground": alignment.ground_from,
+        "error": round(made.error, 4),
+    }
+    said = [f"{source.name}: {made.lines[0]}", *made.lines[1:]]
+    capture_folder.write_capture(folder, by_file, found, said, more)
+    shutil.rmtree(work, ignore_errors=True)
+    return made
+
+
+def _part(tell: Tell, start: float, end: float) -> Tell:
+    """`tell` for one part of the work."""
+    return lambda phase, part: tell(phase, start + (end - start) * part)
+
+
+def _keep_work(work: Path, digest: str) -> None:
+    """Empty the folder of work unless it is that of the same inputs and settings."""
+    mark = work / "inputs"
+    if not mark.is_file() or mark.read_text(encoding="utf-8") != digest:
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir(parents=True)
+        mark.write_text(digest, encoding="utf-8")
+
+
+def _frames(film: Path, work: Path, count: int, tell: Tell, cancelled: Callable[[], bool]) -> list[Picture]:
+    """The frames of a video as pictures; written once."""
+    folder, done = work / "frames", work / "frames.done"
+    if not done.is_file():
+        shutil.rmtree(folder, ignore_errors=True)
+        video.extract_frames(film, folder, count, tell, cancelled)
+        done.touch()
+    return pictures.find_pictures(folder)
+
+
+def _cameras(ready: Prepared, photos: list[Photo], ordered: bool, source: Path, settings: Settings, tell: Tell,
+             cancelled: Callable[[], bool]) -> tuple[Registration, Alignment]:  # fmt: skip
+    """Cameras, from a marker sheet or from features, and the world they belong in."""
+    sheet = None
+    marked: Registration | None = None
+    numbers = {number for photo in photos for number in ready.markers.get(photo.file, ())}
+    if settings.poses != "features" and (paper := recognise(numbers)):
+        sheet = MarkerSheet(paper, settings.marker_length)
+        marked = marker_poses.poses_from_markers(sheet, ready.markers, photos)
+        logger.info("%s: %d of %d pictures show the %s marker sheet", source, len(marked.matrices), len(photos), paper)
+    if settings.poses == "markers" and (marked is None or len(marked.matrices) < FEWEST):
+        count = 0 if marked is None else len(marked.matrices)
+        needed = "" if has_opencv() else "OpenCV is not installed: pip install opencv-python-headless. "
+        raise AssetError(
+            str(source),
+            f"shows a marker sheet in {count} pictures, of {FEWEST} that are needed",
+            f"{needed}Print one (drgs markers), keep it flat, and let each picture show several markers",
+        )
+    if marked is not None and sheet is not None:
+        enough = len(marked.matrices) >= max(FEWEST, _MARKED * len(photos))
+        if settings.poses == "markers" or enough:
+            return marked, _of_sheet(sheet)
+    database = ready.folder.with_name("database.db")
+    masked = ready.masks is not None
+    try:
+        features.extract(database, ready.folder, ready.masks, photos, _part(tell, 0.0, 0.3), cancelled)
+        features.match(database, photos, ordered, masked, _part(tell, 0.3, 0.75), cancelled)
+        found = register(
+            database,
+            ready.folder,
+            ready.folder.with_name("models"),
+            photos,
+            str(source),
+            _part(tell, 0.75, 1.0),
+            cancelled,
+        )
+    except AssetError as error:
+        if marked is None or sheet is None or len(marked.matrices) < FEWEST:
+            raise
+        logger.warning("%s. The %d pictures that show the marker sheet are used", error, len(marked.matrices))
+        return marked, _of_sheet(sheet)
+    alignment = None
+    if marked is not None and sheet is not None:
+        alignment = align_to_markers(found, marked, sheet.name)
+        if alignment is None and marked.matrices:
+            logger.warning(
+                "%s: the marker sheet does not fit the other cameras; it may have moved. It is not used", source
+            )
+    if alignment is None:
+        alignment = align_to_ground(found, settings.distance)
+        if settings.distance is None:
+            logger.warning(
+                "%s: nothing says how large the object is: the cameras are taken to be 1 m from it. A marker sheet "
+                "(drgs markers) or --camera-distance gives the scale", source,
+            )  # fmt: skip
+    return found, alignment
+
+
+def _of_sheet(sheet: MarkerSheet) -> Alignment:
+    """The sheet's own frame."""
+    import numpy as np
+
+    said = f"marker sheet ({sheet.name})"
+    return Alignment(1.0, np.eye(3), np.zeros(3), said, said, said)
+
+
+def _tell_left_out(found: Registration, photos: list[Photo], by_file: dict[str, Picture], source: Path) -> None:
+    missing = [by_file[photo.file].path.name for photo in photos if photo.file not in found.matrices]
+    if missing:
+        logger.warning(
+            "%s: %d of %d pictures do not fit the others and are left out: %s",
+            source, len(missing), len(photos), ", ".join(missing),
+        )  # fmt: skip
+    for group in found.apart:
+        logger.warning(
+            "%s: %d pictures fit together but share nothing with the others, as of another object: %s. Give them "
+            "a folder of their own, or add pictures between", source, len(group), first_of(group),
+        )  # fmt: skip
+
+
+def _lines(made: Made) -> list[str]:
+    """What is said of a capture."""
+    alignment: Any = made.alignment
+    return [
+        f"{made.pictures} of {made.of} pictures have cameras ({made.method}; reprojection error {made.error:.2f} px)",
+        f"scale: {alignment.scale_from}",
+        f"up: {alignment.up_from}; ground: {alignment.ground_from}",
+    ]
+
+
+def check_settings(settings: Settings) -> None:
+    """Raise UsageError for settings out of range."""
+    if settings.poses not in POSES:
+        raise UsageError("poses", f"is {settings.poses!r}", f"Choose from {', '.join(POSES)}")

@@ -1,0 +1,141 @@
+"""Working copies of pictures: small, upright, 8-bit, with masks, looks and markers found on the way."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from PIL import Image as Pillow
+
+from ..core.arrays import Array
+from ..core.asset.archive import replace_by
+from ..core.errors import AssetError, Cancelled, DeviceError
+from ..reconstruct.readers.layout import decode_mask
+from . import libraries
+from .features import Photo, Tell
+from .inspection import SHARPNESS_SIZE, Look, look
+from .marker_sheet import detect
+from .pictures import Picture, decode, reduced, shown
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class Prepared:
+    """Working copies of pictures, in the order of the pictures.
+
+    Attributes
+    ----------
+    pictures : list of Picture
+        Those that could be read.
+    photos : list of Photo
+        Files in `folder`.
+    looks : list of Look
+    markers : dict of str to dict of int to (4, 2) float64 array
+        File -> number -> corners, pixels of the working copy.
+    folder : Path
+    masks : Path, optional
+        Folder of masks as COLMAP names them; None where no picture has one.
+    broken : dict of str to str
+        File name -> why it cannot be read.
+    """
+
+    folder: Path
+    masks: Path | None = None
+    pictures: list[Picture] = field(default_factory=list)
+    photos: list[Photo] = field(default_factory=list)
+    looks: list[Look] = field(default_factory=list)
+    markers: dict[str, dict[int, Array]] = field(default_factory=dict)
+    broken: dict[str, str] = field(default_factory=dict)
+
+
+def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bool, tell: Tell,
+            cancelled: Callable[[], bool]) -> Prepared:  # fmt: skip
+    """Make working copies of pictures, of at most `size` pixels on the longer side; those that are there are kept.
+
+    Parameters
+    ----------
+    pictures : sequence of Picture
+    work : Path
+        Folder; `pictures` and `masks` in it are written.
+    size : int
+    seek_markers : bool
+        Also find the markers of sheets, where OpenCV is installed.
+    tell, cancelled : callable
+
+    Raises
+    ------
+    Cancelled
+        `cancelled` said so.
+    """
+    folder, masks = work / "pictures", work / "masks"
+    folder.mkdir(parents=True, exist_ok=True)
+    masks.mkdir(parents=True, exist_ok=True)
+    result = Prepared(folder)
+    for index, picture in enumerate(pictures):
+        if cancelled():
+            raise Cancelled
+        tell("reading pictures", index / len(pictures))
+        file = f"{picture.name}.jpg"
+        try:
+            small, mask = _small(picture, folder / file, masks / f"{file}.png", size)
+        except AssetError as error:
+            result.broken[picture.path.name] = f"cannot be read ({error.problem})"
+            logger.warning("%s", error)
+            continue
+        height, width = small.shape[:2]
+        result.pictures.append(picture)
+        result.photos.append(Photo(file, picture.lens, picture.exif.focal, (width, height)))
+        result.looks.append(_look(small, mask))
+        if mask is not None:
+            result.masks = masks
+        if seek_markers:
+            try:
+                result.markers[file] = detect(np.asarray(Pillow.fromarray(small).convert("L")))
+            except DeviceError as error:
+                logger.info("markers are not looked for: %s", error)
+                seek_markers = False
+    return result
+
+
+def _small(picture: Picture, copy: Path, mask_copy: Path, size: int) -> tuple[Array, Array | None]:
+    """((h, w, 3) uint8, (h, w) bool mask or None) of a picture, from its working copies where they are there."""
+    if not copy.is_file():
+        pixels = decode(picture)
+        colour = reduced(shown(pixels), size)
+        mask = None
+        if picture.mask is not None:
+            mask = decode_mask(picture.mask)
+        elif pixels.shape[2] == 4 and pixels[..., 3].min() < pixels[..., 3].max():
+            mask = pixels[..., 3] / (np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0)
+        if mask is not None:
+            drawn = Pillow.fromarray(np.asarray(mask > 0.5).astype(np.uint8) * 255)
+            drawn = drawn.resize((colour.shape[1], colour.shape[0]), Pillow.Resampling.NEAREST)
+            replace_by(mask_copy, lambda path: drawn.save(path, "PNG"))
+        replace_by(copy, lambda path: Pillow.fromarray(colour).save(path, "JPEG", quality=95, subsampling=0))
+    with Pillow.open(copy) as image:
+        small = np.asarray(image.convert("RGB"))
+    if not mask_copy.is_file():
+        return small, None
+    with Pillow.open(mask_copy) as image:
+        return small, np.asarray(image.convert("L")) > 127
+
+
+def _look(small: Array, mask: Array | None) -> Look:
+    tiny = reduced(small, SHARPNESS_SIZE)
+    if mask is not None:
+        size = tiny.shape[1], tiny.shape[0]
+        mask = np.asarray(Pillow.fromarray(mask.astype(np.uint8)).resize(size, Pillow.Resampling.NEAREST)) > 0
+    return look(tiny, mask)
+
+
+def has_opencv() -> bool:
+    """Whether markers can be found."""
+    try:
+        libraries.load("opencv")
+    except DeviceError:
+        return False
+    return True

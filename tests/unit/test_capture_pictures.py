@@ -1,0 +1,162 @@
+"""Photographs without cameras: found, turned, described; what is wrong with them is said by name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image, ImageFilter, ImageOps
+
+from drgs_blender.capture import pictures
+from drgs_blender.capture.exif import read_exif
+from drgs_blender.capture.inspection import FEWEST, inspect, look
+from drgs_blender.capture.pictures import Picture, decode, find_pictures, has_pictures, shown, write_picture
+from drgs_blender.core.errors import AssetError
+from drgs_blender.formats.exr import write_exr_picture
+
+
+def texture(seed: int, width: int = 96, height: int = 64) -> Image.Image:
+    """Noise of two scales, another one a seed."""
+    random = np.random.default_rng(seed)
+    coarse = Image.fromarray(random.integers(0, 255, (8, 12, 3), np.uint8)).resize((width, height))
+    return Image.blend(coarse, Image.fromarray(random.integers(0, 255, (height, width, 3), np.uint8)), 0.4)
+
+
+def exif(**values: object) -> Image.Exif:
+    found = Image.Exif()
+    for name, value in values.items():
+        target = found if name in ("Orientation", "Make", "Model") else found.get_ifd(ExifTags.IFD.Exif)
+        target[ExifTags.Base[name]] = value
+    return found
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pictures_are_turned_as_viewers_turn_them(tmp_path, orientation):
+    path = tmp_path / "a.jpg"
+    texture(0).save(path, exif=exif(Orientation=orientation), quality=95)
+    (picture,) = find_pictures(tmp_path)
+    with Image.open(path) as image:
+        wanted = np.asarray(ImageOps.exif_transpose(image))
+    np.testing.assert_array_equal(decode(picture), wanted)
+    assert picture.size == (wanted.shape[1], wanted.shape[0])
+    out = tmp_path / "out"
+    out.mkdir()
+    written = write_picture(picture, out)
+    with Image.open(written) as image:
+        assert image.getexif().get(ExifTags.Base.Orientation, 1) == 1
+        assert np.abs(np.asarray(image, int) - wanted).mean() < 3
+    assert orientation != 1 or written.read_bytes() == path.read_bytes()
+
+
+def test_focal_length_and_exposure_of_exif(tmp_path):
+    path = tmp_path / "a.jpg"
+    values = {"Make": "Maker", "Model": "M1", "FocalLength": 50.0, "FocalLengthIn35mmFilm": 50}
+    texture(0, 360, 240).save(path, exif=exif(**values, FNumber=8.0, ExposureTime=1 / 64, ISOSpeedRatings=200))
+    with Image.open(path) as image:
+        found = read_exif(image)
+    assert found.focal == pytest.approx(50 / 36)  # of a picture with the shape of the film
+    assert found.camera == "Maker M1 50 mm"
+    assert found.exposure == pytest.approx(6 + 6 - 1, abs=0.01)  # 2 log2 N - log2 t - log2(ISO / 100)
+
+
+def test_linear_and_deep_pictures_are_read_and_keep_their_depth(tmp_path):
+    linear = np.full((8, 12, 3), 0.18, np.float32)
+    linear[0, 0] = 4.0
+    write_exr_picture(tmp_path / "a.exr", linear)
+    (picture,) = find_pictures(tmp_path)
+    assert shown(decode(picture))[4, 4, 0] == 118 and shown(decode(picture))[0, 0, 0] == 255
+    out = tmp_path / "out"
+    out.mkdir()
+    written = Picture(write_picture(picture, out), "a")
+    pixels = decode(written)
+    assert pixels.dtype == np.uint16 and pixels[4, 4, 0] == pytest.approx(0.4614 * 65535, rel=1e-3)
+    assert "brighter than white" in picture.notes[0]
+
+
+def test_masks_of_another_shape_are_refused_by_name(tmp_path):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "masks").mkdir()
+    for k in range(3):
+        texture(k).save(tmp_path / "images" / f"{k}.png")
+        Image.new("L", (96, 64), 255).save(tmp_path / "masks" / f"{k}.png")
+    assert all(picture.mask for picture in find_pictures(tmp_path))
+    Image.new("L", (64, 96), 255).save(tmp_path / "masks" / "1.png")
+    with pytest.raises(
+        AssetError, match=r"masks/1.png: is 64 x 96 pixels, 1.png 96 x 64. Draw the mask over the turned"
+    ):
+        find_pictures(tmp_path)
+
+
+def test_what_cannot_be_read_is_left_out_and_named(tmp_path, caplog):
+    for k in range(4):
+        texture(k).save(tmp_path / f"{k}.png")
+    (tmp_path / "broken.jpg").write_bytes(b"no picture")
+    (tmp_path / "phone.heic").write_bytes(b"")
+    assert [picture.name for picture in find_pictures(tmp_path)] == ["0", "1", "2", "3"]
+    assert "broken.jpg" in caplog.text and "phone.heic" in caplog.text
+
+
+def test_raw_files_without_rawpy_are_named(tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr(pictures, "_has_rawpy", lambda: False)
+    for k in range(2):
+        texture(k).save(tmp_path / f"{k}.jpg")
+        (tmp_path / f"{k}.NEF").write_bytes(b"")
+    (tmp_path / "alone.dng").write_bytes(b"")
+    assert [picture.path.name for picture in find_pictures(tmp_path)] == ["0.jpg", "1.jpg"]
+    assert "rawpy" in caplog.text and "alone.dng" in caplog.text
+
+
+def test_folders_with_pictures_are_known(tmp_path):
+    assert not has_pictures(tmp_path) and not has_pictures(tmp_path / "absent")
+    (tmp_path / "walk.MP4").write_bytes(b"")
+    assert has_pictures(tmp_path) and pictures.find_video(tmp_path) == tmp_path / "walk.MP4"
+    texture(0).save(tmp_path / "a.jpg")
+    assert pictures.find_video(tmp_path) is None
+
+
+def looks(images, exposures=None):
+    """(pictures, looks) of images in memory."""
+    from pathlib import Path
+
+    from drgs_blender.capture.exif import Metadata
+
+    exposures = exposures or [None] * len(images)
+    made = [Picture(Path(f"{k}.jpg"), str(k), exif=Metadata(exposure=e), size=im.size)
+            for k, (im, e) in enumerate(zip(images, exposures))]  # fmt: skip
+    return made, [look(np.asarray(image)) for image in images]
+
+
+def test_blurred_pictures_and_duplicates_are_left_out(caplog):
+    images = [texture(k) for k in range(10)]
+    images[3] = images[3].filter(ImageFilter.GaussianBlur(6))
+    images[7] = images[2].copy()
+    fit, left_out = inspect(*looks(images), "photos")
+    assert set(left_out) == {"3.jpg", "7.jpg"} and len(fit) == 8
+    assert "blurred" in left_out["3.jpg"] and "2.jpg" in left_out["7.jpg"]
+    assert "3.jpg" in caplog.text and "7.jpg" in caplog.text
+
+
+def test_sharp_pictures_of_different_contrast_are_kept():
+    images = [texture(k) for k in range(6)]
+    images[1] = Image.eval(images[1], lambda v: 100 + v // 5)
+    assert not inspect(*looks(images), "photos")[1]
+
+
+def test_of_an_exposure_bracket_the_middle_is_used():
+    images, exposures = [], []
+    for k in range(6):
+        for stops in (0, -2, 2):
+            images.append(Image.eval(texture(k), lambda v, f=2.0 ** (stops / 2.2): min(255, int(v * f * 0.5))))
+            exposures.append(10.0 - stops)
+    fit, left_out = inspect(*looks(images, exposures), "photos")
+    assert [picture.name for picture in fit] == [str(3 * k) for k in range(6)] and len(left_out) == 12
+
+
+def test_too_few_pictures_are_refused():
+    with pytest.raises(AssetError, match=rf"has 3 usable pictures .* shape needs {FEWEST} or more"):
+        inspect(*looks([texture(k) for k in range(3)]), "photos")
+
+
+def test_different_exposures_and_sizes_are_told(caplog):
+    images = [texture(k, *((96, 64) if k % 2 else (64, 96))) for k in range(6)]
+    inspect(*looks(images, [10.0, 10.0, 10.0, 12.0, 10.0, 10.0]), "photos")
+    assert "2.0 stops" in caplog.text and "64 x 96" in caplog.text

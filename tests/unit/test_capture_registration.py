@@ -1,0 +1,344 @@
+"""Cameras from features and from marker sheets, and the world that they get."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from drgs_blender.capture import capture_folder, libraries
+from drgs_blender.capture.features import Photo, pairs
+from drgs_blender.capture.pipeline import Settings, make_capture
+from drgs_blender.capture.registration import Registration, register
+from drgs_blender.capture.world_alignment import align_to_ground, align_to_markers, ground_plane, similarity
+from drgs_blender.core.errors import AssetError, Cancelled, DeviceError, UsageError
+from drgs_blender.reconstruct.readers import read_capture
+from drgs_blender.reconstruct.readers.layout import OPENCV_TO_BLENDER
+from drgs_blender.reconstruct.readers.lens import Lens, distort
+
+LENS = Lens(800, 600, 760.0, 760.0, 405.0, 296.0, "RADIAL", (-0.05, 0.01))
+
+
+def tell(phase: str, part: float) -> None:
+    assert 0 <= part <= 1
+
+
+def never() -> bool:
+    return False
+
+
+def towards(eye, target=(0.0, 0.0, 0.02), roll=0.0) -> np.ndarray:
+    """Camera to world, Blender's axes."""
+    z = np.asarray(eye, float) - target
+    z /= np.linalg.norm(z)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    matrix = np.eye(4)
+    turn = np.array([[math.cos(roll), -math.sin(roll), 0], [math.sin(roll), math.cos(roll), 0], [0, 0, 1]])
+    matrix[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1) @ turn
+    matrix[:3, 3] = eye
+    return matrix
+
+
+def ring(count: int, seed: int = 0) -> dict[str, np.ndarray]:
+    random = np.random.default_rng(seed)
+    made = {}
+    for k in range(count):
+        angle, height = 2 * math.pi * k / count, 0.6 + 0.4 * random.random()
+        eye = 0.5 * np.array([math.cos(angle) * math.cos(height), math.sin(angle) * math.cos(height), math.sin(height)])
+        made[f"{k:02d}.jpg"] = towards(eye, roll=0.1 * (random.random() - 0.5))
+    return made
+
+
+def seen(points: np.ndarray, matrix: np.ndarray, lens: Lens) -> np.ndarray:
+    """(n, 2) pixels."""
+    local = (points - matrix[:3, 3]) @ (matrix[:3, :3] @ OPENCV_TO_BLENDER[:3, :3])
+    return np.stack(distort(lens, local[:, 0] / local[:, 2], local[:, 1] / local[:, 2]), axis=1)
+
+
+def registration(cameras: dict[str, np.ndarray], points: np.ndarray) -> Registration:
+    one = dict.fromkeys(cameras, 1)
+    return Registration(
+        dict(cameras), dict.fromkeys(cameras, LENS), one, one, points, np.zeros((len(points), 3), np.uint8), ""
+    )
+
+
+def moved(found: Registration, scale: float, seed: int) -> Registration:
+    """The same in another world."""
+    turn, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    turn *= np.sign(np.linalg.det(turn))
+    shift = np.array([3.0, -2.0, 5.0])
+    cameras = {}
+    for name, matrix in found.matrices.items():
+        cameras[name] = np.eye(4)
+        cameras[name][:3, :3] = turn @ matrix[:3, :3]
+        cameras[name][:3, 3] = scale * turn @ matrix[:3, 3] + shift
+    return replace(found, matrices=cameras, points=scale * found.points @ turn.T + shift)
+
+
+def scene(table: bool) -> np.ndarray:
+    """Points of a lump on the ground, with or without a table around it, and some strays."""
+    random = np.random.default_rng(3)
+    lump = random.normal(size=(1500, 3))
+    lump *= 0.06 / np.linalg.norm(lump, axis=1, keepdims=True)
+    lump[:, 2] += 0.06
+    parts = [lump, 2 * (random.random((20, 3)) - 0.5)]
+    if table:
+        flat = np.column_stack([0.6 * (random.random((1500, 2)) - 0.5), 0.0005 * random.normal(size=1500)])
+        parts.append(flat)
+    return np.concatenate(parts)
+
+
+def test_the_ground_under_the_object_becomes_zero():
+    cameras = ring(20)
+    found = moved(registration(cameras, scene(table=True)), 7.0, 1)
+    centres = np.stack([matrix[:3, 3] for matrix in cameras.values()])
+    alignment = align_to_ground(found, float(np.median(np.linalg.norm(centres - [0, 0, 0.02], axis=1))))
+    alignment.apply(found)
+    assert alignment.ground_from == "plane under the object"
+    for name, matrix in cameras.items():
+        np.testing.assert_allclose(found.matrices[name][2, 3], matrix[2, 3], atol=0.002)
+        assert found.matrices[name][2, :3] @ matrix[2, :3] > 1 - 1e-3  # up, as each camera sees it
+    table = found.points[-1500:]
+    assert np.abs(table[:, 2]).max() < 0.005
+
+
+def test_without_a_table_up_is_how_cameras_were_held_and_points_begin_at_zero():
+    found = moved(registration(ring(20), scene(table=False)), 0.2, 2)
+    alignment = align_to_ground(found)
+    alignment.apply(found)
+    assert (alignment.ground_from, alignment.scale_from.split(":")[0]) == ("lowest points", "unknown")
+    assert found.points[:1500, 2].min() == pytest.approx(0.0, abs=0.05)
+    centres = np.stack([m[:3, 3] for m in found.matrices.values()])
+    assert np.median(np.linalg.norm(centres, axis=1)) == pytest.approx(1.0, rel=0.15)
+
+
+def test_a_wall_is_no_ground():
+    random = np.random.default_rng(0)
+    wall = np.column_stack([random.random((800, 1)) - 0.5, 0.001 * random.normal(size=800) + 0.3, random.random(800)])
+    cameras = np.stack([m[:3, 3] for m in ring(20).values()])
+    assert ground_plane(wall, cameras, np.array([0, 0, 1.0]), 0.5) is None
+
+
+def test_a_similarity_is_found_exactly():
+    points = np.random.default_rng(0).normal(size=(6, 3))
+    other = moved(registration(ring(3), points), 2.5, 4).points
+    scale, rotation, shift = similarity(points, other)
+    assert scale == pytest.approx(2.5)
+    np.testing.assert_allclose(scale * points @ rotation.T + shift, other, atol=1e-9)
+
+
+def test_markers_of_some_pictures_give_scale_and_ground_of_all_in_spite_of_one_that_moved():
+    truth = registration(ring(12), scene(table=True))
+    found = moved(truth, 4.0, 5)
+    marked = replace(truth, matrices={name: truth.matrices[name].copy() for name in list(truth.matrices)[:6]})
+    marked.matrices["02.jpg"][:3, 3] += 0.1
+    alignment = align_to_markers(found, marked, "a4")
+    assert alignment is not None
+    alignment.apply(found)
+    for name, matrix in truth.matrices.items():
+        np.testing.assert_allclose(found.matrices[name], matrix, atol=1e-6)
+
+
+def test_pairs_of_pictures():
+    assert pairs(5, ordered=False) == [(i, j) for i in range(5) for j in range(i + 1, 5)]
+    video = pairs(90, ordered=True)
+    assert {(i, i + 1) for i in range(89)} <= set(video) and (0, 84) in video and len(video) < 1500
+
+
+@pytest.fixture
+def colmap():
+    pytest.importorskip("pycolmap", reason="structure from motion needs pycolmap")
+    return libraries.load("pycolmap")
+
+
+def synthetic(colmap, database, cameras: int, points: int = 400):
+    """COLMAP's own synthetic pictures: keypoints and matches in a database. (truth, photos)."""
+    options = colmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, cameras
+    options.num_points3D = points
+    colmap.set_random_seed(0)
+    with colmap.Database.open(str(database)) as data:
+        truth = colmap.synthesize_dataset(options, data)
+    names = sorted(truth.image(number).name for number in truth.reg_image_ids())
+    camera = next(iter(truth.cameras.values()))
+    return truth, [Photo(name, ("one",), None, (camera.width, camera.height)) for name in names]
+
+
+def test_cameras_are_found_from_matches(colmap, tmp_path):
+    truth, photos = synthetic(colmap, tmp_path / "database.db", 8)
+    found = register(tmp_path / "database.db", tmp_path, tmp_path / "models", photos, "photos", tell, never)
+    assert sorted(found.matrices) == [photo.file for photo in photos]
+    ours = np.stack([found.matrices[photo.file][:3, 3] for photo in photos])
+    theirs = np.stack([truth.find_image_with_name(photo.file).projection_center() for photo in photos])
+    scale, rotation, shift = similarity(ours, theirs)
+    size = np.linalg.norm(theirs - theirs.mean(axis=0), axis=1).mean()
+    assert np.linalg.norm(scale * ours @ rotation.T + shift - theirs, axis=1).max() < 1e-3 * size
+    assert max(found.errors.values()) < 0.1 and len(found.points) > 200
+
+
+def test_too_few_matched_pictures_are_refused_with_their_names(colmap, tmp_path):
+    _, photos = synthetic(colmap, tmp_path / "database.db", 6)
+    strangers = [replace(photos[0], file=f"other_{k}.jpg") for k in range(9)]
+    with pytest.raises(AssetError, match=r"6 of 15 pictures fit together. Not registered: other_0.jpg"):
+        register(tmp_path / "database.db", tmp_path, tmp_path / "models", photos + strangers, "photos", tell, never)
+
+
+def test_a_missing_library_is_named_with_the_command_that_installs_it(monkeypatch):
+    monkeypatch.setitem(
+        libraries.LIBRARIES, "pycolmap", libraries.Library("no_such_module", "pycolmap>=4.2", "structure")
+    )
+    with pytest.raises(DeviceError, match=r"needs pycolmap.*pip install .pycolmap>=4.2"):
+        libraries.load("pycolmap")
+
+
+@pytest.fixture
+def cv2():
+    pytest.importorskip("cv2", reason="marker sheets need OpenCV")
+    return libraries.load("opencv")
+
+
+def test_a_sheet_gives_lens_and_cameras_in_metres(cv2):
+    from drgs_blender.capture.marker_poses import poses_from_markers
+    from drgs_blender.capture.marker_sheet import MarkerSheet
+
+    sheet = MarkerSheet("a4", marker=29.0)
+    cameras = ring(24)
+    random = np.random.default_rng(0)
+    found = {
+        name: {
+            k: seen(corners, matrix, LENS) + 0.05 * random.normal(size=(4, 2)) for k, corners in sheet.corners.items()
+        }
+        for name, matrix in cameras.items()
+    }
+    found["03.jpg"][5] += 60.0  # misread
+    photos = [Photo(name, ("one",), None, (800, 600)) for name in cameras]
+    result = poses_from_markers(sheet, found, photos)
+    assert len(result.matrices) == 24 and max(result.errors.values()) < 0.2
+    for name, matrix in cameras.items():
+        np.testing.assert_allclose(result.matrices[name], matrix, atol=2e-3)
+    lens = result.lenses["03.jpg"]
+    assert (lens.fx, lens.cx, lens.cy) == pytest.approx((LENS.fx, LENS.cx, LENS.cy), abs=1.5)
+
+
+@pytest.mark.parametrize("paper", ["a4", "letter", "a3"])
+def test_markers_are_found_where_they_are_printed(cv2, paper, tmp_path):
+    from drgs_blender.capture.marker_sheet import MarkerSheet, detect, recognise, write_pdf
+
+    sheet = MarkerSheet(paper)
+    found = detect(sheet.picture(4.0))
+    assert found.keys() == sheet.corners.keys() and recognise(set(found)) == paper
+    middle = np.array([sheet.paper.width / 2, sheet.paper.height / 2])
+    for number, corners in sheet.corners.items():
+        printed = (corners[:, :2] * [1000, -1000] + middle) * 4.0
+        np.testing.assert_allclose(found[number], printed, atol=0.5)
+    write_pdf(tmp_path / "sheet.pdf", paper)
+    data = (tmp_path / "sheet.pdf").read_bytes()
+    width, height = (n * 72 / 25.4 for n in (sheet.paper.width, sheet.paper.height))
+    assert data.startswith(b"%PDF-1.4") and b"/MediaBox [0 0 %.3f %.3f]" % (width, height) in data
+    start = int(data.rsplit(b"startxref\n", 1)[1].split()[0])
+    assert data[start:].startswith(b"xref")
+    for offset in data[start:].split(b"trailer")[0].splitlines()[3:]:
+        assert (
+            data[int(offset.split()[0]) :][:9].rstrip(b"<").endswith(b"obj\n")
+            or b" 0 obj" in data[int(offset[:10]) :][:9]
+        )
+
+
+def photographs_of_a_sheet(cv2, folder, count: int) -> dict[str, np.ndarray]:
+    """Photographs of a flat sheet by a pinhole, by homographies; true cameras."""
+    from drgs_blender.capture.marker_sheet import MarkerSheet
+
+    sheet = MarkerSheet("a4")
+    page, lens = sheet.picture(4.0), replace(LENS, model="PINHOLE", coefficients=())
+    height, width = page.shape
+    corners = np.array([[-105, 148.5, 0], [105, 148.5, 0], [105, -148.5, 0], [-105, -148.5, 0]]) / 1000
+    flat = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32) - 0.5
+    cameras = ring(count)
+    folder.mkdir()
+    for name, matrix in cameras.items():
+        turn = cv2.getPerspectiveTransform(flat, (seen(corners, matrix, lens) - 0.5).astype(np.float32))
+        picture = cv2.warpPerspective(page, turn, (800, 600), flags=cv2.INTER_AREA, borderValue=90)
+        Image.fromarray(picture).convert("RGB").save(folder / name, quality=95)
+    return cameras
+
+
+def test_photographs_of_a_sheet_become_a_capture_that_reconstruct_reads(cv2, tmp_path):
+    cameras = photographs_of_a_sheet(cv2, tmp_path / "photos", 6)
+    out = tmp_path / "capture"
+    made = make_capture(tmp_path / "photos", out, Settings(), tell, never)
+    assert made.pictures == 6 and made.method == "marker sheet" and not made.left_out
+    capture = read_capture(out)
+    for view in capture.views:
+        true = cameras[f"{view.name}.jpg"]
+        np.testing.assert_allclose(view.camera.matrix_world, true, atol=8e-3)
+    assert capture.points is None  # surfels must not begin on the sheet
+    report = json.loads((out / capture_folder.REPORT).read_text())
+    assert len(report["cameras"]) == 6 and report["scale"] == "marker sheet (a4)"
+    with Image.open(out / capture_folder.DRAWING) as drawing:
+        assert np.asarray(drawing).min() < 200
+    assert not (out / capture_folder.WORK).exists()
+    assert make_capture(tmp_path / "photos", out, Settings(), tell, never).kept
+
+
+def test_a_stopped_run_keeps_its_work_for_the_same_pictures_alone(cv2, tmp_path):
+    photographs_of_a_sheet(cv2, tmp_path / "photos", 6)
+    out, calls = tmp_path / "capture", []
+
+    def stop() -> bool:
+        calls.append(0)
+        return len(calls) > 3
+
+    with pytest.raises(Cancelled):
+        make_capture(tmp_path / "photos", out, Settings(), tell, stop)
+    copies = sorted((out / capture_folder.WORK / "pictures").iterdir())
+    times = [path.stat().st_mtime_ns for path in copies]
+    assert len(copies) == 3 and not (out / capture_folder.CAMERAS).exists()
+    with pytest.raises(Cancelled):
+        make_capture(tmp_path / "photos", out, Settings(), tell, lambda: True)
+    assert [path.stat().st_mtime_ns for path in copies] == times
+    with pytest.raises(Cancelled):
+        make_capture(tmp_path / "photos", out, Settings(size=400), tell, lambda: True)
+    assert not any(path.exists() for path in copies)
+
+
+def test_folders_of_others_are_not_written_to(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "letter.txt").write_text("")
+    for folder in (tmp_path / "photos", tmp_path / "photos" / "inside", tmp_path / "other"):
+        with pytest.raises(UsageError):
+            make_capture(tmp_path / "photos", folder, Settings(), tell, never)
+    assert (tmp_path / "other" / "letter.txt").exists()
+
+
+def test_without_markers_poses_by_markers_are_refused(cv2, tmp_path):
+    (tmp_path / "photos").mkdir()
+    for k in range(6):
+        pixels = np.random.default_rng(k).integers(0, 255, (60, 80, 3), np.uint8)
+        Image.fromarray(pixels).save(tmp_path / "photos" / f"{k}.png")
+    with pytest.raises(AssetError, match="shows a marker sheet in 0 pictures"):
+        make_capture(tmp_path / "photos", tmp_path / "out", Settings(poses="markers"), tell, never)
+
+
+@pytest.mark.slow
+def test_a_video_of_a_sheet_becomes_a_capture(cv2, tmp_path):
+    av = pytest.importorskip("av", reason="video needs PyAV")
+    cameras = photographs_of_a_sheet(cv2, tmp_path / "photos", 12)
+    film = tmp_path / "walk.mkv"
+    with av.open(str(film), "w") as container:
+        stream = container.add_stream("mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 800, 600, "yuv420p", 20_000_000
+        for name in cameras:
+            with Image.open(tmp_path / "photos" / name) as image:
+                container.mux(stream.encode(av.VideoFrame.from_image(image)))
+        container.mux(stream.encode())
+    made = make_capture(film, tmp_path / "capture", Settings(), tell, never)
+    assert made.pictures == made.of == 12
+    views = sorted(read_capture(tmp_path / "capture").views, key=lambda view: view.name)
+    for view, matrix in zip(views, cameras.values(), strict=True):
+        np.testing.assert_allclose(view.camera.matrix_world, matrix, atol=0.02)
