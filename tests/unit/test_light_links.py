@@ -216,7 +216,7 @@ def test_whichever_strategy_finds_a_glowing_mesh_it_is_as_bright(scene: Scene, s
 
 @pytest.mark.parametrize("change", UNBLOCKED)
 def test_mirrors_show_what_is_in_front_of_a_lamp_that_it_does_not_block(scene: Scene, change: str) -> None:
-    """As in Cycles: behind the screen the lamp lights what is rough in full, and is not in mirrors."""
+    """Behind the screen the lamp lights what is rough in full, and is not in mirrors."""
     _, frame = scene
     settings = replace(frame.settings, samples=256)
     lamp = replace(frame.lights[0], radius=0.4)

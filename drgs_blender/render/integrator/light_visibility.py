@@ -1,7 +1,7 @@
 """Visibility of lights: the shadow rays of light samples, with what shadow linking and lamps without shadow change.
 
 Shadow rays towards a light with shadow linking have a mask of its own (`light_links`); a lamp without shadow has none.
-Rays of lobes see either before the nearest surface alone, as in Cycles, and there weights are those of all lights.
+Rays of lobes see either before the nearest surface alone, and there weights are those of all lights.
 Behind a surface that does not block the light, its own samples alone bring it, with the weight that they have in
 Cycles: that of the power heuristic against the lobes, whose part is missing. So a rough surface is lit nearly in full,
 and a mirror shows the surface, not the light behind it.
