@@ -10,7 +10,7 @@ import logging
 import re
 import time
 from collections import deque
-from collections.abc import Container
+from collections.abc import Callable, Container
 from typing import NamedTuple
 
 log = logging.getLogger("drgs")
@@ -60,14 +60,22 @@ warned: set[str] = set()
 
 
 class Warnings:
-    """Collects the warnings of one export; every text once, and none that is `known`, to which they are added."""
+    """Collects the warnings of one export; every text once, and none that is `known`, to which they are added.
 
-    def __init__(self, known: set[str] | None = None) -> None:
+    Parameters
+    ----------
+    report : prints a warning, in place of the log
+    """
+
+    def __init__(self, known: set[str] | None = None, report: Callable[[str], None] | None = None) -> None:
         self.texts: list[str] = []
+        self._report = report
         self._known = set() if known is None else known
 
     def __call__(self, text: str) -> None:
         if text not in self._known:
             self._known.add(text)
             self.texts.append(text)
-            note("WARNING", text)
+            note("WARNING", text, logged=self._report is None)
+            if self._report is not None:
+                self._report(text)

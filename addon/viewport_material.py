@@ -41,6 +41,11 @@ def viewport_material(channels: Collection[str] = ()) -> bpy.types.Material:
     return material
 
 
+def is_viewport_material(material: bpy.types.Material) -> bool:
+    """Whether a material is one of these, with textures or without."""
+    return KEY in material or material.name.split(" ")[0] == NAME
+
+
 def textured_material(material: bpy.types.Material, channels: Collection[str]) -> bpy.types.Material:
     """`material`, which shows textures, or that with the same textures that shows these optional `channels`."""
     base, _, shown = material[KEY].partition(" ")
@@ -66,7 +71,7 @@ def update_viewport_material(mesh: bpy.types.Mesh) -> None:
     for slot, material in enumerate(mesh.materials):
         if material is None or material.library:
             continue
-        if slot == 0 and material.name.split(" ")[0] == NAME:
+        if slot == 0 and KEY not in material and is_viewport_material(material):
             mesh.materials[0] = viewport_material(channels)
         elif KEY in material:
             mesh.materials[slot] = textured_material(material, channels)

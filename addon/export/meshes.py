@@ -15,6 +15,7 @@ from ...drgs_blender.core.materials import Image
 from .. import mesh_arrays
 from ..bakes.requests import Wanted
 from .export_cache import ExportCache, uid
+from .holdouts import cut_out
 from .instances import Key, Visible, terminator_offset
 from .light_links import LightLinks
 from .materials import DEFAULT_MATERIAL, ExportedMaterial, Materials
@@ -82,8 +83,16 @@ class Meshes:
 
     def add(self, item: Visible) -> None:
         """Take in a visible instance of a mesh."""
-        obj, rays = item.object, item.visibility
+        obj = item.object
         slots, sent = self._materials.slots(obj), self._links.numbers_of(item)
+        owners = uid(obj.data), uid(obj)
+        stands = (*owners, obj.data.as_pointer(), obj.data.is_editmode)
+
+        def arrays() -> _Arrays:
+            return self._cache.get(("arrays", *stands), owners, lambda: self._arrays(obj))
+
+        item = cut_out(item, slots, lambda: arrays().material_index, self._warn)
+        rays = item.visibility
         key = (
             obj.data.as_pointer(),
             *(m.as_pointer() if m else 0 for m in slots),
@@ -96,11 +105,8 @@ class Meshes:
         )
         shape = self._shapes.get(key)
         if shape is None:
-            owners = uid(obj.data), uid(obj)
-            stands = (*owners, obj.data.as_pointer(), obj.data.is_editmode)
-            arrays = self._cache.get(("arrays", *stands), owners, lambda: self._arrays(obj))
             state, pictures, bakes = self._cache.get(
-                ("mesh", *stands, obj.name, *key), owners, lambda: self._state(item, slots, arrays)
+                ("mesh", *stands, obj.name, *key), owners, lambda: self._state(item, slots, arrays())
             )
             self._materials.images |= pictures
             shape = self._shapes[key] = _Shape(state)

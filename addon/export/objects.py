@@ -15,8 +15,10 @@ from ...drgs_blender.core.frame import Adjustment, ObjectState
 from ...drgs_blender.core.materials import ShaderAOV
 from ...drgs_blender.core.passes import Pass
 from .. import assets, cache_playback, mesh_arrays, point_caches
+from ..viewport_material import is_viewport_material
 from .aov_nodes import aov_values
 from .export_cache import ExportCache, uid
+from .holdouts import cut_out
 from .instances import Key, Visible, terminator_offset
 from .materials import finite
 from .surface_nodes import SurfaceWalker
@@ -61,20 +63,35 @@ class DrgsObjects:
             lambda: _shape(obj, self._depsgraph, self._key_of, self._warn),
         )
         material = obj.material_slots[0].material if obj.material_slots else None
+        visibility = cut_out(item, [material], lambda: None, self._warn).visibility
         self.states.append(
             replace(
                 shape,
                 matrix_world=item.matrix_world,
                 pass_index=obj.pass_index,
                 material_pass_index=0 if material is None else material.pass_index,
-                visibility=item.visibility,
+                visibility=visibility,
                 captured_colours=obj.drgs.captured_colours,
                 light_group=obj.lightgroup,
                 terminator_offset=terminator_offset(obj, self._warn),
                 aovs=_aovs(material, obj, self._aovs, self._warn) if material is not None and self._aovs else [],
             )
         )
+        _check_shown(obj, material, shape, self._warn)
         self.keys.append(item.key)
+
+
+def _check_shown(obj: bpy.types.Object, material: bpy.types.Material | None, shape: ObjectState, warn: Warn) -> None:
+    """Name the channels that are rendered here, and that the material for Blender's own engines has no node for."""
+    if material is None or material.node_tree is None or not is_viewport_material(material):
+        return
+    shown = {node.attribute_name for node in material.node_tree.nodes if node.type == "ATTRIBUTE"}
+    for channel in ("opacity", "emission"):
+        if getattr(shape, channel) is not None and channel not in shown:
+            warn(
+                f'"{obj.name}": its attribute {channel} is not seen in Cycles and the viewport: the material '
+                f'"{material.name}" has no node for it. Paint > {channel.title()} adds one'
+            )
 
 
 def _aovs(material: bpy.types.Material, obj: bpy.types.Object, aovs: Sequence[Pass], warn: Warn) -> list[ShaderAOV]:

@@ -52,6 +52,8 @@ class SurfaceWalker(MixingWalker):
         if not linked:
             self.report("has no surface, which is black in Blender; its viewport colour is used")
             return _plain(uniform(material.diffuse_color[:3]), uniform(material.roughness))
+        if ref.origin().node.type == "HOLDOUT":
+            return Surface()  # black, where it is not cut out: see `holdouts`
         surface = self.shader(ref)
         return None if surface.alpha.black else self.settled(output, surface)
 
@@ -193,6 +195,13 @@ class SurfaceWalker(MixingWalker):
         if np.ptp(colour) > 0.01 or colour.mean() < 0.99:
             self.warn(output.node, "coloured transparency is not rendered; it is clear")
         return Surface(alpha=uniform(0))
+
+    def shader_holdout(self, output: SocketRef) -> Surface:
+        self.report(
+            "its Holdout is mixed with other shaders, and black there. Make it the whole surface of a material, or use "
+            "Object Properties > Visibility > Holdout"
+        )
+        return Surface()
 
     def shader_mix_shader(self, output: SocketRef) -> Surface:
         factor = output.input(0).origin()

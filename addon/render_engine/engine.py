@@ -110,7 +110,9 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
         background_render.fail(text, code)
 
     def _render(self, depsgraph: bpy.types.Depsgraph) -> None:
-        warn = messages.Warnings(messages.warned)
+        # Without a window Blender prints what is reported; a log would say it a second time.
+        report = self._warn if bpy.app.background else None
+        warn = messages.Warnings(messages.warned, report)
         self.update_stats("", "Exporting the scene")
 
         def export(moments: bool) -> Frame:
@@ -132,10 +134,14 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
             passes = engine_link.render(frame, self._progress, self._stopped)
         for text in passes.warnings:
             warn(text)
-        for text in warn.texts:
-            self.report({"WARNING"}, text)
+        if report is None:
+            for text in warn.texts:
+                self._warn(text)
         self._show(depsgraph, frame, passes)
         self.update_stats("", summary(frame, passes.statistics))
+
+    def _warn(self, text: str) -> None:
+        self.report({"WARNING"}, text)
 
     def _stopped(self) -> bool:
         """Whether Esc was pressed, or the extension goes."""

@@ -260,6 +260,20 @@ def test_attribute_of_a_wrong_kind_is_named_and_ignored(ball, export):
     assert any('"ball"' in w and "albedo" in w for w in warnings)
 
 
+def test_an_attribute_that_the_material_does_not_show_is_named(ball, export):
+    """What a script adds counts here; Cycles and the viewport see it only by the material's node."""
+    material = part("addon.viewport_material")
+    mesh = ball.data
+    material.update_viewport_material(mesh)
+    glow = mesh.attributes.new("emission", "FLOAT_COLOR", "POINT")
+    glow.data.foreach_set("color", np.ones(4 * len(mesh.vertices), np.float32))
+    frame, (text,) = export()
+    assert frame.objects[0].emission is not None
+    assert '"ball"' in text and "emission" in text and f'"{mesh.materials[0].name}"' in text and "Paint" in text
+    material.update_viewport_material(mesh)
+    assert not export()[1]
+
+
 def test_attribute_values_that_are_no_numbers_are_named_and_the_assets(ball, export):
     values = ball.data.attributes["roughness"].data
     own = np.array([v.value for v in values], np.float32)

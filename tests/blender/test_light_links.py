@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 import pytest
-from scenes import mesh_object
+from scenes import mesh_object, new_world, sphere
 from test_panorama import _paint, picture, room, srgb_psnr  # noqa: F401  a fixture
 
 pytestmark = pytest.mark.blender_api
@@ -126,3 +126,61 @@ def test_pictures_are_those_of_cycles(room, name):  # noqa: F811
     print(f"{name}: {found:.1f} dB, unlinked {change:.1f} dB, mean {ours.mean() / theirs.mean():.4f}")
     assert found >= 38 and found > change + 4
     assert abs(ours[..., :3].mean() / theirs[..., :3].mean() - 1) < 0.01
+
+
+@pytest.fixture
+def gallery(scene):
+    """Balls of mirror, coat and glass on a floor; before a part of the lamp a screen that the camera does not see."""
+    floor = mesh_object("floor", [(-4, -4, 0), (4, -4, 0), (4, 4, 0), (-4, 4, 0)], [(0, 1, 2, 3)])
+    _paint(floor, (0.6, 0.6, 0.6, 1), 0.3, 0.0)
+    looks = {
+        "mirror": (0.0, 1.0, {}),
+        "coat": (0.6, 0.0, {"Coat Weight": 1.0}),
+        "glass": (0.05, 0.0, {"Transmission Weight": 1.0}),
+    }
+    for i, (name, (roughness, metallic, values)) in enumerate(looks.items()):
+        ball = mesh_object(name, 0.4 * sphere(32, 48)[0] + (i - 1, 0, 0.4), sphere(32, 48)[1])
+        for polygon in ball.data.polygons:
+            polygon.use_smooth = True
+        _paint(ball, (0.8, 0.7, 0.6, 1), roughness, metallic)
+        shader = next(n for n in ball.data.materials[0].node_tree.nodes if n.type == "BSDF_PRINCIPLED")
+        for socket, value in values.items():
+            shader.inputs[socket].default_value = value
+    corners = [(-0.3, -1.2, 1.4), (0.7, -1.2, 1.4), (0.7, -0.2, 1.4), (-0.3, -0.2, 1.4)]
+    screen = mesh_object("screen", corners, [(0, 1, 2, 3)])
+    _paint(screen, (0.2, 0.5, 0.2, 1), 1.0, 0.0)
+    screen.visible_camera = False
+    lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "AREA"))
+    lamp.data.energy, lamp.data.size, lamp.location = 100, 1.0, (0.4, -1.2, 2.6)
+    lamp.rotation_euler = (-0.4, 0.15, 0.0)
+    scene.collection.objects.link(lamp)
+    _, background = new_world(scene)
+    background.inputs["Color"].default_value = (0.1, 0.1, 0.1, 1)
+    scene.camera.location, scene.camera.rotation_euler = (0, -4, 3), (0.95, 0, 0)
+    scene.camera.data.lens = 45
+    scene.render.resolution_x, scene.render.resolution_y = 96, 64
+    return scene
+
+
+SHADOWS = {
+    "blocked by the mirror alone": lambda o: setattr(
+        o["Lamp"].light_linking, "blocker_collection", linked("b", include=[o["mirror"]])
+    ),
+    "not blocked by the glass": lambda o: setattr(
+        o["Lamp"].light_linking, "blocker_collection", linked("b", exclude=[o["glass"]])
+    ),
+    "without shadow": lambda o: setattr(o["Lamp"].data, "use_shadow", False),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.judged
+@pytest.mark.parametrize("name", SHADOWS)
+def test_mirrors_coats_and_glass_show_lamps_as_in_cycles(gallery, name):
+    """Whatever blocks the lamp, its reflections and caustics are those of Cycles."""
+    SHADOWS[name]({obj.name: obj for obj in gallery.objects})
+    theirs, ours = picture(gallery, "CYCLES", 256, passes=12), picture(gallery, "DRGS", 256)
+    found = srgb_psnr(ours[..., :3], theirs[..., :3])
+    print(f"{name}: {found:.1f} dB, mean {ours[..., :3].mean() / theirs[..., :3].mean():.4f}")
+    assert found >= 30  # caustics of 256 paths are noise
+    assert abs(ours[..., :3].mean() / theirs[..., :3].mean() - 1) < 0.02

@@ -133,14 +133,15 @@ def _paint(obj, colour, roughness, metallic):
     obj.data.materials.append(material)
 
 
-def picture(scene, engine, samples, transparent=False):
-    """(h, w, 4) of a render with `engine`, both with the same filter and one bounce."""
+def picture(scene, engine, samples, transparent=False, passes=0):
+    """(h, w, 4) of a render with `engine`, both with the same filter, one bounce and so many passages of glass."""
     scene.render.engine, scene.render.film_transparent = engine, transparent
     cycles, settings = scene.cycles, scene.drgs
     cycles.device, cycles.samples, cycles.pixel_filter_type = "CPU", samples, "BOX"
     cycles.filter_width = 1.0
     cycles.use_adaptive_sampling = cycles.use_denoising = False
-    cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = 1
+    cycles.diffuse_bounces = cycles.glossy_bounces = 1
+    cycles.max_bounces, cycles.transmission_bounces = 1 + passes, passes
     cycles.sample_clamp_indirect = cycles.blur_glossy = 0.0
     cycles.caustics_reflective = True
     settings.use_strategy_samples, settings.samples, settings.bounces = False, samples, 1

@@ -58,6 +58,14 @@ def test_an_animation_warns_once_of_what_is_in_every_frame(ball, scene, captured
     assert len(history) == 4
 
 
+def test_a_warning_is_printed_once_without_a_window(ball, scene, captured, capfd, caplog):
+    scene.collection.objects.link(bpy.data.objects.new("Fog", bpy.data.volumes.new("Fog")))
+    bpy.ops.render.render()
+    printed = "".join(capfd.readouterr())
+    assert printed.count("Fog") == 1 and "Warning: 1 volume object is not rendered by DR-GS: Fog" in printed
+    assert not [record for record in caplog.records if "Fog" in record.message]
+
+
 def test_without_a_card_f12_is_rendered_on_the_processor_and_says_so(ball, scene):
     history = part("addon.messages").history
     light(scene)

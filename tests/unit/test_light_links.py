@@ -160,6 +160,80 @@ def test_glowing_meshes_are_linked(scene: Scene, rays_see: str) -> None:
     assert through[index == 1].mean() == pytest.approx(lit[index == 1].mean(), rel=0.03)
 
 
+#: Cosine, GGX and light samples.
+STRATEGIES = {"auto": None, "lobes": (16, 64, 0), "lights": (0, 0, 80), "all": (16, 48, 16)}
+#: Lamps that not everything blocks.
+UNBLOCKED: dict[str, dict[str, int]] = {"linked": {"blockers": 0}, "without shadow": {"cast_shadow": False}}
+
+
+def glossy(rough: float, screen: bool = True, **more: object) -> list[MeshState]:
+    """A slab of metal under a screen that the camera does not see."""
+    meshes = [slab("left", 1, -1, 0, 0.7, **more), slab("screen", 3, 0, 1.5, 0.9, visibility=Visibility(camera=False))]
+    meshes[0].materials[0].roughness, meshes[0].materials[0].metallic = rough, 1.0
+    return meshes if screen else meshes[:1]
+
+
+def test_shadow_linking_to_everything_changes_no_sample(scene: Scene) -> None:
+    """A lamp whose shadow all objects throw is the lamp without links: for light samples and for rays of lobes."""
+    session, frame = scene
+    settings = replace(frame.settings, samples=64, bounces=1)
+    meshes, lamps = glossy(0.3), [replace(frame.lights[0], radius=0.8), frame.lights[1]]
+    plain, index = rendered(scene, meshes=meshes, lights=lamps, settings=settings)
+    frame = replace(frame, meshes=meshes, lights=[replace(lamp, blockers=2) for lamp in lamps])
+    changes = with_bits(frame, "ball", blocks=4)
+    for who in ("left", "screen"):
+        changes = with_bits(replace(frame, **changes), who, blocks=4)
+    linked, _ = rendered((session, frame), settings=settings, **changes)
+    assert plain[index == 1].mean() > 0.02
+    np.testing.assert_allclose(linked, plain, rtol=2e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("change", UNBLOCKED)
+def test_whichever_strategy_finds_a_lamp_it_is_as_bright(scene: Scene, change: str, strategy: str) -> None:
+    """Where nothing is in front of it: in a rough mirror, with shadow linking or without a shadow, as others are."""
+    _, frame = scene
+    lamp = replace(frame.lights[0], radius=0.8)
+    settings = replace(frame.settings, samples=256, strategy_samples=STRATEGIES[strategy])
+    plain = replace(frame.settings, samples=256)
+    bare, index = rendered(scene, meshes=glossy(0.3, False), lights=[lamp], settings=plain)
+    assert bare[index == 1].mean() > 0.5
+    free, _ = rendered(scene, meshes=glossy(0.3, False), lights=[replace(lamp, **UNBLOCKED[change])], settings=settings)
+    assert free[index == 1].mean() == pytest.approx(bare[index == 1].mean(), rel=0.02)
+
+
+@pytest.mark.parametrize("strategy", ["auto", "lobes", "all"])
+def test_whichever_strategy_finds_a_glowing_mesh_it_is_as_bright(scene: Scene, strategy: str) -> None:
+    _, frame = scene
+    settings = replace(frame.settings, samples=256, strategy_samples=STRATEGIES[strategy])
+    glow = slab("glow", 4, 0, 2.0, 0.8, emission=(6.0, 6.0, 6.0), visibility=Visibility(camera=False))
+    bare, index = rendered(scene, meshes=[*glossy(0.3, False), glow], lights=[], settings=settings)
+    assert bare[index == 1].mean() > 0.5
+    linked = [*glossy(0.3, False), replace(glow, blockers=0)]
+    found, _ = rendered(scene, meshes=linked, lights=[], settings=settings)
+    assert found[index == 1].mean() == pytest.approx(bare[index == 1].mean(), rel=0.03)
+
+
+@pytest.mark.parametrize("change", UNBLOCKED)
+def test_mirrors_show_what_is_in_front_of_a_lamp_that_it_does_not_block(scene: Scene, change: str) -> None:
+    """Behind the screen the lamp lights what is rough in full, and is not in mirrors."""
+    _, frame = scene
+    settings = replace(frame.settings, samples=256)
+    lamp = replace(frame.lights[0], radius=0.4)
+    seen = {}
+    for rough in (0.03, 0.3, 1.0):
+        bare, index = rendered(scene, meshes=glossy(rough, False), lights=[lamp], settings=settings)
+        behind, _ = rendered(
+            scene, meshes=glossy(rough), lights=[replace(lamp, **UNBLOCKED[change])], settings=settings
+        )
+        assert bare[index == 1].mean() > 0.05
+        seen[rough] = behind[index == 1].mean() / bare[index == 1].mean()
+    assert seen[1.0] == pytest.approx(1.0, abs=0.02) and seen[0.03] < 0.5 and seen[0.03] < seen[0.3] < seen[1.0]
+    blocked = with_bits(replace(frame, meshes=glossy(0.3)), "screen", blocks=1)
+    dark, index = rendered(scene, lights=[replace(lamp, blockers=0)], settings=settings, **blocked)
+    assert dark[index == 1].mean() < 0.5 * seen[0.3]
+
+
 def test_threads_and_strips_do_not_change_a_bit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     _, frame = scene
     key, fill = frame.lights

@@ -20,7 +20,8 @@ from . import mis
 from . import wavefront as w
 from .group_sums import KIND, KINDS, credit_lamps_of_point, credit_point, deliver_groups, finish_groups
 from .indirect import CARRIED, INDIRECT, trace_paths
-from .intersect import FAR, light_radiance, meet, passed, put_hit
+from .intersect import FAR, meet, passed, put_hit
+from .light_visibility import light_radiance
 from .sample_allocation import COSINE, ENVIRONMENT, GGX, LIGHTS
 
 #: Rays of a batch: few enough for the second cache, enough to fill vectors.
@@ -155,7 +156,8 @@ def _trace_lights(rays, count, scene, settings, sums):  # type: ignore[no-untype
         if not scene.traits.lobes_apart:
             others = glossy_others = others + glossy_others
         receiver = s[i + w.POINT_SET]
-        dr, dg, db, gr, gg, gb = light_radiance(rays, slot, others, glossy_others, s[i + w.WL], receiver, scene, mask)
+        counts = s[i + w.WL], s[i + w.WC] + s[i + w.WG]
+        dr, dg, db, gr, gg, gb = light_radiance(rays, slot, others, glossy_others, counts, receiver, scene, mask)
         if dr + dg + db + gr + gg + gb > ZERO:
             group = group_of_sample(scene.lights, receiver, np.int64(rays.ints[c + w.CELL]))
             _reflect_sample(scene.lights, sums, rays, slot, group, (dr, dg, db), (gr, gg, gb))

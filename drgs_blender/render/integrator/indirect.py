@@ -24,7 +24,8 @@ from ..scene.terminator import terminator_at
 from . import brdf, mis
 from . import wavefront as w
 from .group_sums import clear_groups, credit_lamps_of_path, credit_path
-from .intersect import FAR, light_radiance, meet, passed, put_hit, surface_of
+from .intersect import FAR, meet, passed, put_hit, surface_of
+from .light_visibility import light_radiance
 from .multiscatter import has_multiscatter, lobe_weights
 
 Array = np.ndarray
@@ -135,7 +136,7 @@ def _towards_lights(rays, count, scene, shift, found):  # type: ignore[no-untype
         i, c = w.at(slot)
         others = s[i + w.SHARE] * s[i + w.PC] + (ONE - s[i + w.SHARE]) * s[i + w.PG]
         dr, dg, db, gr, gg, gb = light_radiance(
-            rays, slot, others, others, ONE, s[i + w.PATH_SET], scene, np.int32(ray_masks.SHADOW << shift)
+            rays, slot, others, others, (ONE, ONE), s[i + w.PATH_SET], scene, np.int32(ray_masks.SHADOW << shift)
         )
         if dr + dg + db + gr + gg + gb > ZERO:
             owner = np.int64(ints[c + w.OWNER])

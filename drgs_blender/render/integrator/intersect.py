@@ -14,13 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compute.jit import njit
-from ..lights.light_links import blockers_of, lights_of
-from ..lights.light_sampler import light_flags
-from ..lights.light_shapes import DIFFUSE, GLOSSY
-from ..lights.light_shapes import SHADOW as SHADOWED
-from ..lights.triangle_light import ABSENT
 from ..sampling import ONE, ZERO, F, U, mix, unit
-from ..scene import ray_masks
 from ..scene.interaction import Tracer, nearest, shadowed, surface_at
 from ..scene.ray import Hit, Ray
 from ..scene.see_through import nearest_there, transmitted
@@ -436,52 +430,3 @@ def put_start(tracer, rays, slot, points, point):  # type: ignore[no-untyped-def
     i, c = w.at(slot)
     s[i + w.SIZE] = points.size[point]
     ints[c + w.OWN] = U(points.own[point])
-
-
-@njit
-def light_radiance(rays, slot, others, glossy_others, share, receiver, scene, mask):  # type: ignore[no-untyped-def]
-    """Radiance of a light sample times visibility and MIS weight over pdf, for the diffuse and the glossy lobe.
-
-    Parameters
-    ----------
-    rays : Batch
-        As `wavefront.light_directions` and `evaluate` left it.
-    slot : int64
-    others, glossy_others : float32
-        Sum over the other strategies of count times pdf (sr^-1), for the diffuse and the glossy lobe.
-    share : float32
-        Number of light samples.
-    receiver : float32
-        Set of the surface, see `light_links`.
-    scene : Scene
-    mask : int32
-        Of the shadow ray, see `ray_masks`.
-
-    Returns
-    -------
-    dr, dg, db, gr, gg, gb : float32
-        For the diffuse and the glossy lobe, linear Rec.709, not yet times BRDF and cosine; 0 in shadow.
-    """
-    s, ints = rays
-    i, c = w.at(slot)
-    density = s[i + w.MV]
-    r, g, b = s[i + w.ER], s[i + w.EG], s[i + w.EB]
-    if not (s[i + w.LIVE] > ZERO and r + g + b > ZERO and density != ZERO):
-        return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    light = np.int64(ints[c + w.CELL])
-    flags = light_flags(light, lights_of(scene.lights, receiver))
-    if flags & ABSENT and mask >> ray_masks.WITHOUT:
-        return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    bright, own = ONE, blockers_of(scene.lights, receiver, light)
-    if mask >> ray_masks.WITHOUT == 0 and own != 0:
-        mask = own
-    if flags & SHADOWED or own != 0:
-        bright = passed(scene, rays, slot, s[i + w.MU] * F(0.9999), mask)
-        if not bright > ZERO:
-            return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    if density < ZERO or own != 0:
-        others = glossy_others = ZERO
-    density = share * abs(density)
-    diffuse = bright / (others + density) if flags & DIFFUSE else ZERO
-    glossy = bright / (glossy_others + density) if flags & GLOSSY else ZERO
-    return r * diffuse, g * diffuse, b * diffuse, r * glossy, g * glossy, b * glossy

@@ -2,9 +2,9 @@
 
 A sample is divided by the sum, over the strategies that might have drawn it, of number of samples times pdf (Veach
 1997; PBRT 2.2.3): that is its weight over its pdf. The power heuristic, which squares both, is used where a picture
-depends on the weights: at the shadow terminator. The strategies
-are cosine and GGX sampling (two lobes of a BRDF), the environment, and lights, whose weight `intersect.light_radiance`
-has, since their visibility is found there.
+depends on the weights: at the shadow terminator, and behind what does not block a light. The strategies
+are cosine and GGX sampling (two lobes of a BRDF), the environment, and lights, whose weight `light_visibility` has,
+since their visibility is found there.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def balance_heuristic_at(s, i, cosine, ggx):  # type: ignore[no-untyped-def]
 def balance_heuristic(rays, count, cosine, ggx):  # type: ignore[no-untyped-def]
     """MIS weight over pdf (balance heuristic, PBRT 2.2.3): divide both lobes by the sum of count times pdf.
 
-    The strategies are environment, cosine and GGX; lights have a density of their own, see `intersect.light_radiance`.
+    The strategies are environment, cosine and GGX; lights have a density of their own, see `light_visibility`.
 
     Parameters
     ----------

@@ -22,7 +22,8 @@ from .bsdf.lobes import evaluate, evaluate_below
 from .bsdf.surface_lobes import bump_shadow
 from .group_sums import credit_lamps_of_path, credit_path
 from .indirect import lifted
-from .intersect import FAR, light_radiance, passed
+from .intersect import FAR, passed
+from .light_visibility import light_radiance
 
 Array = np.ndarray
 
@@ -316,7 +317,7 @@ def towards_lights(numbers, at, receiver, throughput, first, scratch, count, sce
     s[w.ER], s[w.EG], s[w.EB], s[w.MU], s[w.MV], s[w.LIVE] = r, g, b, distance, density, ONE
     ints[w.CELL] = U(max(light, 0))
     mask = np.int32(ray_masks.SHADOW << settings.shift)
-    dr, dg, db, gr, gg, gb = light_radiance(rays, 0, pdf, pdf, ONE, receiver, scene, mask)
+    dr, dg, db, gr, gg, gb = light_radiance(rays, 0, pdf, pdf, (ONE, ONE), receiver, scene, mask)
     if dr + dg + db + gr + gg + gb > ZERO:
         group = group_of_sample(scene.lights, receiver, np.int64(ints[w.CELL]))
         gather((dr, dg, db), (gr, gg, gb), throughput, first, group, scene.lights, scratch)

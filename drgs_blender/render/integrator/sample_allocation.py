@@ -52,7 +52,7 @@ def _allocate(state, h, share, sampler):  # type: ignore[no-untyped-def]
             step = max(ONE, F(np.int32(total / F(8.0))))
             light = step * _rounded(light / step)
             if lights > ZERO:
-                # Lights without size, or that nothing shadows, are found by their own samples alone.
+                # Lights without size are found by their own samples alone.
                 light = max(light, TWO if envmap > ZERO else ONE)
             light = min(light, total - TWO)
             half = max(ONE, F(np.int32(step / TWO)))

@@ -2,8 +2,7 @@
 
 Objects that are lit by the same lights form a set. Each set has tables of its own lights alone (`light_sampler`), so
 that nothing is drawn for lights that shine elsewhere; kernels choose them by the set of the surface at hand. Shadow
-rays of lights with shadow linking have masks of their own (`scene.ray_masks`); such lights are found by their own
-samples alone, since a ray by another strategy meets other objects.
+rays of lights with shadow linking have masks of their own (`scene.ray_masks`).
 
 Kernels have a version of their own for `LinkedTables`. With `LightTables` the functions here do nothing, and are gone
 from the machine code. Tables with groups (`light_groups`) hold either.
@@ -235,7 +234,7 @@ def _emits_to(lights, receiver, hit, geometry):  # type: ignore[no-untyped-def]
         if hit.face < 0:
             return False
         source = load_int32(geometry.face_object, np.int64(hit.face))
-        return lights.emission[source] >> np.int64(receiver) & 1 != 0 and lights.emission_blockers[source] == 0
+        return lights.emission[source] >> np.int64(receiver) & 1 != 0
 
     return found
 

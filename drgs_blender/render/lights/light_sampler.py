@@ -24,7 +24,6 @@ from .light_shapes import (
     KIND,
     PLACE,
     RADIANCE,
-    SHADOW,
     WIDTH,
     light_direction,
     light_emission,
@@ -235,8 +234,7 @@ def sample_light(n0, n1, n2, px, py, pz, lights):  # type: ignore[no-untyped-def
         Radiance, linear Rec.709; 0 when the light sends nothing here.
     pdf : float32
         Per solid angle times the probability of the pick, sr^-1; 0 when the light sends nothing here. Negative for a
-        light that no other strategy finds (without size, or one that nothing shadows): it adds f cos rgb / |pdf|
-        without a MIS weight.
+        light that no other strategy finds, one without size: it adds f cos rgb / |pdf| without a MIS weight.
     index : int64
         Row of the table or, behind those, of the emitters; -1 for none.
     """
@@ -260,8 +258,6 @@ def sample_light(n0, n1, n2, px, py, pz, lights):  # type: ignore[no-untyped-def
         pdf = -probability
     else:
         pdf = probability * light_pdf(i, px, py, pz, lx, ly, lz, t, table)
-        if not np.int64(table[i, FLAGS]) & SHADOW:
-            pdf = -pdf
     part = light_emission(i, lx, ly, lz, table)
     if bare and table[i, KIND] != F(BARE_SUN):
         part /= t * t
@@ -384,8 +380,7 @@ def light_along(i, origin, direction, tmax, others, share, seen_by, lights):  # 
     """
     table = lights.table
     flags = np.int64(table[i, FLAGS])
-    # What nothing shadows is left to ``sample_light``: only the camera looks at it along rays.
-    if not flags & seen_by or not (flags & SHADOW or seen_by & CAMERA):
+    if not flags & seen_by:
         return ZERO, ZERO, ZERO
     ox, oy, oz = origin
     dx, dy, dz = direction

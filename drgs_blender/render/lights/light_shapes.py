@@ -60,8 +60,7 @@ def light_row(light: Light) -> Array | str:
     row[PLACE : PLACE + 3] = matrix[:3, 3]
     row[CONE_COS], row[REACH_COS] = -2.0, -1.0
     row[FLAGS] = CAMERA * light.camera + DIFFUSE * light.diffuse + GLOSSY * light.glossy
-    # What has blockers of its own is found by its own samples alone, see `light_links`.
-    row[FLAGS] += SHADOW * (light.cast_shadow and light.blockers < 0)
+    row[FLAGS] += SHADOW * light.cast_shadow
     if light.kind != "point":
         if not lengths[2] > 0:
             return "its scale is zero"
