@@ -40,17 +40,21 @@ Row = Callable[[str, np.ndarray, np.ndarray], tuple[str, ...]]
 def render(
     name: str, options: argparse.Namespace, folder: Path, module: str = "composed_job"
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(ours, theirs): (k, h, w, 4) pictures of k seeds. Those of Cycles are kept for as long as the job is the same."""
+    """(ours, theirs): (k, h, w, 4) pictures of k seeds.
+
+    Those of Cycles are kept for as long as the job is the same; ours, too, where an interrupted run is resumed.
+    """
     drgs, npz = spread_asset("spot")
     wanted = []
     for engine, samples in (("CYCLES", options.spp), ("DRGS", options.samples)):
         for seed in range(options.seeds):
             out = OUT / f"{module}-{name}-{engine.lower()}-{seed}.npy"
             note = out.with_suffix(".job.json")
-            program = _PROGRAM.with_name(f"{module}.py").read_bytes()
-            sources = hashlib.sha256(_PROGRAM.read_bytes() + program + npz.read_bytes()).hexdigest()
+            programs = b"".join(path.read_bytes() for path in sorted(_PROGRAM.parent.glob("*_scenes.py")))
+            sources = hashlib.sha256(_PROGRAM.read_bytes() + programs + npz.read_bytes()).hexdigest()
             text = json.dumps([sources, name, samples, seed, options.size, BOUNCES])
-            known = engine == "CYCLES" and out.exists() and note.exists() and note.read_text() == text
+            known = out.exists() and note.exists() and note.read_text() == text
+            known &= engine == "CYCLES" or options.resume
             wanted.append(({"engine": engine, "seed": seed, "samples": samples, "out": str(out)}, note, text, known))
     job = {
         "zip": str(folder / "extension.zip"), "asset": str(drgs), "module": module, "scene": name,
@@ -63,9 +67,8 @@ def render(
     environment = os.environ | {"BLENDER_USER_RESOURCES": str(folder / name), "DRGS_ENGINE": sys.executable}
     command = [str(blender_python()), "-P", str(_PROGRAM), str(path)]
     subprocess.run(command, check=True, timeout=3000, env=environment)
-    for picture, note, text, _ in wanted:
-        if picture["engine"] == "CYCLES":
-            note.write_text(text)
+    for _, note, text, _ in wanted:
+        note.write_text(text)
     pictures = [np.load(picture["out"]) for picture, _, _, _ in wanted]
     return np.stack(pictures[options.seeds :]), np.stack(pictures[: options.seeds])
 
@@ -85,6 +88,7 @@ def options_of(text: str, scenes: Collection[str], seeds: int, spp: int, samples
     parser.add_argument("--spp", type=int, default=spp, help="of Cycles, per pixel and picture")
     parser.add_argument("--samples", type=int, default=samples, help="of ours, per pixel and picture")
     parser.add_argument("--scenes", nargs="+", default=list(scenes), choices=list(scenes))
+    parser.add_argument("--resume", action="store_true", help="keep what an interrupted run of this code rendered")
     options = parser.parse_args()
     if options.seeds < 2:
         parser.error("--seeds: noise can be separated from the rest with two pictures or more")

@@ -12,6 +12,9 @@ from scene_nodes import look, node, painted_image
 
 Tree = bpy.types.NodeTree
 
+#: Surfaces that light passes, of a path: Blender's default, and what paths here allow.
+PASSED = 12
+
 
 def surface(name: str, kind: str, **values: object) -> bpy.types.Material:
     """A material of one shader node; `values` as of `scene_nodes.node`."""
@@ -80,6 +83,7 @@ def sheen(job: dict) -> None:
 
 def glass(job: dict) -> None:
     """Smooth glass of several IOR and colours."""
+    job["passed"] = PASSED
     clear = {"Transmission_Weight": 1.0, "Roughness": 0.0}
     balls(
         principled("Window", IOR=1.5, **clear, Base_Color=(1, 1, 1, 1)),
@@ -90,6 +94,7 @@ def glass(job: dict) -> None:
 
 def rough_glass(job: dict) -> None:
     """Frosted glass; half glass, half paint."""
+    job["passed"] = PASSED
     balls(
         principled("Frosted", Transmission_Weight=1.0, Roughness=0.3, Base_Color=(1, 1, 1, 1)),
         principled("Milky", Transmission_Weight=1.0, Roughness=0.6, Base_Color=(0.9, 0.7, 0.5, 1)),
@@ -99,6 +104,7 @@ def rough_glass(job: dict) -> None:
 
 def thin_glass(job: dict) -> None:
     """A pane before a ball and a cube."""
+    job["passed"] = PASSED
     pane = cube(principled("Pane", Transmission_Weight=1.0, Roughness=0.0, Base_Color=(1, 1, 1, 1)), 1, (0, -0.6, 0.6))
     pane.scale = (1.6, 0.04, 1.1)
     ball(material("Ball", (0.7, 0.3, 0.2)), 0.35, (-0.4, 0.3, 0.35))
@@ -142,6 +148,7 @@ def specular(job: dict) -> None:
 
 def glass_nodes(job: dict) -> None:
     """The Glass, Refraction and Glossy BSDF."""
+    job["passed"] = PASSED
     balls(
         surface("Glass", "BsdfGlass", distribution="GGX", Color=(0.7, 0.9, 0.8, 1), Roughness=0.1, IOR=1.45),
         surface("Refraction", "BsdfRefraction", distribution="GGX", Color=(0.9, 0.8, 0.7, 1), Roughness=0.15, IOR=1.3),

@@ -231,8 +231,10 @@ def build(job: dict) -> bpy.types.Scene:
     cycles = scene.cycles
     cycles.device, cycles.use_adaptive_sampling, cycles.use_denoising = "CPU", False, False
     cycles.pixel_filter_type, cycles.filter_width = "BOX", 1.0
-    cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = job["bounces"]
-    cycles.transmission_bounces = job["bounces"]
+    cycles.diffuse_bounces = cycles.glossy_bounces = job["bounces"]
+    # Surfaces that light passes count apart here, and in Cycles among all: without them its limit would be another.
+    passed = job.get("passed", 0)
+    cycles.max_bounces, cycles.transmission_bounces = job["bounces"] + passed, passed or job["bounces"]
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = cycles.blur_glossy = 0.0
     cycles.caustics_reflective = cycles.caustics_refractive = True
     cycles.light_sampling_threshold = 0.0
