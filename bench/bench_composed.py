@@ -66,7 +66,8 @@ def render(
     path.write_text(json.dumps(job))
     environment = os.environ | {"BLENDER_USER_RESOURCES": str(folder / name), "DRGS_ENGINE": sys.executable}
     command = [str(blender_python()), "-P", str(_PROGRAM), str(path)]
-    subprocess.run(command, check=True, timeout=3000, env=environment)
+    if job["pictures"]:
+        subprocess.run(command, check=True, timeout=3000, env=environment)
     for _, note, text, _ in wanted:
         note.write_text(text)
     pictures = [np.load(picture["out"]) for picture, _, _, _ in wanted]
