@@ -14,6 +14,7 @@ from . import capture_folder, features, marker_poses, pictures, video
 from .features import Photo, Tell
 from .inspection import inspect
 from .marker_sheet import MarkerSheet, recognise
+from .masks import stage as mask_stage
 from .pictures import Picture
 from .preparation import Prepared, has_opencv, prepare
 from .registration import FEWEST, Registration, register
@@ -42,6 +43,9 @@ class Settings:
         Side of the sheet's black squares as measured, mm; None: printed in true size.
     distance : float, optional
         Median distance of the cameras from the object, metres, where no sheet gives the scale.
+    masks : str
+        One of `masks.stage.MODES`: given: those that are there are used; auto: where there are none they are made;
+        none: neither.
     """
 
     frames: int = video.DEFAULT_FRAMES
@@ -49,6 +53,7 @@ class Settings:
     poses: str = "auto"
     marker_length: float | None = None
     distance: float | None = None
+    masks: str = "given"
 
 
 @dataclass(slots=True)
@@ -99,6 +104,9 @@ def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, can
     work = folder / capture_folder.WORK
     film = pictures.find_video(source)
     given = pictures.find_pictures(source) if film is None else [Picture(film, film.stem)]
+    if settings.masks == "none":
+        for picture in given:
+            picture.mask = None
     digest = pictures.digest(given, settings)
     if capture_folder.complete(folder, digest):
         shutil.rmtree(work, ignore_errors=True)
@@ -112,14 +120,18 @@ def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, can
     left_out |= ready.broken
     photos = [photo for photo, picture in zip(ready.photos, ready.pictures) if any(picture is one for one in fit)]
     by_file = {photo.file: picture for photo, picture in zip(ready.photos, ready.pictures)}
-    found, alignment = _cameras(ready, photos, film is not None, source, settings, _part(tell, 0.2, 0.95), cancelled)
+    found, alignment = _cameras(ready, photos, film is not None, source, settings, _part(tell, 0.2, 0.85), cancelled)
     alignment.apply(found)
     for photo in photos:
         if photo.file not in found.matrices:
             left_out[by_file[photo.file].path.name] = "not registered"
     made = Made(folder, len(found.matrices), len(given), left_out, found.method, 0.0, alignment)
     made.error = sum(found.errors.values()) / len(found.errors)
-    made.lines = _lines(made)
+    masked = mask_stage.make_or_check(
+        settings.masks, found, by_file, ready.folder, work / "object_masks", folder / mask_stage.CONTACT_SHEET,
+        ready.masks, str(source), _part(tell, 0.85, 0.96), cancelled,
+    )  # fmt: skip
+    made.lines = _lines(made) + masked.lines
     _tell_left_out(found, photos, by_file, source)
     tell("writing the capture", 0.96)
     more = {
@@ -131,6 +143,10 @@ def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, can
         "ground": alignment.ground_from,
         "error": round(made.error, 4),
     }
+    if masked.fits:
+        more["masks"] = {
+            fit.name: {"outside": round(fit.outside, 4), "missing": round(fit.missing, 4)} for fit in masked.fits
+        }
     said = [f"{source.name}: {made.lines[0]}", *made.lines[1:]]
     capture_folder.write_capture(folder, by_file, found, said, more)
     shutil.rmtree(work, ignore_errors=True)
@@ -255,3 +271,5 @@ def check_settings(settings: Settings) -> None:
     """Raise UsageError for settings out of range."""
     if settings.poses not in POSES:
         raise UsageError("poses", f"is {settings.poses!r}", f"Choose from {', '.join(POSES)}")
+    if settings.masks not in mask_stage.MODES:
+        raise UsageError("masks", f"is {settings.masks!r}", f"Choose from {', '.join(mask_stage.MODES)}")

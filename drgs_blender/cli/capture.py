@@ -59,6 +59,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="pixels of the longer side at which features and markers are sought; default 1600",
     )
+    parser.add_argument(
+        "--masks",
+        choices=("given", "auto", "none"),
+        default="given",
+        help="given: use and check masks that are there (default); auto: make them where there are none, of an object "
+        "on a ground that shows texture; none: neither make nor use any",
+    )
 
 
 def _above_zero(text: str) -> float:
@@ -76,7 +83,12 @@ def run(args: argparse.Namespace) -> int:
     from ..capture.pipeline import Settings, make_capture
 
     settings = Settings(
-        args.video_frames, args.feature_resolution, args.poses, args.marker_length, args.camera_distance
+        args.video_frames,
+        args.feature_resolution,
+        args.poses,
+        args.marker_length,
+        args.camera_distance,
+        args.masks,
     )
     with interruptible() as cancelled, FractionBar(args, "capturing", every=WORK_SECONDS) as bar:
         made = make_capture(args.input, args.out, settings, bar, cancelled)

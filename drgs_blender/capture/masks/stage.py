@@ -1,0 +1,216 @@
+"""The stage of the front end that makes masks of the object, or checks those that are given."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image as Pillow
+
+from ...core.arrays import Array
+from ...core.asset.archive import replace_by
+from ...core.errors import AssetError, DeviceError, first_of
+from .. import libraries
+from ..features import Tell
+from ..pictures import Picture
+from ..registration import Registration
+from ..world_alignment import look_at
+from .contact_sheet import draw_contact_sheet
+from .hull import Hull
+from .hull_check import Fit, check_masks
+from .mask_view import MaskView
+from .object_box import ObjectBox, find_box
+from .segmentation import find_masks, refine_box, window_of
+
+logger = logging.getLogger(__name__)
+
+#: given: masks that are there are used; auto: where no picture has one they are made; none: neither.
+MODES = ("given", "auto", "none")
+#: Pixels of the longer side: whole pictures while the object is sought, the part around it while it is cut out.
+_WHOLE, _PART = 560, 400
+CONTACT_SHEET = "masks.png"
+_REMEDY = "Draw the masks by hand (white on the object, folder masks), or give --masks none"
+
+
+@dataclass(slots=True)
+class Masked:
+    """Masks that were made or checked: figures per view, lines for the report."""
+
+    fits: list[Fit] = field(default_factory=list)
+    lines: list[str] = field(default_factory=list)
+
+
+def make_or_check(mode: str, found: Registration, by_file: dict[str, Picture], copies: Path, work: Path, sheet: Path,
+                  given: Path | None, subject: str, tell: Tell, cancelled: Callable[[], bool]) -> Masked:  # fmt: skip
+    """Make masks where there are none, or check those that are given; `Picture.mask` is set to what is made.
+
+    Parameters
+    ----------
+    mode : str
+        One of `MODES`.
+    found : Registration
+        Z up, ground at 0.
+    by_file : dict of str to Picture
+        Working copy -> picture.
+    copies : Path
+        Folder of working copies.
+    work : Path
+        Folder to write masks into.
+    sheet : Path
+        Contact sheet to write.
+    given : Path, optional
+        Folder of given masks as ``FILE.png``, of the working copies' size.
+    subject : str
+        For messages.
+    tell, cancelled : callable
+
+    Raises
+    ------
+    AssetError
+        A given mask does not fit the others.
+    Cancelled
+        `cancelled` said so.
+    """
+    sheet.unlink(missing_ok=True)
+    if mode == "none" or (mode == "given" and given is None):
+        return Masked()
+    try:
+        cv2: Any = libraries.load("opencv")
+    except DeviceError as error:
+        logger.warning("%s: masks are not %s: %s", subject, "made" if given is None else "checked", error)
+        return Masked()
+    files = sorted(found.matrices)
+    views = [_view(file, by_file[file], found, copies) for file in files]
+    if given is not None:
+        return _check_given(cv2, views, files, given, sheet, subject)
+    return _make(cv2, views, files, by_file, work, sheet, found, subject, tell, cancelled)
+
+
+def _view(file: str, picture: Picture, found: Registration, copies: Path) -> MaskView:
+    with Pillow.open(copies / file) as image:
+        pixels = np.asarray(image.convert("RGB"))
+    lens = found.lenses[file].scaled(pixels.shape[1], pixels.shape[0])
+    return MaskView(picture.path.name, pixels, found.matrices[file], lens)
+
+
+def _whole(view: MaskView) -> MaskView:
+    height, width = view.shape
+    return view.cropped(0, 0, width, height, min(_WHOLE, max(width, height)))
+
+
+def _make(cv2: Any, views: list[MaskView], files: list[str], by_file: dict[str, Picture], work: Path, sheet: Path,
+          found: Registration, subject: str, tell: Tell, cancelled: Callable[[], bool]) -> Masked:  # fmt: skip
+    """Masks by GrabCut and hull; none, with a warning, where no object is found."""
+    tell("masks: the object", 0.0)
+    box: ObjectBox | None = find_box(found.points, np.stack([view.matrix for view in views]))
+    whole = [_whole(view) for view in views]
+    if box is not None and not len(box.points):
+        box = refine_box(cv2, whole, box)
+    windows = [] if box is None else [window_of(cv2, view, box) for view in views]
+    seen = [k for k, window in enumerate(windows) if window is not None]
+    if box is None or len(seen) < 3:
+        logger.warning("%s: no object is found on the ground: no masks are made. %s", subject, _REMEDY)
+        return Masked(lines=["masks: none, no object is found on the ground"])
+    parts = [views[k].cropped(*windows[k], _PART) for k in seen]  # type: ignore[misc]
+    masks, hull = find_masks(cv2, parts, box, tell, cancelled)
+    fits = check_masks(cv2, parts, masks, hull)
+    for index, fit in enumerate(fits):
+        if fit.wrong:  # the others know better
+            masks[index] = hull.seen_by(parts[index], hull.solid(without=index))
+    if not hull.solid().any():
+        logger.warning("%s: masks of the pictures do not fit together: none are made. %s", subject, _REMEDY)
+        return Masked(lines=["masks: none, they do not fit together"])
+    work.mkdir(parents=True, exist_ok=True)
+    for k in range(len(views)):
+        picture = by_file[files[k]]
+        width, height = picture.size
+        drawn = np.zeros((height, width), np.uint8)
+        if k in seen:
+            old_height, old_width = views[k].shape
+            left, top, right, bottom = (
+                round(edge * new / old)
+                for edge, new, old in zip(windows[k], (width, height) * 2, (old_width, old_height) * 2, strict=True)  # type: ignore[arg-type]
+            )
+            part = Pillow.fromarray(masks[seen.index(k)].astype(np.uint8) * 255)
+            resized = np.asarray(part.resize((right - left, bottom - top), Pillow.Resampling.BILINEAR))
+            drawn[top:bottom, left:right] = resized
+        target = work / f"{files[k]}.png"
+        replace_by(target, partial(Pillow.fromarray(drawn).save, format="PNG"))
+        picture.mask = target
+    draw_contact_sheet(sheet, parts, masks, fits)
+    lines = [f"masks: made for {len(views)} pictures; look at {sheet.name}"]
+    replaced = [str(fit) for fit in fits if fit.wrong]
+    doubtful = [str(fit) for fit in fits if fit.doubtful and not fit.wrong]
+    if replaced:
+        logger.warning("%s: masks that do not fit the others are replaced by these' hull: %s", subject,
+                       first_of(replaced))  # fmt: skip
+    return Masked(fits, lines + _doubts(doubtful, subject, sheet))
+
+
+def _doubts(doubtful: list[str], subject: str, sheet: Path) -> list[str]:
+    if not doubtful:
+        return []
+    logger.warning("%s: %d masks are doubtful: %s. Look at %s", subject, len(doubtful), first_of(doubtful), sheet.name)
+    return [f"doubtful masks: {first_of(doubtful)}"]
+
+
+def _check_given(cv2: Any, views: list[MaskView], files: list[str], given: Path, sheet: Path,
+                 subject: str) -> Masked:  # fmt: skip
+    """Figures of given masks; AssetError where one cuts the object."""
+    parts, masks = [], []
+    for file, view in zip(files, views, strict=True):
+        path = given / f"{file}.png"
+        if not path.is_file():
+            continue
+        small = _whole(view)
+        with Pillow.open(path) as image:
+            resized = image.convert("L").resize(small.shape[::-1], Pillow.Resampling.BILINEAR)
+        parts.append(small)
+        masks.append(np.asarray(resized) > 127)
+    if len(parts) < 4:
+        logger.warning("%s: only %d masks are there: they cannot be checked", subject, len(parts))
+        return Masked()
+    fits = check_given(cv2, parts, masks)
+    if not fits:
+        logger.warning("%s: the masks have no part of the space in common: they are not checked", subject)
+        return Masked()
+    draw_contact_sheet(sheet, parts, masks, fits)
+    wrong = [str(fit) for fit in fits if fit.wrong]
+    if wrong and 4 * len(wrong) <= len(fits):  # more than that: the hull is no judge
+        raise AssetError(
+            subject, f"has masks that do not fit the others: {first_of(wrong)}",
+            f"Look at {sheet}; draw these masks anew, or remove these pictures, or give --masks none",
+        )  # fmt: skip
+    doubtful = [str(fit) for fit in fits if fit.doubtful]
+    return Masked(fits, [f"masks: {len(fits)} given ones fit each other", *_doubts(doubtful, subject, sheet)])
+
+
+def check_given(cv2: Any, views: list[MaskView], masks: list[Array]) -> list[Fit]:
+    """Figures of masks against each other; none where they have no hull.
+
+    Parameters
+    ----------
+    cv2 : module
+        OpenCV.
+    views : list of MaskView
+    masks : list of (h, w) bool arrays
+    """
+    box = _box_of_masks(views)
+    for _ in range(2):  # around what the cameras look at, then around the hull
+        hull = Hull(cv2, views, masks, box)
+        if not hull.solid().any():
+            return []
+        box = hull.box(box, grounded=False)
+    return check_masks(cv2, views, masks, Hull(cv2, views, masks, box))
+
+
+def _box_of_masks(views: list[MaskView]) -> ObjectBox:
+    """A cube around what the cameras look at, as large as their nearest distance from it."""
+    target = look_at(np.stack([view.matrix for view in views]))
+    near = 0.7 * min(float(np.linalg.norm(view.centre - target)) for view in views)
+    return ObjectBox(target - near, target + near, np.zeros((0, 3)))
