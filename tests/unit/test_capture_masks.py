@@ -101,7 +101,7 @@ def test_rays_and_projection_are_inverse():
     rows, columns = np.mgrid[:120, :160] + 0.5
     np.testing.assert_allclose(at, np.stack([columns, rows], -1).reshape(-1, 2), atol=1e-6)
     assert (depth > 0).all()
-    part = view.cropped(40, 20, 120, 100, 160)
+    part = view.cropped((40, 20, 120, 100), 160)
     np.testing.assert_allclose(part.project(places)[0], 2 * (at - [40, 20]), atol=1e-6)
 
 

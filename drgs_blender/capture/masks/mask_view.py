@@ -68,8 +68,9 @@ class MaskView:
         local = np.stack([x, y, np.ones_like(x)], axis=-1)
         return local @ (self.matrix @ OPENCV_TO_BLENDER)[:3, :3].T
 
-    def cropped(self, left: int, top: int, right: int, bottom: int, longest: int) -> MaskView:
-        """A part of the picture, enlarged or reduced to `longest` pixels on its longer side."""
+    def cropped(self, window: tuple[int, int, int, int], longest: int) -> MaskView:
+        """A part (left, top, right, bottom) of the picture, made `longest` pixels on its longer side."""
+        left, top, right, bottom = window
         width, height = right - left, bottom - top
         factor = longest / max(width, height)
         size = max(1, round(width * factor)), max(1, round(height * factor))

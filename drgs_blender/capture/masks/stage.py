@@ -100,7 +100,7 @@ def _view(file: str, picture: Picture, found: Registration, copies: Path) -> Mas
 
 def _whole(view: MaskView) -> MaskView:
     height, width = view.shape
-    return view.cropped(0, 0, width, height, min(_WHOLE, max(width, height)))
+    return view.cropped((0, 0, width, height), min(_WHOLE, max(width, height)))
 
 
 def _make(cv2: Any, views: list[MaskView], files: list[str], by_file: dict[str, Picture], work: Path, sheet: Path,
@@ -112,11 +112,12 @@ def _make(cv2: Any, views: list[MaskView], files: list[str], by_file: dict[str, 
     if box is not None and not len(box.points):
         box = refine_box(cv2, whole, box)
     windows = [] if box is None else [window_of(cv2, view, box) for view in views]
-    seen = [k for k, window in enumerate(windows) if window is not None]
+    found_in = {k: window for k, window in enumerate(windows) if window is not None}
+    seen = list(found_in)
     if box is None or len(seen) < 3:
         logger.warning("%s: no object is found on the ground: no masks are made. %s", subject, _REMEDY)
         return Masked(lines=["masks: none, no object is found on the ground"])
-    parts = [views[k].cropped(*windows[k], _PART) for k in seen]  # type: ignore[misc]
+    parts = [views[k].cropped(window, _PART) for k, window in found_in.items()]
     masks, hull = find_masks(cv2, parts, box, tell, cancelled)
     fits = check_masks(cv2, parts, masks, hull)
     for index, fit in enumerate(fits):
