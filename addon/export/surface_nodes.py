@@ -49,7 +49,7 @@ class SurfaceWalker(MixingWalker):
             self.note(output, "the volume is not rendered")
             if not linked:
                 return None
-        if not linked:
+        if ref is None or not linked:
             self.report("has no surface, which is black in Blender; its viewport colour is used")
             return _plain(uniform(material.diffuse_color[:3]), uniform(material.roughness))
         if ref.origin().node.type == "HOLDOUT":
