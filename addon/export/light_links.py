@@ -52,7 +52,13 @@ class LightLinks:
                 warn(f'"{obj.name}": more than {_MOST[kind]} collections of {_WORDS[kind]}; it is not rendered there')
                 continue
             numbers[collection.as_pointer()] = len(numbers)
-            self._members[kind].append(_members(collection))
+            members = _members(collection)
+            self._members[kind].append(members)
+            if kind == "blocker" and members.excluded and not members.included:
+                warn(
+                    f'"{obj.name}": mirrors and glass show the objects that its shadow linking excludes, where Cycles '
+                    "shows the light behind them. Include those that block it instead, or keep them out of the way"
+                )
 
     def __bool__(self) -> bool:
         return any(self._numbers.values())

@@ -61,7 +61,8 @@ def test_included_and_excluded_members(shapes, export):
     links.receiver_collection = linked("four", include=[a], children=[(inner, "INCLUDE")])
     links.blocker_collection = linked("five", children=[(inner, "EXCLUDE")])
     frame, warnings = export()
-    assert lit(frame) == ("ac", "ab") and not warnings
+    assert lit(frame) == ("ac", "ab")
+    assert len(warnings) == 1 and lamp.name in warnings[0] and "excludes" in warnings[0]
     links.receiver_collection = bpy.data.collections.new("empty")
     assert lit(export()[0])[0] == "abc"
 
