@@ -544,7 +544,9 @@ SHADERS = {
         ((0.65, 0.375, 0.3), 0.8, 0.25, (0, 0, 0)),
     ),
     "glowing": (
-        lambda t: add(t, "MixShader", 0.25, add(t, "Emission", A, 4.0), add(t, "BsdfAnisotropic", B, 0.2)),
+        lambda t: add(
+            t, "MixShader", 0.25, add(t, "Emission", A, 4.0), add(t, "BsdfAnisotropic", B, 0.2, distribution="GGX")
+        ),
         ((0.05, 0.15, 0.225), 0.2, 1, (2.4, 0.9, 0.3)),
     ),
     "sum": (
