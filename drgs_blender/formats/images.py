@@ -20,6 +20,8 @@ Array = np.ndarray
 
 #: Largest texture that is decoded, in pixels (16k x 16k).
 PIXEL_LIMIT = 1 << 28
+#: Most pixels per byte of a large file: more is a bomb, not a picture.
+RATIO_LIMIT = 2000
 #: Pillow's own limit is lower than that, and its words do not say what to do.
 Pillow.MAX_IMAGE_PIXELS = None
 _FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF", "GIF")
@@ -44,6 +46,9 @@ def decode_image(data: bytes, subject: str, limit: int = PIXEL_LIMIT) -> Array:
         with Pillow.open(io.BytesIO(data), formats=_FORMATS) as image:
             if image.width * image.height > limit:
                 raise AssetError(subject, f"is {image.width} x {image.height} pixels", "Use a smaller image")
+            if image.width * image.height > max(1 << 26, RATIO_LIMIT * len(data)):
+                size = f"{image.width} x {image.height} pixels in {len(data)} bytes"
+                raise AssetError(subject, f"is {size}, which no picture is", "Use a smaller image")
             if _is_deep(image):
                 return _deep(image, data, subject, limit)
             if image.mode.startswith("I"):  # 16-bit grey
