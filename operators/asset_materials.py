@@ -21,7 +21,6 @@ from ..drgs_blender.core.asset.textures import (
     SLOTS,
     SPECULAR,
     MeshTextures,
-    channel_of,
 )
 
 _EXTENSIONS = ("REPEAT", "EXTEND", "MIRROR")
@@ -99,7 +98,7 @@ def _plug(
         placed = _moved(tree, surface, slot, placed, transform)
     links.new(placed, texture.inputs["Vector"])
     factors, value = textures.factors[k, FACTORS[slot]].tolist(), texture.outputs["Color"]
-    channel = channel_of(slot, textures.files[int(textures.slots[k, slot])][1])
+    channel = textures.channel(slot, int(textures.slots[k, slot]))
     if slot == NORMAL:
         bumps = _node(tree, "ShaderNodeNormalMap", surface, -300, slot)
         bumps.uv_map, bumps.inputs["Strength"].default_value = uv_map, factors[0]

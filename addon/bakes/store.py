@@ -28,7 +28,7 @@ LIMIT = 4 << 30
 KEPT_EXPORTS = 4
 _SUFFIX = ".npz"
 #: What results of a surface and of a World hold: the number of axes of each array.
-_CONTENTS = ({"pixels": 3, "uvs": None, "factor": 0}, {"map": 3, "suns": 2, "kept": 0})
+_CONTENTS = ({"pixels": 3, "uvs": 2, "factor": 0}, {"map": 3, "suns": 2, "kept": 0})
 
 
 def cache_folder() -> Path | None:
@@ -127,7 +127,7 @@ def read(path: Path) -> Baked:
     except (zipfile.BadZipFile, EOFError, KeyError, SyntaxError, MemoryError, NotImplementedError) as error:
         raise ValueError(str(error) or type(error).__name__) from error
     axes = {name: array.ndim for name, array in found.items()}
-    if not any(axes == {n: axes.get(n) if k is None else k for n, k in known.items()} for known in _CONTENTS):
+    if axes not in _CONTENTS:
         raise ValueError(f"holds {', '.join(axes) or 'nothing'}, which is no result of a bake")
     for array in found.values():
         array.flags.writeable = False

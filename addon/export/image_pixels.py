@@ -90,7 +90,7 @@ def _rgba(image: bpy.types.Image) -> Array | None:
         return None
     count = pixels.shape[2]
     opaque = count < 4 or image.alpha_mode == "NONE"
-    channels = 4 if image.is_float else _told(pixels, opaque)
+    channels = 4 if image.is_float else _needed_channels(pixels, opaque)
     found = shareable((*pixels.shape[:2], channels), np.float32 if image.is_float else np.uint8)
     for first in range(0, len(found), _STRIP):
         part, into = pixels[first : first + _STRIP], found[first : first + _STRIP]
@@ -102,7 +102,7 @@ def _rgba(image: bpy.types.Image) -> Array | None:
     return found
 
 
-def _told(pixels: Array, opaque: bool) -> int:
+def _needed_channels(pixels: Array, opaque: bool) -> int:
     """How many channels of bytes say something: 4; 3 where all is opaque; 1 where it is grey, too."""
     if not opaque and any((part[..., 3] != 1).any() for part in _strips(pixels)):
         return 4

@@ -15,7 +15,7 @@ from ...drgs_blender.core.materials import Image
 from .. import mesh_arrays
 from ..bakes.requests import Wanted
 from .export_cache import ExportCache, uid
-from .holdouts import cut_out
+from .holdouts import Holdouts
 from .instances import Key, Visible, terminator_offset
 from .light_links import LightLinks
 from .materials import DEFAULT_MATERIAL, ExportedMaterial, Materials
@@ -78,7 +78,7 @@ class Meshes:
     ) -> None:
         self._links, self._with_uv_map = links, with_uv_map
         self._depsgraph, self._materials, self._warn, self._cache = depsgraph, materials, warn, cache
-        self._wanted = wanted
+        self._wanted, self._holdouts = wanted, Holdouts(warn)
         self._shapes: dict[tuple[object, ...], _Shape] = {}
 
     def add(self, item: Visible) -> None:
@@ -91,7 +91,7 @@ class Meshes:
         def arrays() -> _Arrays:
             return self._cache.get(("arrays", *stands), owners, lambda: self._arrays(obj))
 
-        item = cut_out(item, slots, lambda: arrays().material_index, self._warn)
+        item = self._holdouts.cut_out(item, slots, lambda: arrays().material_index)
         rays = item.visibility
         key = (
             obj.data.as_pointer(),

@@ -46,9 +46,11 @@ class Walker:
         """Say once how a node is approximated."""
         self.approximated = (*self.approximated, self._say(node, problem, self._approximate))
 
-    def note(self, node: bpy.types.Node, problem: str) -> None:
-        """Say once what is wrong with a node, and stays so when it is baked."""
+    def note(self, node: bpy.types.Node, problem: str, approximated: bool = False) -> None:
+        """Say once what is wrong with a node, and stays so when it is baked, as it is where it is `approximated`."""
         self._say(node, problem, self._warn)
+        if approximated:  # not by the text itself, which a bake would withdraw
+            self.approximated = (*self.approximated, problem)
 
     def _say(self, node: bpy.types.Node, problem: str, say: Warn) -> str:
         text = f'{self.owner}, node "{node.label or node.name}": {problem}'

@@ -18,7 +18,7 @@ from .. import assets, cache_playback, mesh_arrays, point_caches
 from ..viewport_material import is_viewport_material
 from .aov_nodes import aov_values
 from .export_cache import ExportCache, uid
-from .holdouts import cut_out
+from .holdouts import Holdouts
 from .instances import Key, Visible, terminator_offset
 from .materials import finite
 from .surface_nodes import SurfaceWalker
@@ -41,6 +41,7 @@ class DrgsObjects:
         aovs: Sequence[Pass] = (),
     ) -> None:
         self._depsgraph, self._key_of, self._warn, self._cache, self._aovs = depsgraph, key_of, warn, cache, aovs
+        self._holdouts = Holdouts(warn)
         self.states: list[ObjectState] = []
         self.keys: list[Key] = []
 
@@ -63,7 +64,7 @@ class DrgsObjects:
             lambda: _shape(obj, self._depsgraph, self._key_of, self._warn),
         )
         material = obj.material_slots[0].material if obj.material_slots else None
-        visibility = cut_out(item, [material], lambda: None, self._warn).visibility
+        visibility = self._holdouts.cut_out(item, [material], lambda: None).visibility
         self.states.append(
             replace(
                 shape,

@@ -41,7 +41,8 @@ class SurfaceWalker(MixingWalker):
         if material.node_tree is None or (bpy.app.version < (5, 0, 0) and not material.use_nodes):
             return _plain(uniform(material.diffuse_color[:3]), uniform(material.roughness), uniform(material.metallic))
         ref = surface_of(material.node_tree)
-        linked = ref is not None and ref.origin().socket.is_output
+        origin = None if ref is None else ref.origin()
+        linked = origin is not None and origin.socket.is_output
         output = ref and ref.node
         if output and output.inputs["Displacement"].is_linked:
             self.note(output, "displacement is not rendered")
@@ -49,10 +50,10 @@ class SurfaceWalker(MixingWalker):
             self.note(output, "the volume is not rendered")
             if not linked:
                 return None
-        if ref is None or not linked:
+        if ref is None or origin is None or not linked:
             self.report("has no surface, which is black in Blender; its viewport colour is used")
             return _plain(uniform(material.diffuse_color[:3]), uniform(material.roughness))
-        if ref.origin().node.type == "HOLDOUT":
+        if origin.node.type == "HOLDOUT":
             return Surface()  # black, where it is not cut out: see `holdouts`
         surface = self.shader(ref)
         return None if surface.alpha.black else self.settled(output, surface)

@@ -57,9 +57,8 @@ class TextureWalker(Walker):
         if shown is None:
             name = "has no image" if image is None else f'image "{image.name}" cannot be read'
             problem = f"{name}; as in Cycles it is magenta. Choose another, or find its file"
-            self.note(node, problem)  # also where a bake shows it
-            if image is not None and images.has_file(image, lookup.frame):
-                self.approximated = (*self.approximated, problem)  # Cycles reads part of some damaged files
+            # Cycles reads part of some damaged files.
+            self.note(node, problem, approximated=image is not None and images.has_file(image, lookup.frame))
             return uniform(1) if output.socket.name == "Alpha" else SocketValue(np.array(images.MISSING))
         if node.projection != "FLAT":
             self.warn(node, f"the {node.projection.title()} projection is not supported; the UV map is used")
@@ -115,8 +114,7 @@ class TextureWalker(Walker):
         values = attribute_values(self.mesh, name)
         if values is None:
             problem = f'mesh "{self.mesh.name}" has no values "{name}", which are black in Cycles. Choose others'
-            self.note(output.node, problem)  # also where a bake shows the black
-            self.approximated = (*self.approximated, problem)
+            self.note(output.node, problem, approximated=True)
             return uniform(self.unknown)
         layer, channel = LayerRef("attribute", name), cast(Channel, "rgb")
         if output.socket.name == "Alpha":

@@ -15,7 +15,7 @@ from . import libraries
 logger = logging.getLogger(__name__)
 
 Tell = Callable[[str, float], None]
-#: Up to so many pictures every one is matched with every other.
+#: Number of pictures up to which every one is matched with every other.
 EXHAUSTIVE = 120
 #: Neighbours in the order of pictures that are matched, and the step of the pictures that are matched with all others
 #: of that step: loops close there.

@@ -48,3 +48,12 @@ def load(name: str) -> Any:
     if name == "pycolmap":
         module.logging.minloglevel = module.logging.Level.FATAL.value  # its errors arrive as exceptions
     return module
+
+
+def is_there(name: str) -> bool:
+    """Whether a row of `LIBRARIES` can be loaded."""
+    try:
+        load(name)
+    except Exception:  # also where a library of its own does not load
+        return False
+    return True

@@ -99,7 +99,7 @@ def has_pictures(source: Path) -> bool:
 
 
 def _photographs(source: Path) -> list[Path]:
-    """The photographs of a folder in the order of their names, those that cannot be read left out and named."""
+    """The photographs of a folder, of the first of `_FOLDERS` that has some, in the order of their names."""
     if not source.is_dir():
         return []
     for folder in (source / name for name in _FOLDERS):
@@ -133,7 +133,7 @@ def find_pictures(source: Path) -> list[Picture]:
     raw = [path.name for path in paths if path.suffix.lower() in RAW]
     beside = {path.stem for path in paths if path.suffix.lower() not in RAW}
     paths = [path for path in paths if path.suffix.lower() not in RAW or path.stem not in beside]
-    if raw and not _has_rawpy():
+    if raw and not libraries.is_there("rawpy"):
         logger.warning(
             "%s: %d camera raw files are left out%s: %s. Reading them needs rawpy (pip install rawpy)",
             source, len(raw), " where no developed picture is beside them" if beside else "", first_of(raw),
@@ -157,14 +157,6 @@ def find_pictures(source: Path) -> list[Picture]:
         logger.warning("%s: %d pictures cannot be read and are left out: %s", source, len(broken), first_of(broken))
     _check_masks(pictures, source)
     return pictures
-
-
-def _has_rawpy() -> bool:
-    try:
-        libraries.load("rawpy")
-    except Exception:  # also where its own library does not load
-        return False
-    return True
 
 
 def _described(picture: Picture) -> Picture:

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import AssetError, UsageError, first_of
-from . import capture_folder, features, marker_poses, pictures, video
+from . import capture_folder, features, libraries, marker_poses, pictures, video
 from .features import Photo, Tell
 from .inspection import inspect
 from .marker_sheet import MarkerSheet, recognise
 from .masks import stage as mask_stage
 from .pictures import Picture
-from .preparation import Prepared, has_opencv, prepare
+from .preparation import Prepared, prepare
 from .registration import FEWEST, Registration, register
 from .world_alignment import Alignment, align_to_ground, align_to_markers
 
@@ -92,12 +92,13 @@ def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, can
     AssetError
         Pictures cannot be used, or too few can be registered.
     UsageError
-        `folder` is not free.
+        `folder` is not free, or a setting is unknown.
     DeviceError
         A library is not installed.
     Cancelled
         `cancelled` said so.
     """
+    check_settings(settings)
     if not source.exists():
         raise AssetError(str(source), "does not exist", "Check the path")
     capture_folder.open_folder(folder, source)
@@ -189,7 +190,7 @@ def _cameras(ready: Prepared, photos: list[Photo], ordered: bool, source: Path, 
         logger.info("%s: %d of %d pictures show the %s marker sheet", source, len(marked.matrices), len(photos), paper)
     if settings.poses == "markers" and (marked is None or len(marked.matrices) < FEWEST):
         count = 0 if marked is None else len(marked.matrices)
-        needed = "" if has_opencv() else "OpenCV is not installed: pip install opencv-python-headless. "
+        needed = "" if libraries.is_there("opencv") else "OpenCV is not installed: pip install opencv-python-headless. "
         raise AssetError(
             str(source),
             f"shows a marker sheet in {count} pictures, of {FEWEST} that are needed",
@@ -268,7 +269,7 @@ def _lines(made: Made) -> list[str]:
 
 
 def check_settings(settings: Settings) -> None:
-    """Raise UsageError for settings out of range."""
+    """Raise UsageError for unknown settings."""
     if settings.poses not in POSES:
         raise UsageError("poses", f"is {settings.poses!r}", f"Choose from {', '.join(POSES)}")
     if settings.masks not in mask_stage.MODES:

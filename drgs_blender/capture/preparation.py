@@ -14,7 +14,6 @@ from ..core.arrays import Array
 from ..core.asset.archive import replace_by
 from ..core.errors import AssetError, Cancelled, DeviceError
 from ..reconstruct.readers.layout import decode_mask
-from . import libraries
 from .features import Photo, Tell
 from .inspection import SHARPNESS_SIZE, Look, look
 from .marker_sheet import detect
@@ -130,12 +129,3 @@ def _look(small: Array, mask: Array | None) -> Look:
         size = tiny.shape[1], tiny.shape[0]
         mask = np.asarray(Pillow.fromarray(mask.astype(np.uint8)).resize(size, Pillow.Resampling.NEAREST)) > 0
     return look(tiny, mask)
-
-
-def has_opencv() -> bool:
-    """Whether markers can be found."""
-    try:
-        libraries.load("opencv")
-    except DeviceError:
-        return False
-    return True

@@ -8,12 +8,11 @@ that was stopped goes on when the same command is given again.
 from __future__ import annotations
 
 import argparse
-import math
 from pathlib import Path
 
 from .interrupt import interruptible
 from .progress import WORK_SECONDS, FractionBar
-from .sampling import int_range
+from .sampling import above_zero, int_range
 
 EXAMPLES = """examples:
   drgs capture photographs --out statue
@@ -42,13 +41,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--marker-length",
-        type=_above_zero,
+        type=above_zero("no length"),
         metavar="MM",
         help="side of the sheet's black squares as measured; default: as printed in true size",
     )
     parser.add_argument(
         "--camera-distance",
-        type=_above_zero,
+        type=above_zero("no length"),
         metavar="M",
         help="metres from the cameras to the object, typically, where no sheet gives the scale",
     )
@@ -66,16 +65,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="given: use and check masks that are there (default); auto: make them where there are none, of an object "
         "on a ground that shows texture; none: neither make nor use any",
     )
-
-
-def _above_zero(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"{text} is no length above zero")
-    return value
 
 
 def run(args: argparse.Namespace) -> int:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import logging
-import math
 import sys
 import time
 from pathlib import Path
@@ -24,7 +23,7 @@ from .frame_lines import emit
 from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_and_report
 from .progress import WORK_SECONDS, FractionBar
-from .sampling import int_range
+from .sampling import above_zero, int_range
 
 if TYPE_CHECKING:
     from ..reconstruct.pipeline import Progress
@@ -67,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--time-budget",
-        type=_minutes,
+        type=above_zero("not a time"),
         metavar="M",
         help="minutes of all stages together, about, once kernels are compiled",
     )
@@ -96,16 +95,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="convention of the camera matrices; default opengl: that of the layout",
     )
     parser.add_argument("--up", choices=tuple(UP_AXES), help="up axis of the capture's world; default: found")
-
-
-def _minutes(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"{text} is not a time above zero")
-    return value
 
 
 def run(args: argparse.Namespace) -> int:

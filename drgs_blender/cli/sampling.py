@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, get_args, get_type_hints
@@ -114,6 +115,21 @@ def int_range(low: int, high: int) -> Any:
         value = whole_number(text)
         if not low <= value <= high:
             raise argparse.ArgumentTypeError(f"{value} is not from {low} to {high}")
+        return value
+
+    return parse
+
+
+def above_zero(what: str) -> Any:
+    """Parser of a finite number above 0; `what` is said of others: "not a time", "no length"."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and value > 0):
+            raise argparse.ArgumentTypeError(f"{text} is {what} above zero")
         return value
 
     return parse

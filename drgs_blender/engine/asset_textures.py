@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core.arrays import keep
 from ..core.asset.model import Asset
-from ..core.asset.textures import ALBEDO, COLOURED, ROUGHNESS, MeshTextures, channel_of
+from ..core.asset.textures import ALBEDO, COLOURED, ROUGHNESS, MeshTextures
 from ..core.color import linear_to_srgb, srgb_to_linear
 from ..core.errors import AssetError
 from ..core.frame import Adjustment
@@ -65,10 +65,6 @@ class TexturedAsset:
     def image(self, number: int, slot: int) -> Image:
         """An image as it is for a slot."""
         return self._images[number, slot in COLOURED]
-
-    def channel(self, number: int, slot: int) -> str:
-        """Channel of an image that counts for a slot, in the words of `core.materials.Texture`."""
-        return channel_of(slot, self.textures.files[number][1])
 
     def baked(self, number: int, slot: int, factors: Array, adjustment: Adjustment) -> Image:
         """An image times its factor, adjusted; made again when the adjustment has changed."""

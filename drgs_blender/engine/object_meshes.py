@@ -201,7 +201,7 @@ def _materials(
             images[image.name] = image
             found[slot] = Texture(
                 image.name,
-                channel=textured.channel(image_number, slot),  # type: ignore[arg-type]
+                channel=textures.channel(slot, image_number),  # type: ignore[arg-type]
                 transform=textures.transforms[k, slot].astype(np.float64),
                 extension=EXTENSIONS[textures.extensions[k, slot]],  # type: ignore[arg-type]
             )

@@ -12,7 +12,15 @@ from ..geometry.normals import VertexNormals
 from .atlas import TexturedMaterial, UniformMaterial
 from .files import plain_name
 from .glb import Glb
-from .mesh_groups import FaceGroup, ImageMaterial, Picture, corner_normals, face_groups, joined_corners
+from .mesh_groups import (
+    FaceGroup,
+    ImageMaterial,
+    Picture,
+    corner_normals,
+    face_groups,
+    joined_corners,
+    pictured_material,
+)
 
 _WRAP = {"repeat": 10497, "extend": 33071, "mirror": 33648}
 #: Of all coats, see `core.asset.model.MATERIAL_CHANNELS`.
@@ -116,7 +124,7 @@ class _Materials:
         specular: dict[str, Any] = {}
         coat: dict[str, Any] = {}
         if isinstance(material, UniformMaterial):
-            pictured = material if isinstance(material, ImageMaterial) else ImageMaterial((1.0, 1.0, 1.0), 1.0, 0.0)
+            pictured = pictured_material(material)
             translucent = material.opacity < 1 or pictured.translucent
             radiance, level = max(material.emission), material.specular
             if radiance > 0:

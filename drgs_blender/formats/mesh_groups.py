@@ -22,7 +22,6 @@ from ..core.asset.textures import (
     SLOTS,
     SPECULAR,
     MeshTextures,
-    channel_of,
 )
 from ..geometry.normals import VertexNormals, unit
 from .atlas import (
@@ -87,6 +86,11 @@ class ImageMaterial(UniformMaterial):
     specular_picture: Picture | None = None
     coat_picture: Picture | None = None
     translucent: bool = False
+
+
+def pictured_material(material: UniformMaterial) -> ImageMaterial:
+    """The material itself where it may have images, else one that has none."""
+    return material if isinstance(material, ImageMaterial) else ImageMaterial((1.0, 1.0, 1.0), 1.0, 0.0)
 
 
 @dataclass(slots=True)
@@ -220,10 +224,10 @@ def _image_material(mesh: Mesh, textures: MeshTextures, k: int, rows: Array) -> 
         if colour is not None and colour.extension != opacity.extension:
             return None  # other programs have one image of both
         if colour is None or slots[ALBEDO] != slots[OPACITY]:
-            colour = _joined(colour, opacity, channel_of(OPACITY, textures.images[_name(textures, slots[OPACITY])]))
+            colour = _joined(colour, opacity, textures.channel(OPACITY, int(slots[OPACITY])))
     elif colour is not None and own_channels.get("opacity", 1.0) < 1:
         colour = colour._replace(data=_opaque(colour.data, f"image {files[int(slots[ALBEDO])][0]}"))
-    if specular is not None and channel_of(SPECULAR, textures.images[_name(textures, slots[SPECULAR])]) != "a":
+    if specular is not None and textures.channel(SPECULAR, int(slots[SPECULAR])) != "a":
         specular = _joined(None, specular, "r")
     return ImageMaterial(
         **own_channels, name=textures.names[k], normal_strength=float(factors[5]),
@@ -231,10 +235,6 @@ def _image_material(mesh: Mesh, textures: MeshTextures, k: int, rows: Array) -> 
         emission_picture=picture(EMISSION), specular_picture=specular, coat_picture=picture(COAT),
         translucent=opacity is not None,
     )  # fmt: skip
-
-
-def _name(textures: MeshTextures, number: int) -> str:
-    return list(textures.images)[number]
 
 
 def _joined(colour: Picture | None, opacity: Picture, channel: str) -> Picture:

@@ -17,7 +17,7 @@ from ..core.asset.archive import replace_file
 from ..core.version import __version__
 from ..geometry.normals import VertexNormals
 from .atlas import TexturedMaterial, UniformMaterial
-from .mesh_groups import FaceGroup, ImageMaterial, corner_normals, face_groups
+from .mesh_groups import FaceGroup, ImageMaterial, corner_normals, face_groups, pictured_material
 
 Array = np.ndarray
 
@@ -147,7 +147,7 @@ def _material(name: str, material: UniformMaterial | TexturedMaterial) -> list[s
             surface += [f"float inputs:clearcoat.connect = <{path}/Layers.outputs:r>", _COAT_ROUGHNESS]
             shaders += _texture(path, "Layers", "layers.png", "raw", ["float outputs:r"])
     else:
-        own = material if isinstance(material, ImageMaterial) else ImageMaterial((1.0, 1.0, 1.0), 1.0, 0.0)
+        own = pictured_material(material)
         picture = own.colour_picture
         if picture is None:
             surface.append(f"color3f inputs:diffuseColor = ({', '.join(f'{v:.9g}' for v in material.colour)})")

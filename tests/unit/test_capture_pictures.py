@@ -96,7 +96,7 @@ def test_what_cannot_be_read_is_left_out_and_named(tmp_path, caplog):
 
 
 def test_raw_files_without_rawpy_are_named(tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr(pictures, "_has_rawpy", lambda: False)
+    monkeypatch.setattr(pictures.libraries, "is_there", lambda name: False)
     for k in range(2):
         texture(k).save(tmp_path / f"{k}.jpg")
         (tmp_path / f"{k}.NEF").write_bytes(b"")

@@ -16,7 +16,7 @@ from .object_box import ObjectBox
 _VOXELS, _TOLERANCE = 88, 0.1
 #: Margin of a box around the hull, in parts of its largest side.
 _MARGIN = 0.12
-#: Views that must see a voxel; from so many on, one may always have it outside.
+#: Views that must see a voxel; number of views from which on one may always have it outside.
 _FEWEST, _MANY = 3, 6
 
 

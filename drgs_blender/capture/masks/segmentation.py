@@ -100,11 +100,15 @@ def refine_box(cv2: Any, views: Sequence[MaskView], box: ObjectBox) -> ObjectBox
 
 def window_of(cv2: Any, view: MaskView, box: ObjectBox) -> tuple[int, int, int, int] | None:
     """(left, top, right, bottom) of the box in a view with some of its surroundings; None where it is not in it."""
-    rows, columns = np.nonzero(_outline(cv2, view, box.corners))
-    if len(rows) < 16:
-        return None
+    seen = _outline(cv2, view, box.corners)
+    return _around(seen) if seen.sum() >= 16 else None
+
+
+def _around(seen: Array) -> tuple[int, int, int, int]:
+    """(left, top, right, bottom) of what is true in (h, w), with some of its surroundings."""
+    rows, columns = np.nonzero(seen)
     margin = 4 + int(_SURROUNDINGS * max(np.ptp(rows), np.ptp(columns)))
-    height, width = view.shape
+    height, width = seen.shape
     left, top = max(0, columns.min() - margin), max(0, rows.min() - margin)
     return left, top, min(width, columns.max() + margin + 1), min(height, rows.max() + margin + 1)
 
@@ -166,12 +170,8 @@ def _cut(cv2: Any, view: MaskView, box: ObjectBox, inside: Array, agreement: Arr
     label_of[~inside | ~outer] = cv2.GC_BGD
     if not ((label_of == cv2.GC_FGD) | (label_of == cv2.GC_PR_FGD)).any():
         return np.zeros((height, width), bool)
-    rows, columns = np.nonzero(outer & inside)
-    margin = 4 + int(_SURROUNDINGS * max(np.ptp(rows), np.ptp(columns)))
-    window = (
-        slice(max(0, rows.min() - margin), rows.max() + margin + 1),
-        slice(max(0, columns.min() - margin), columns.max() + margin + 1),
-    )
+    left, top, right, bottom = _around(outer & inside)
+    window = slice(top, bottom), slice(left, right)
     part = np.ascontiguousarray(label_of[window])
     pixels = np.ascontiguousarray(view.pixels[window][..., ::-1])
     # of a picture of one colour GrabCut does not end

@@ -111,10 +111,9 @@ def _make(cv2: Any, views: list[MaskView], files: list[str], by_file: dict[str, 
     whole = [_whole(view) for view in views]
     if box is not None and not len(box.points):
         box = refine_box(cv2, whole, box)
-    windows = [] if box is None else [window_of(cv2, view, box) for view in views]
-    found_in = {k: window for k, window in enumerate(windows) if window is not None}
-    seen = list(found_in)
-    if box is None or len(seen) < 3:
+    windows = {} if box is None else {k: window_of(cv2, view, box) for k, view in enumerate(views)}
+    found_in = {k: window for k, window in windows.items() if window is not None}
+    if box is None or len(found_in) < 3:
         logger.warning("%s: no object is found on the ground: no masks are made. %s", subject, _REMEDY)
         return Masked(lines=["masks: none, no object is found on the ground"])
     parts = [views[k].cropped(window, _PART) for k, window in found_in.items()]
@@ -127,17 +126,16 @@ def _make(cv2: Any, views: list[MaskView], files: list[str], by_file: dict[str, 
         logger.warning("%s: masks of the pictures do not fit together: none are made. %s", subject, _REMEDY)
         return Masked(lines=["masks: none, they do not fit together"])
     work.mkdir(parents=True, exist_ok=True)
-    for k in range(len(views)):
+    made = dict(zip(found_in, masks, strict=True))
+    for k, view in enumerate(views):
         picture = by_file[files[k]]
         width, height = picture.size
         drawn = np.zeros((height, width), np.uint8)
-        if k in seen:
-            old_height, old_width = views[k].shape
-            left, top, right, bottom = (
-                round(edge * new / old)
-                for edge, new, old in zip(windows[k], (width, height) * 2, (old_width, old_height) * 2, strict=True)  # type: ignore[arg-type]
-            )
-            part = Pillow.fromarray(masks[seen.index(k)].astype(np.uint8) * 255)
+        if k in made:
+            old_height, old_width = view.shape
+            sizes = zip(found_in[k], (width, height) * 2, (old_width, old_height) * 2, strict=True)
+            left, top, right, bottom = (round(edge * new / old) for edge, new, old in sizes)
+            part = Pillow.fromarray(made[k].astype(np.uint8) * 255)
             resized = np.asarray(part.resize((right - left, bottom - top), Pillow.Resampling.BILINEAR))
             drawn[top:bottom, left:right] = resized
         target = work / f"{files[k]}.png"
@@ -185,7 +183,7 @@ def _check_given(cv2: Any, views: list[MaskView], files: list[str], given: Path,
     if wrong and 4 * len(wrong) <= len(fits):  # more than that: the hull is no judge
         raise AssetError(
             subject, f"has masks that do not fit the others: {first_of(wrong)}",
-            f"Look at {sheet}; draw these masks anew, or remove these pictures, or give --masks none",
+            f"Look at {sheet}; draw these masks again, or remove these pictures, or give --masks none",
         )  # fmt: skip
     doubtful = [str(fit) for fit in fits if fit.doubtful]
     return Masked(fits, [f"masks: {len(fits)} given ones fit each other", *_doubts(doubtful, subject, sheet)])

@@ -101,6 +101,12 @@ class MeshTextures:
         """Optional channels of which a material has an image."""
         return tuple(SLOTS[slot] for slot in range(OPACITY, len(SLOTS)) if (self.slots[:, slot] >= 0).any())
 
+    def channel(self, slot: int, number: int) -> str:
+        """Channel that counts of image `number` in a slot: "rgb", "r", "g", "b" or "a"."""
+        if slot in (OPACITY, SPECULAR):
+            return "a" if _has_alpha(self.files[number][1].tobytes()) else "r"
+        return {ROUGHNESS: "g", METALLIC: "b", COAT: "r"}.get(slot, "rgb")
+
     @property
     def files(self) -> list[tuple[str, Array]]:
         """Name with suffix and content of each image."""
@@ -160,13 +166,6 @@ def textures_of(tensors: dict[str, Array], faces: int, where: str) -> MeshTextur
 def image_suffix(data: Array | bytes) -> str:
     """Suffix of an image file by its content, ".png" or ".jpg"; "" of anything else."""
     return next((suffix for suffix, magic in _MAGIC.items() if bytes(data[: len(magic)]) == magic), "")
-
-
-def channel_of(slot: int, data: Array) -> str:
-    """Channel that counts of an image file in a slot: "rgb", "r", "g", "b" or "a"."""
-    if slot in (OPACITY, SPECULAR):
-        return "a" if _has_alpha(data.tobytes()) else "r"
-    return {ROUGHNESS: "g", METALLIC: "b", COAT: "r"}.get(slot, "rgb")
 
 
 def _has_alpha(data: bytes) -> bool:
