@@ -18,7 +18,7 @@ from drgs_blender.core.asset import Asset
 from drgs_blender.core.asset.archive import read_archive, write_archive
 from drgs_blender.core.asset.container import inspect_asset, read_asset, write_asset
 from drgs_blender.core.asset.schema import SINCE, TEXTURES
-from drgs_blender.core.asset.textures import COAT, EMISSION, OPACITY, SPECULAR, channel_of
+from drgs_blender.core.asset.textures import COAT, EMISSION, FACTOR_COUNT, OPACITY, SPECULAR, MeshTextures
 from drgs_blender.core.color import srgb_to_linear
 from drgs_blender.core.errors import AssetError
 from drgs_blender.core.frame import Adjustment, Frame, ObjectState, RenderSettings, World
@@ -182,7 +182,7 @@ def test_an_asset_keeps_the_images_of_its_file() -> None:
     assert textures is not None and textures.optional == ("opacity", "emission", "specular", "coat")
     (slots,), files = textures.slots, list(textures.images.values())
     assert slots[OPACITY] == slots[0] and files[slots[0]].tobytes() == material_images()["base_colour_image"].file
-    assert channel_of(OPACITY, files[slots[OPACITY]]) == "a" and channel_of(SPECULAR, files[slots[SPECULAR]]) == "r"
+    assert textures.channel(OPACITY, slots[OPACITY]) == "a" and textures.channel(SPECULAR, slots[SPECULAR]) == "r"
     for slot, name in ((EMISSION, "emission"), (SPECULAR, "specular"), (COAT, "coat")):
         pixels = decode_image(files[slots[slot]].tobytes(), name)
         np.testing.assert_array_equal(pixels[..., 0], pictures()[name].reshape(16, 16, -1)[..., 0])
@@ -273,7 +273,7 @@ def test_obj_has_images_of_opacity_and_emission(tmp_path: Path) -> None:
     assert {d.tobytes() for d in textures.images.values()} == {
         (tmp_path / name).read_bytes() for name in ("veil.png", "glow.png")
     }
-    assert channel_of(OPACITY, textures.images[list(textures.images)[textures.slots[0, OPACITY]]]) == "r"
+    assert textures.channel(OPACITY, textures.slots[0, OPACITY]) == "r"
 
 
 def test_gltf_names_what_assets_do_not_have(tmp_path: Path) -> None:
@@ -295,15 +295,23 @@ def test_gltf_names_what_assets_do_not_have(tmp_path: Path) -> None:
     assert "glass: IOR 1.33 becomes a specular level" in file.notes
 
 
+def image_alone(data: bytes) -> MeshTextures:
+    """Textures of no face with one image."""
+    shapes = {"uvs": (0, 3, 2), "material": (0,), "slots": (0, 8), "factors": (0, FACTOR_COUNT)}
+    shapes |= {"transforms": (0, 8, 2, 3), "extensions": (0, 8)}
+    arrays = {name: np.zeros(shape) for name, shape in shapes.items()}
+    return MeshTextures(**arrays, names=[], images={"image": np.frombuffer(data, np.uint8)})
+
+
 def test_alpha_of_png_files_is_known_without_decoding() -> None:
     for mode, colour in (("RGB", (1, 2, 3)), ("RGBA", (1, 2, 3, 4)), ("L", 5), ("LA", (5, 6)), ("P", 7)):
         data = io.BytesIO()
         Pillow.new(mode, (3, 2), colour).save(data, "PNG")
-        whole = np.frombuffer(data.getvalue(), np.uint8)
-        assert (channel_of(OPACITY, whole) == "a") == (decode_image(data.getvalue(), "a").shape[2] == 4), mode
+        channel = image_alone(data.getvalue()).channel(OPACITY, 0)
+        assert (channel == "a") == (decode_image(data.getvalue(), "a").shape[2] == 4), mode
     data = io.BytesIO()
     Pillow.new("P", (3, 2), 7).save(data, "PNG", transparency=7)
-    assert channel_of(OPACITY, np.frombuffer(data.getvalue(), np.uint8)) == "a"
+    assert image_alone(data.getvalue()).channel(OPACITY, 0) == "a"
     data = io.BytesIO()
     Pillow.new("RGB", (3, 2)).save(data, "JPEG")
-    assert channel_of(SPECULAR, np.frombuffer(data.getvalue(), np.uint8)) == "r"
+    assert image_alone(data.getvalue()).channel(SPECULAR, 0) == "r"
