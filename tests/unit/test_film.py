@@ -46,7 +46,7 @@ def random_light(n: int, seed: int = 1) -> Radiance:
 
 def numbers(*pass_index: int) -> ObjectNumbers:
     rows = np.arange(len(pass_index), dtype=np.int32)
-    return ObjectNumbers(rows, np.array(pass_index, np.int32), rows + 1)
+    return ObjectNumbers(np.array(pass_index, np.int32), rows + 1)
 
 
 def expose(

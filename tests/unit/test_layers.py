@@ -144,7 +144,7 @@ def developed(buffer: GBuffer, scene: TraceScene, radiance: Radiance, transparen
     camera = look_along_y(SIZE)
     settings = replace(SETTINGS, film_transparent=transparent)
     film = Film(camera, settings, camera_parameters(camera, settings, 1))
-    rows = ObjectNumbers(np.arange(len(scene.source), dtype=np.int32), scene.pass_index, scene.pass_index)
+    rows = ObjectNumbers(scene.pass_index, scene.pass_index)
     film.add(buffer, radiance, rows, EnvironmentLight(World(colour=(1.0, 0.5, 0.25))))
     white = np.ones((*buffer.alpha.shape[:2], 3), np.float32)
     apart = {

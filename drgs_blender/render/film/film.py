@@ -162,7 +162,7 @@ class Film:
         light = radiance.components, radiance.variance, unshadowed
         over_range(
             _develop, y1 - y0, buffer.point_rows(x0, int(self.parameters[WIDTH])), buffer.surfaces(), light,
-            objects.row, self.parameters, self.pixels.rows(y0 - top, y1 - top), fewest=ROWS)  # fmt: skip
+            self.parameters, self.pixels.rows(y0 - top, y1 - top), fewest=ROWS)  # fmt: skip
         if not self.transparent and not environment.black:
             over_range(
                 _background, y1 - y0, self.parameters, x0, y0, buffer.alpha, environment.envmap,
@@ -253,7 +253,7 @@ class Film:
 
 
 @njit
-def _develop(y0, y1, points, surfaces, light, row, p, pixels):  # type: ignore[no-untyped-def]
+def _develop(y0, y1, points, surfaces, light, p, pixels):  # type: ignore[no-untyped-def]
     """Sum the points of each pixel of some rows; they are neighbours in the arrays.
 
     Parameters
@@ -262,8 +262,6 @@ def _develop(y0, y1, points, surfaces, light, row, p, pixels):  # type: ignore[n
     surfaces : PointSurfaces
     light : tuple of array
         Components, variance and unshadowed luminance of `Radiance`.
-    row : array
-        Of `ObjectNumbers`.
     p : array
         `camera.camera_parameters`.
     pixels : Pixels
@@ -342,7 +340,7 @@ def _develop(y0, y1, points, surfaces, light, row, p, pixels):  # type: ignore[n
                 b * inverse,
             )
             pixels.roughness[y, x], pixels.metallic[y, x] = rough * inverse, metal * inverse
-            pixels.object_row[y, x] = np.float32(row[surfaces.object_index[nearest]])
+            pixels.object_row[y, x] = np.float32(surfaces.object_index[nearest])
             first = last
 
 

@@ -20,8 +20,6 @@ class ObjectNumbers(NamedTuple):
 
     Attributes
     ----------
-    row : (n,) int32 array
-        0, 1, ...
     pass_index : (n,) int32 array
         Blender's, of the pass IndexOB.
     name : (n,) int32 array
@@ -29,7 +27,6 @@ class ObjectNumbers(NamedTuple):
         Two names have the same number by a chance of 1 in 2^24, and are then kept apart by shape alone.
     """
 
-    row: Array
     pass_index: Array
     name: Array
 
@@ -38,11 +35,11 @@ def object_numbers(scene: TraceScene) -> ObjectNumbers:
     """The numbers of the objects of a scene."""
     names = [fault.name for fault in scene.faults]
     numbers = np.array([zlib.crc32(name.encode()) % (_MOST - 1) + 1 for name in names], np.int32)
-    return ObjectNumbers(np.arange(len(scene.source), dtype=np.int32), scene.pass_index, numbers[scene.source])
+    return ObjectNumbers(scene.pass_index, numbers[scene.source])
 
 
 def number_of(objects: ObjectNumbers | None, kind: str, row: Array, empty: Array) -> Array:
     """(h, w) float32 of a field of `ObjectNumbers` by pixels' rows, 0 where they are `empty` or there is no object."""
-    if objects is None or not len(objects.row):
+    if objects is None or not len(objects.name):
         return np.zeros(row.shape, np.float32)
     return np.where(empty, 0, getattr(objects, kind)[row.astype(np.int32)]).astype(np.float32)

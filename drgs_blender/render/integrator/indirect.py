@@ -192,7 +192,7 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
             weight = through / (density + light)
             if scene.geometry.terminators != 0 and w.grazing(s, i) > ZERO:
                 light = envmap_pdf(u, v, U(SIDE * SIDE), envmap)
-                weight = through * density / (density * density + light * light)
+                weight = through * mis.power_heuristic(density, light) / density
             group = group_of_environment(scene.lights)
             _find(scene.lights, found, owner, group, fr * red * weight, fg * green * weight, fb * blue * weight)
         if through < ONE and not last:

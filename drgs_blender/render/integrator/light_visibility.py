@@ -21,13 +21,7 @@ from ..sampling import ONE, ZERO, F
 from ..scene import ray_masks
 from . import wavefront as w
 from .intersect import passed
-
-
-@njit
-def _behind(others, density):  # type: ignore[no-untyped-def]
-    """Weight over pdf, by the power heuristic, of a light sample behind a surface that does not block it."""
-    ratio = others / density
-    return ONE / (density * (ONE + ratio * ratio))
+from .mis import power_heuristic
 
 
 @njit
@@ -82,8 +76,9 @@ def light_radiance(rays, slot, others, glossy_others, counts, receiver, scene, m
         met_glossy = met
         if scene.traits.lobes_apart:
             met_glossy = passed(scene, rays, slot, far, np.int32(kind * ray_masks.GLOSSY))
-        behind = bright * _behind(others / lobes, density / share) / share
-        glossy_behind = bright * _behind(glossy_others / lobes, density / share) / share
+        pdf = density / share
+        behind = bright * power_heuristic(pdf, others / lobes) / density
+        glossy_behind = bright * power_heuristic(pdf, glossy_others / lobes) / density
         diffuse, glossy = met * diffuse + (ONE - met) * behind, met_glossy * glossy + (ONE - met_glossy) * glossy_behind
     diffuse, glossy = diffuse if flags & DIFFUSE else ZERO, glossy if flags & GLOSSY else ZERO
     return r * diffuse, g * diffuse, b * diffuse, r * glossy, g * glossy, b * glossy

@@ -20,6 +20,24 @@ _TINY = F(1e-30)
 
 
 @inlined
+def power_heuristic(own, other):  # type: ignore[no-untyped-def]
+    """Weight of a sample by the power heuristic (Veach 1997).
+
+    Parameters
+    ----------
+    own, other : float32
+        Pdf of its strategy, sr^-1, and of the other one.
+
+    Returns
+    -------
+    float32
+        In [0, 1].
+    """
+    ratio = other / max(own, _TINY)
+    return ONE / (ONE + ratio * ratio) if own > ZERO else ZERO
+
+
+@inlined
 def _weight_over_pdf(s, i, cosine, ggx):  # type: ignore[no-untyped-def]
     """One over the density of all strategies together for the slot at i."""
     brdf_density = cosine * s[i + w.WC] * s[i + w.PC] + ggx * s[i + w.WG] * s[i + w.PG]
@@ -107,7 +125,7 @@ def _light_weight(s, i, settings, envmap):  # type: ignore[no-untyped-def]
     diffuse, glossy = s[i + w.KD] * luminance(albedo[0], albedo[1], albedo[2]), luminance(fr, fg, fb)
     density = (diffuse * s[i + w.PC] + glossy * s[i + w.PG]) / max(diffuse + glossy, _TINY)
     light = envmap_pdf(s[i + w.MU], s[i + w.MV], U(SIDE * SIDE), envmap)
-    return light * light / max(light * light + density * density, _TINY)
+    return power_heuristic(light, density)
 
 
 @njit

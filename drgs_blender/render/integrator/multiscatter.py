@@ -132,7 +132,7 @@ def read_1d(table, roughness):  # type: ignore[no-untyped-def]
 
 
 @njit
-def lobe_albedo(nv, roughness, settings):  # type: ignore[no-untyped-def]
+def lobe_albedo(nv, roughness, tables):  # type: ignore[no-untyped-def]
     """E: directional albedo of a lobe of GGX that reflects all light.
 
     Parameters
@@ -141,19 +141,33 @@ def lobe_albedo(nv, roughness, settings):  # type: ignore[no-untyped-def]
         Cosine between viewer and normal.
     roughness : float32
         In [0, 1].
-    settings : Settings
+    tables : Settings or AlbedoTables
 
     Returns
     -------
     float32
         In (0, 1].
     """
-    return max(read_2d(settings.energy, nv, roughness), F(1e-3))
+    return max(read_2d(tables.energy, nv, roughness), F(1e-3))
 
 
 @inlined
-def _added(missing, fresnel, mean):  # type: ignore[no-untyped-def]
-    """Light of further microfacets over that of the first, of a lobe with mean Fresnel reflectance `fresnel`."""
+def added_light(missing, fresnel, mean):  # type: ignore[no-untyped-def]
+    """Light of further microfacets over that of the first.
+
+    Parameters
+    ----------
+    missing : float32
+        (1 - E) / E.
+    fresnel : float32
+        Mean Fresnel reflectance F'.
+    mean : float32
+        E'.
+
+    Returns
+    -------
+    float32
+    """
     return missing * fresnel * mean / max(ONE - fresnel * (ONE - mean), _TINY)
 
 
@@ -188,16 +202,16 @@ def lobe_weights(nv, roughness, metallic, albedo, is_multiscatter, settings):  #
         return kd, (metallic, metallic, metallic), rest
     e, mean = lobe_albedo(nv, roughness, settings), read_1d(settings.mean_energy, roughness)
     missing = (ONE - e) / e
-    added = _added(missing, _DIELECTRIC, mean)
+    added = added_light(missing, _DIELECTRIC, mean)
     if kd > ZERO:
         kd = rest - (rest - kd) * (ONE + added) / (ONE + missing)
     r, g, b = min(albedo[0], ONE), min(albedo[1], ONE), min(albedo[2], ONE)
     return (
         kd,
         (
-            metallic * (ONE + _added(missing, r + (ONE - r) * _SCHLICK, mean)),
-            metallic * (ONE + _added(missing, g + (ONE - g) * _SCHLICK, mean)),
-            metallic * (ONE + _added(missing, b + (ONE - b) * _SCHLICK, mean)),
+            metallic * (ONE + added_light(missing, r + (ONE - r) * _SCHLICK, mean)),
+            metallic * (ONE + added_light(missing, g + (ONE - g) * _SCHLICK, mean)),
+            metallic * (ONE + added_light(missing, b + (ONE - b) * _SCHLICK, mean)),
         ),
         rest * (ONE + added),
     )

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import inlined, njit
+from ...compute.jit import njit
 from ..lights.environment import cell_at, cell_end, direction_in_cell, envmap_pdf, envmap_radiance, first_cell, map_at
 from ..lights.light_groups import group_of_environment, group_of_hit, group_of_sample
 from ..lights.light_links import emits_to, lights_of
@@ -24,6 +24,7 @@ from .group_sums import credit_lamps_of_path, credit_path
 from .indirect import lifted
 from .intersect import FAR, passed
 from .light_visibility import light_radiance
+from .mis import power_heuristic
 
 Array = np.ndarray
 
@@ -58,12 +59,6 @@ class Scratch(NamedTuple):
     direct: Array
     indirect: Array
     grouped: Array
-
-
-@inlined
-def _power_weight(light, brdf):  # type: ignore[no-untyped-def]
-    """MIS weight of a light sample by the power heuristic, see `mis.terminator_weights`."""
-    return light * light / (light * light + brdf * brdf)
 
 
 @njit
@@ -270,7 +265,7 @@ def towards_envmap(numbers, at, row, throughput, first, scratch, count, scene, s
     if through > ZERO:
         k = through / (own + pdf)
         if w.grazing(s, 0) > ZERO:
-            k = through * _power_weight(envmap_pdf(u, v, U(SIDE * SIDE), envmap), s[w.PG]) / own
+            k = through * power_heuristic(envmap_pdf(u, v, U(SIDE * SIDE), envmap), s[w.PG]) / own
         light = (r * k, g * k, b * k)
         gather(light, light, throughput, first, group_of_environment(scene.lights), scene.lights, scratch)
 
@@ -371,7 +366,7 @@ def light_along(ray, densities, receiver, row, diffuse, throughput, first, scrat
         r, g, b = envmap_radiance(u, v, scene.envmap)
         k = through / (pdf + share * envmap_pdf(u, v, row, scene.envmap))
         if share > ZERO and w.grazing(scratch.rays.floats, 0) > ZERO:
-            k = through * (ONE - _power_weight(envmap_pdf(u, v, U(SIDE * SIDE), scene.envmap), pdf)) / pdf
+            k = through * (ONE - power_heuristic(envmap_pdf(u, v, U(SIDE * SIDE), scene.envmap), pdf)) / pdf
         light = k * r, k * g, k * b
         if light[0] + light[1] + light[2] > ZERO:
             gather(light, light, throughput, first, group_of_environment(lights), lights, scratch)

@@ -90,6 +90,15 @@ def _doubled_area(vertices, faces, f):  # type: ignore[no-untyped-def]
     return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
 
 
+@inlined
+def _unit_or(x, y, z, ux, uy, uz):  # type: ignore[no-untyped-def]
+    """A normal made unit; (ux, uy, uz) where it is unusable."""
+    length = np.sqrt(x * x + y * y + z * z)
+    usable = length > 1e-12 and length < FARTHEST
+    scale = np.float32(1.0) / length if usable else np.float32(0.0)
+    return x * scale if usable else ux, y * scale if usable else uy, z * scale if usable else uz
+
+
 @njit
 def corner_normals(first, last, normals, vertices, faces, out):  # type: ignore[no-untyped-def]
     """Fill (3 m, 3) `out` with the (m, 3, 3) normals made unit; count the faces without area.
@@ -118,13 +127,7 @@ def corner_normals(first, last, normals, vertices, faces, out):  # type: ignore[
             empty += 1
             gx, gy, gz = np.float32(0.0), np.float32(0.0), np.float32(1.0)
         for k in range(3):
-            x, y, z = normals[f, k, 0], normals[f, k, 1], normals[f, k, 2]
-            length = np.sqrt(x * x + y * y + z * z)
-            if length > 1e-12 and length < FARTHEST:
-                scale = np.float32(1.0) / length
-                x, y, z = x * scale, y * scale, z * scale
-            else:
-                x, y, z = gx, gy, gz
+            x, y, z = _unit_or(normals[f, k, 0], normals[f, k, 1], normals[f, k, 2], gx, gy, gz)
             out[3 * f + k, 0], out[3 * f + k, 1], out[3 * f + k, 2] = x, y, z
     return empty
 
@@ -140,14 +143,9 @@ def unit_normals(first, last, normals, out):  # type: ignore[no-untyped-def]
     normals, out : (n, 3) float32 array
         `out` is written, (0, 0, 1) where a normal is unusable.
     """
+    zero, one = np.float32(0.0), np.float32(1.0)
     for i in range(first, last):
-        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
-        length = np.sqrt(x * x + y * y + z * z)
-        if length > 1e-12 and length < FARTHEST:
-            scale = np.float32(1.0) / length
-            x, y, z = x * scale, y * scale, z * scale
-        else:
-            x, y, z = np.float32(0.0), np.float32(0.0), np.float32(1.0)
+        x, y, z = _unit_or(normals[i, 0], normals[i, 1], normals[i, 2], zero, zero, one)
         out[i, 0], out[i, 1], out[i, 2] = x, y, z
 
 

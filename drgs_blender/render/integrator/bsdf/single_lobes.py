@@ -6,7 +6,7 @@ import math
 
 from ....compute.jit import inlined, njit
 from ...sampling import ONE, PI, TWO, ZERO, F, basis, luminance
-from ..multiscatter import read_1d, read_2d
+from ..multiscatter import added_light, lobe_albedo, read_1d
 from .albedo_tables import read_3d
 from .lobes import (
     AX,
@@ -154,13 +154,12 @@ def compensate_energy(b, k, mu, mean, tables):  # type: ignore[no-untyped-def]
     tables : AlbedoTables
     """
     rough = math.sqrt(math.sqrt(b[k + AX] * b[k + AY]))
-    e, average = max(read_2d(tables.energy, mu, rough), F(1e-3)), read_1d(tables.mean_energy, rough)
+    e, average = lobe_albedo(mu, rough, tables), read_1d(tables.mean_energy, rough)
     missing = (ONE - e) / e
     b[k + SCALE] = ONE + missing
     for i in range(3):
-        f = min(max(mean[i], ZERO), ONE)
-        many = f * average / max(ONE - f * (ONE - average), F(1e-6))
-        b[k + WEIGHT + i] *= (ONE + many * missing) / (ONE + missing)
+        added = added_light(missing, min(max(mean[i], ZERO), ONE), average)
+        b[k + WEIGHT + i] *= (ONE + added) / (ONE + missing)
 
 
 @njit
