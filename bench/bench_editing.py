@@ -65,7 +65,7 @@ def render(options: argparse.Namespace, folder: Path) -> None:
     subprocess.run([sys.executable, str(ROOT / "tools" / "extension.py"), "--out", str(archive)], check=True)
     job = {
         "zip": str(archive), "out": str(folder), "size": options.size, "samples": options.samples,
-        "assets": {"helmet": str(asset_path("helmet")), "spot": str(textured_spot())},
+        "assets": {"helmet": str(asset_path("helmet", textures=True)), "spot": str(textured_spot())},
         "lights": [str(environments() / f"{name}.exr") for name in LIGHTS],
     }  # fmt: skip
     path = folder / "job.json"

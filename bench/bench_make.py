@@ -43,7 +43,9 @@ def main() -> None:
     light = str(environments() / "city.exr")
     jobs, cameras = [], {}
     for name, file in FILES.items():
-        cameras[name] = frame_camera(read_asset(asset_path(name)).mesh.vertices, options.size, azimuth=-60)
+        cameras[name] = frame_camera(
+            read_asset(asset_path(name, textures=True)).mesh.vertices, options.size, azimuth=-60
+        )
         jobs += [
             {
                 "file": str(ROOT / "examples" / file), "environment": light, "strength": STRENGTH,
@@ -59,7 +61,7 @@ def main() -> None:
     for name in FILES:
         theirs = np.stack([np.load(job["out"]) for job in jobs if f"make-{name}-" in job["out"]])
         for text, more in BUDGETS.items():
-            asset, found = asset_path(name, **more), []
+            asset, found = asset_path(name, textures=True, **more), []
             for sees in ("surfels", "mesh"):
                 ours = np.stack([
                     relight(

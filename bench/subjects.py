@@ -29,12 +29,17 @@ def source_digest() -> str:
     return digest(Path(make.__file__))
 
 
-def asset_path(name: str, **options: Any) -> Path:
-    """`.drgs` of an example as `drgs make` builds it with `options`, made once for these sources."""
-    path = OUT / source_digest() / ("-".join([name, *map(str, options.values())]) + ".drgs")
+def asset_path(name: str, textures: bool = False, **options: Any) -> Path:
+    """`.drgs` of an example as `drgs make` builds it with `options`, made once for these sources.
+
+    Without `textures` its materials are those of its vertices alone, which Cycles is given as well.
+    """
+    kind = ["textures"] if textures else []
+    path = OUT / source_digest() / ("-".join([name, *map(str, options.values()), *kind]) + ".drgs")
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         file, defaults = SOURCES[name]
+        options |= {} if textures else {"max_texture": 0}
         write_asset(path, make_asset(ROOT / "examples" / file, **defaults, **options))
     return path
 

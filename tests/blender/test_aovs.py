@@ -59,6 +59,7 @@ def painted(room):  # noqa: F811
 
 
 @pytest.mark.slow
+@pytest.mark.judged
 def test_passes_are_those_of_cycles(painted, tmp_path):
     theirs, ours = layers_of(painted, "CYCLES", tmp_path), layers_of(painted, "DRGS", tmp_path)
     for name, channels in (("tone", 4), ("wetness", 1)):

@@ -50,6 +50,7 @@ def test_frame_has_the_groups_that_the_view_layer_names(grouped, export):
 
 
 @pytest.mark.slow
+@pytest.mark.judged
 def test_passes_are_those_of_cycles(grouped, tmp_path):
     grouped.cycles.samples = grouped.drgs.samples = 256
     found = {}

@@ -31,6 +31,14 @@ DARK = EnvironmentLight(World(colour=(0.0, 0.0, 0.0)))
 pytestmark = pytest.mark.slow  # Warp compiles the whole integrator for them
 
 
+@pytest.fixture(autouse=True)
+def _not_optimised(device: WarpRenderBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compiling takes longer than these small scenes: half as long without LLVM's optimisation."""
+    import warp
+
+    monkeypatch.setattr(warp.config, "optimization_level", 0)
+
+
 def sky(size: tuple[int, int] = (32, 64)) -> EnvironmentLight:
     image = np.random.default_rng(2).random((*size, 3)).astype(np.float32)
     image[5, 9] = 80.0
