@@ -19,8 +19,8 @@ The tables are written by `tools/settings_page.py` from the dataclasses of the s
     drgs reconstruct lego --out again.drgs --config lego.drgs
 
 - **`--config FILE.toml`** has the settings in tables named as the stages, those of the run before any table; what it
-  leaves out stays as it is by default. `--print-settings` prints all of them as such a file (`... > settings.toml`), with
-  what each is and may be, as other options, `--config` and `--set` that are given with it have changed them.
+  leaves out stays as it is by default. `--print-settings` prints all of them as such a file (`... > settings.toml`),
+  with what each is and may be, as other options, `--config` and `--set` that are given with it have changed them.
 - **`--set NAME=VALUE`** changes one, with the name as below; lists and texts as in TOML, texts without quotes, too.
   Options and `--set` come before the file.
 - **The asset keeps them all**: `drgs inspect` shows them under `provenance`, and `--config A.drgs` uses them again. The
