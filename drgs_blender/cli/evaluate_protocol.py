@@ -67,12 +67,17 @@ def run(args: argparse.Namespace, settings: RenderSettings) -> int:
     flip = find_flip()
     report: dict[str, Any] = {"protocol": protocol.name, "samples": settings.samples, "objects": {}}
     with FractionBar(args, "rendering", every=WORK_SECONDS) as bar:
-        for name in names:
+        for k, name in enumerate(names):
             file = assets if assets.is_file() else assets / f"{name}.drgs"
             asset, render, digest = _loaded(file, settings)
 
-            def tell(part: str, done: int, of: int, name: str = name) -> None:
-                bar(f"{name}, {part}, {done} of {of}", done / of if of else 1.0)
+            begun: list[str] = []  # parts of this object
+
+            def tell(part: str, done: int, of: int, k: int = k, name: str = name, begun: list[str] = begun) -> None:
+                if part not in begun:
+                    begun.append(part)
+                done_here = (len(begun) - 1 + done / of) / protocol.parts
+                bar(f"{name}, {part}, {done} of {of}", (k + done_here) / len(names))
 
             bench = Bench(asset, render, args.resolution, args.most_views, flip, lpips, tell, _writer(args, name))
             report["objects"][name] = {"asset": digest, **protocol.measure(bench, root, name, args.lights_from)}

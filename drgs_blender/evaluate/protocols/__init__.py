@@ -51,6 +51,8 @@ class Protocol:
     measure : callable
         (bench, folder of the set, object, folder of the lights or None) -> figures of the object, nested by name.
     columns : tuple of Column
+    parts : int
+        How many lights an object is rendered under, its own and others, or groups of them.
     lights : bool
         Its light files may lie in another folder.
     about : str
@@ -63,6 +65,7 @@ class Protocol:
     read: Callable[[Path, str, int | None], Capture]
     measure: Callable[[Bench, Path, str, Path | None], dict[str, Any]]
     columns: tuple[Column, ...]
+    parts: int
     lights: bool
     about: str
 
@@ -87,7 +90,7 @@ PROTOCOLS: dict[str, Protocol] = {
     for protocol in (
         Protocol(
             "glossysynthetic", glossysynthetic.OBJECTS, glossysynthetic.folder, glossysynthetic.read,
-            glossysynthetic.measure, (*_pictures("views", "Views"), *_pictures("relit", "Relit")), True,
+            glossysynthetic.measure, (*_pictures("views", "Views"), *_pictures("relit", "Relit")), 4, True,
             "GlossySynthetic (NeRO), relit as GS-ROR measures: 16 views a light, each picture scaled by one factor a "
             "channel over the whole frame on white. Chamfer distance and normals are left out: the set has neither "
             "mesh nor normals",
@@ -95,7 +98,7 @@ PROTOCOLS: dict[str, Protocol] = {
         Protocol(
             "tensoir", tensoir.OBJECTS, tensoir.folder, tensoir.read, tensoir.measure,
             (*_pictures("views", "Views"), *_pictures("relit", "Relit"), Column("materials.albedo_psnr", "Albedo PSNR"),
-             Column("shape.normal_degrees", "Normals MAE")), True,
+             Column("shape.normal_degrees", "Normals MAE")), 6, True,
             "TensoIR-Synthetic: relit with albedo scaled by the median ratio of each channel (20 views); albedo in a "
             "gamma of 2.2; pictures, albedo and normals over the whole frame, on white, normals on +Z",
         ),
@@ -103,13 +106,13 @@ PROTOCOLS: dict[str, Protocol] = {
             "stanford-orb", stanford_orb.OBJECTS, stanford_orb.folder, stanford_orb.read, stanford_orb.measure,
             (*_hdr_pictures("relit", "Relit"), *_hdr_pictures("views", "Views"),
              Column("materials.albedo_psnr", "Albedo PSNR-L"), Column("shape.normal_distance", "Normals 1 - cos", 4),
-             Column("shape.depth_mse", "Depth MSE", 5)), False,
+             Column("shape.depth_mse", "Depth MSE", 5)), 2, False,
             "Stanford-ORB at 512 pixels, inside of the eroded masks; relit pictures scaled by one factor a channel, "
             "others not. Chamfer distance is left out: it needs the benchmark's own sampling of the meshes",
         ),
         Protocol(
             "shiny-blender", shiny_blender.OBJECTS, shiny_blender.folder, shiny_blender.read, shiny_blender.measure,
-            (*_pictures("views", "Views"), Column("shape.normal_degrees", "Normals MAE")), False,
+            (*_pictures("views", "Views"), Column("shape.normal_degrees", "Normals MAE")), 1, False,
             "Shiny Blender (Ref-NeRF): views over the whole frame on white, normals weighted by alpha. Relit pictures "
             "are left out: the set has none, tables with them render their own",
         ),

@@ -114,7 +114,7 @@ def normal_distance(ours: Array, true: Array, inside: Array) -> float:
     """Mean of 1 - cosine over the pixels inside; one without a normal counts 1."""
     lengths = np.linalg.norm(ours, axis=-1) * np.linalg.norm(true, axis=-1)
     distance = 1 - (ours * true).sum(axis=-1) / np.maximum(lengths, 1e-6)
-    return float(distance[inside].mean()) if inside.any() else float("nan")
+    return float(np.maximum(distance[inside], 0).mean()) if inside.any() else float("nan")
 
 
 def depth_error(depths: list[tuple[Array, Array, int]]) -> float | None:
