@@ -7,14 +7,16 @@ serves one request at a time, from any thread, and starts the process again when
 from __future__ import annotations
 
 import os
+import subprocess
 import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import bpy
 
-from ..drgs_blender.core.errors import DeviceError
+from ..drgs_blender.core.errors import DeviceError, EngineError, UsageError
 from ..drgs_blender.core.frame import Frame
+from ..drgs_blender.ipc.child_process import clean_environment
 from ..drgs_blender.ipc.client import EngineClient, Passes, locate_engine
 from ..drgs_blender.ipc.locate import VARIABLE
 from . import engine_environment, messages, preferences
@@ -23,6 +25,8 @@ SET_UP = (
     f"Press Set Up Engine (sidebar > DR-GS), or set {VARIABLE} to a Python environment that has it, such as the folder "
     ".venv of a checkout"
 )
+#: Seconds that Blender waits for a short command.
+PATIENCE = 60.0
 UPDATE = "Press Set Up Engine in sidebar > DR-GS; nothing need be fetched for it"
 
 #: Runs ``drgs`` and ends it together with Blender, however that ends: its standard input is closed then.
@@ -90,6 +94,35 @@ def drgs_command() -> list[str]:
     """
     command = command_line()
     return [*command[: command.index("-m")], "-c", _MAIN]
+
+
+def output_of(arguments: list[str]) -> str:
+    """What ``drgs`` prints, of a command that takes a second or two; Blender waits.
+
+    Raises
+    ------
+    UsageError
+        It fails; with the reason that it gives.
+    EngineError
+        It cannot be started or does not answer.
+    DeviceError
+        See `command_line`.
+    """
+    command = drgs_command()
+    reading, writing = os.pipe()  # its standard input, which stays open
+    try:
+        done = subprocess.run(
+            [*command, *arguments], stdin=reading, capture_output=True, timeout=PATIENCE, env=clean_environment()
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise EngineError("Engine", f"{command[0]} does not answer ({error})", "See the preferences") from error
+    finally:
+        os.close(reading)
+        os.close(writing)
+    if done.returncode:
+        lines = done.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {done.returncode}"]
+        raise UsageError("", lines[-1].removeprefix("drgs: ").rstrip("."), "")
+    return done.stdout.decode()
 
 
 def lacks_reconstruction() -> bool:

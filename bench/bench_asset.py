@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_evaluate import mean, of_truth, score, under_other_lights
+from bench_evaluate import mean, of_truth, score, similarity, under_other_lights
 from decouple_score import with_materials_of
 from PIL import Image
 from report import DOCUMENT, OUT, ROOT, store_row, table, write_section
@@ -35,12 +35,12 @@ FOLDER = OUT / "assets"
 FIGURE = ROOT / "docs" / "images" / "assets.png"
 #: What the sheet shows.
 LIGHT, VIEW = "city", 1
-DEFORMED = "Relit and deformed scaled: frame / foreground"
+DEFORMED, DEFORMED_SIMILARITY = "Relit and deformed scaled: frame / foreground", "Relit and deformed: SSIM / FLIP"
 COLUMNS = (
     "Object", "Primary", "Views left out: frame / foreground", "Relit scaled: frame / foreground",
     "Relit with the true materials", "Relit, the true asset",
     DEFORMED, "Normals deg", "Silhouettes", "Albedo scaled",
-    "Roughness / metallic RMSE", "Seconds after stage (i)",
+    "Roughness / metallic RMSE", "Seconds after stage (i)", "Relit: SSIM / FLIP", DEFORMED_SIMILARITY,
 )  # fmt: skip
 
 
@@ -105,6 +105,7 @@ def row(report: dict[str, Any], beside: list[str], seconds: float) -> list[str]:
         f"{materials['albedo_psnr_scaled']:.2f}",
         f"{materials['roughness_rmse']:.3f} / {materials['metallic_rmse']:.3f}",
         f"{seconds:.0f}",
+        *map(similarity, lit),
     ]
 
 
@@ -116,7 +117,10 @@ def rescore_deformed(objects: list[str], scenes: Path, samples: int) -> None:
         found = score(FOLDER / f"{name}.drgs", scenes / name, "surfels", samples, truth)["lights"]
         line = next(line for line in section.splitlines() if line.startswith(f"| {name} | surfels |"))
         cells = line.strip("| ").split(" | ")
-        cells[COLUMNS.index(DEFORMED)] = pair(found)
+        columns = next(line for line in section.splitlines() if line.startswith(f"| {COLUMNS[0]} |"))
+        for column, cell in ((DEFORMED, pair(found)), (DEFORMED_SIMILARITY, similarity(found))):
+            if column in columns:  # the page may be older than the column
+                cells[columns.strip("| ").split(" | ").index(column)] = cell
         section = section.replace(line, f"| {' | '.join(cells)} |")
         store_row(FOLDER / "rows.json", f"{name}|surfels", cells[2:])
         print(*cells, flush=True)
@@ -178,7 +182,8 @@ def main() -> None:
     bound = f"{options.time_budget:g} minutes" if options.time_budget else "{} and {} steps".format(*options.steps)
     body = (
         f"{bound}, {len(capture.training)} photographs of {side} pixels by Cycles; PSNR in dB over the frame on white, "
-        f"and of the foreground; scaled by one factor a channel; means over the other lights. With the true materials: "
+        f"and of the foreground; scaled by one factor a channel, as are the pictures of SSIM and FLIP, on white; means "
+        f"over the other lights. With the true materials: "
         f"on the own shape; no bound, as learned ones may make up for its errors. The true asset: the ceiling.\n\n"
         f"![One view of each: as photographed; under another light, Cycles and ours; bent](images/{FIGURE.name})\n\n"
     )

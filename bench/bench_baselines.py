@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_evaluate import mean, under_other_lights
+from bench_evaluate import mean, similarity, under_other_lights
 from report import OUT, store_row, table, write_section
 
 from drgs_blender.cli.evaluate import session_renderer
@@ -34,6 +34,7 @@ Array = np.ndarray
 FOLDER = OUT / "baselines"
 COLUMNS = (
     "Object", "Method", "Views left out", "The day's light, deformed", "Relit", "Relit and deformed",
+    "Relit: SSIM / FLIP", "Relit and deformed: SSIM / FLIP",
 )  # fmt: skip
 
 
@@ -94,8 +95,10 @@ def row(folder: Path, name: str, options: argparse.Namespace) -> list[str]:
     draw = renderer(session, session.load_asset(path), method, options.samples)
     report = compare(asset, capture, read_truth(folder), draw)
     (day,) = (entry for entry in report["lights"] if entry["posed"] and entry["training_light"])
-    relit = [mean(under_other_lights(report, posed), "scaled", "foreground") for posed in (False, True)]
-    return [f"{x:.2f}" for x in (report["novel"]["psnr_foreground"], day["scaled"]["foreground"], *relit)]
+    lit = [under_other_lights(report, posed) for posed in (False, True)]
+    relit = [mean(rows, "scaled", "foreground") for rows in lit]
+    figures = (report["novel"]["psnr_foreground"], day["scaled"]["foreground"], *relit)
+    return [*(f"{x:.2f}" for x in figures), *map(similarity, lit)]
 
 
 def main() -> None:
@@ -116,7 +119,8 @@ def main() -> None:
         f"{about}; the same photographs by Cycles, surfels and mesh for every row. What is left out is left out "
         "of learning and of rendering; the integrals are ours, so the rows show what the idea costs and not what the "
         "original programs reach. PSNR of the foreground in dB; all but the views left out scaled by one factor a "
-        "channel; relit: means over the lights that were not photographed. Colours of the day are their mean over all "
+        "channel; SSIM and FLIP of scaled frames on white; relit: means over the lights that were not photographed. "
+        "Colours of the day are their mean over all "
         "views: harmonics, which these methods have, would help them in the two columns of the day's light.\n\n"
     )
     cells = [(*key.split("|"), *cells) for key, cells in rows.items()]

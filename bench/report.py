@@ -41,7 +41,7 @@ def processor_seconds(children: bool = False) -> float:
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """A Markdown table; floats are shown with three significant figures."""
+    """A Markdown table; floats are shown with three significant figures, what kept rows have not as a dash."""
 
     def cell(value: object) -> str:
         if not isinstance(value, float):
@@ -49,7 +49,8 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
         return f"{value:.3g}" if abs(value) < 1e3 else f"{value:.0f}"
 
     lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
-    lines += ["| " + " | ".join(cell(v) for v in row) + " |" for row in rows]
+    whole = [[*map(cell, row), *"-" * (len(columns) - len(row))] for row in rows]
+    lines += ["| " + " | ".join(row) + " |" for row in whole]
     return "\n".join(lines)
 
 

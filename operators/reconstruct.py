@@ -27,6 +27,43 @@ _CAMERAS = (
 )
 
 
+#: Fields of the dialog, 0 where nothing is said -> the setting of each.
+_NUMBERS = {
+    "minutes": "minutes",
+    "resolution": "capture.resolution",
+    "test_every": "capture.test_every",
+    "surfels": "schedule.surfels",
+    "voxels": "mesh_resolution",
+    "iterations": "schedule.iterations",
+    "material_iterations": "decoupling.iterations",
+}
+
+
+def options_of(fields: bpy.types.OperatorProperties) -> list[str]:
+    """Options of ``drgs reconstruct`` for the fields of the dialog."""
+    arguments = ["--variant", fields.variant, "--axes", fields.axes]
+    for name, setting in _NUMBERS.items():
+        if value := getattr(fields, name):
+            arguments += ["--set", f"{setting}={value:.6g}" if isinstance(value, float) else f"{setting}={value}"]
+    return arguments if fields.use_materials else [*arguments, "--no-materials"]
+
+
+def _settings_file(text: str, named: str, folder: Path) -> Path | None:
+    """The file of settings that the dialog gives, a text written to `folder`; None where it gives none."""
+    if text and named:
+        raise UsageError("Settings", f'are given as the text "{text}" and as the file {named}', "Leave one of them out")
+    if named:
+        return Path(bpy.path.abspath(named)).absolute()
+    if not text:
+        return None
+    block = bpy.data.texts.get(text)
+    if block is None:
+        raise UsageError(f'Text "{text}"', "is not in this .blend", "Choose one, or press New Settings")
+    file = folder / f"{bpy.path.clean_name(text)}.toml"
+    file.write_text(block.as_string(), encoding="utf-8")
+    return file
+
+
 class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
     """Make a DR-GS object of photographs, with cameras (COLMAP, NeRF, nerfstudio) or without. Blender goes on"""
 
@@ -47,7 +84,11 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
     minutes: FloatProperty(
-        name="Time Budget (min)", description="About how long it may take", default=10.0, min=0.1, max=1e4
+        name="Time Budget (min)",
+        description="About how long it may take; 0 lets the steps decide",
+        default=10.0,
+        min=0.0,
+        max=1e4,
     )
     resolution: IntProperty(
         name="Resolution", description="Longer side of the photographs, reduced; 0 is as they are", default=400, min=0
@@ -81,6 +122,53 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
     use_environment: BoolProperty(
         name="Set World", description="Light the scene with the light of the photographs", default=False
     )
+    surfels: IntProperty(name="Surfels, at Most", description="0 is 16,000", default=0, min=0, max=5_000_000)
+    voxels: IntProperty(
+        name="Voxels", description="Of the mesh's longest side, from 16 to 1024; 0 is 256", default=0, min=0, max=1024
+    )
+    iterations: IntProperty(
+        name="Surfel Steps", description="How long surfels are learned; 0 is 3,000", default=0, min=0, max=10_000_000
+    )
+    material_iterations: IntProperty(
+        name="Material Steps",
+        description="How long materials and light are learned; 0 is 2,500",
+        default=0,
+        min=0,
+        max=10_000_000,
+    )
+    settings: StringProperty(
+        name="Settings",
+        description="Text with all settings (TOML), as New Settings writes it; it comes in place of the fields above. "
+        "Set World and the scene's device are not among them",
+        options={"SKIP_SAVE"},
+    )
+    config: StringProperty(
+        name="Settings File",
+        description="TOML file of settings, or an asset whose settings to use again, in place of a text",
+        options={"SKIP_SAVE"},
+    )
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split, layout.use_property_decorate = True, False
+        fields = layout.column()
+        fields.active = not (self.settings or self.config)
+        for name in ("minutes", "resolution", "variant", "use_materials", "test_every", "axes"):
+            fields.prop(self, name)
+        layout.prop(self, "use_environment")
+        layout.prop(self, "out")
+        header, body = layout.panel("DRGS_PT_reconstruct_advanced", default_closed=True)
+        header.label(text="Advanced")
+        if body is None:
+            return
+        fields = body.column()
+        fields.active = not (self.settings or self.config)
+        for name in ("surfels", "voxels", "iterations", "material_iterations"):
+            fields.prop(self, name)
+        row = body.row(align=True)
+        row.prop_search(self, "settings", bpy.data, "texts")
+        row.operator("drgs.reconstruct_settings", text="", icon="ADD")
+        body.prop(self, "config")
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -115,15 +203,10 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
             )
         out = Path(bpy.path.abspath(self.out or f"//{bpy.path.clean_name(folder.name)}"))
         out = assets.chosen(out.absolute().with_suffix(".drgs"), bool(self.out))
-        arguments = ["reconstruct", str(capture), "--out", str(out), "--time-budget", f"{self.minutes:g}"]
-        arguments += ["--variant", self.variant, "--axes", self.axes, "--device", context.scene.drgs.device.lower()]
-        if self.resolution:
-            # Eight is the least that the program takes.
-            arguments += ["--resolution", str(max(self.resolution, 8))]
-        if self.test_every > 1:
-            arguments += ["--test-every", str(self.test_every)]
-        if not self.use_materials:
-            arguments.append("--no-materials")
+        arguments = ["reconstruct", str(capture), "--out", str(out), "--device", context.scene.drgs.device.lower()]
+        with self.folder("drgs-reconstruct-") as work:
+            file = _settings_file(self.settings, self.config, work)
+            arguments += options_of(self) if file is None else ["--config", str(file)]
         reconstruction.job = reconstruction.Reconstruction(out)
         subject = f'Capture "{folder.name}"'
         return self.start(context, arguments, subject, f"Making {out.name}", "could not be reconstructed", [out])
@@ -166,6 +249,29 @@ class DRGS_OT_reconstruct_cancel(DrgsOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
+class DRGS_OT_reconstruct_settings(DrgsOperator, bpy.types.Operator):
+    """Write all settings of Reconstruct from Photographs to a new text, as its fields have them, and use that text"""
+
+    bl_idname = "drgs.reconstruct_settings"
+    bl_label = "New Settings"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        dialog = getattr(context.space_data, "active_operator", None)
+        if getattr(dialog, "bl_idname", "") != "DRGS_OT_reconstruct":
+            dialog = None
+        options = [] if dialog is None else options_of(dialog)
+        text = bpy.data.texts.new("Reconstruction.toml")
+        try:
+            text.write(engine_link.output_of(["reconstruct", "--print-settings", *options]))
+        except BaseException:
+            bpy.data.texts.remove(text)
+            raise
+        if dialog is not None:
+            dialog.settings = text.name
+        return {"FINISHED"}
+
+
 def _job() -> reconstruction.Reconstruction:
     assert reconstruction.job is not None, "none is under way"
     return reconstruction.job
@@ -179,4 +285,4 @@ def _redraw(context: bpy.types.Context) -> None:
                 area.tag_redraw()
 
 
-CLASSES = (DRGS_OT_reconstruct, DRGS_OT_reconstruct_cancel)
+CLASSES = (DRGS_OT_reconstruct, DRGS_OT_reconstruct_settings, DRGS_OT_reconstruct_cancel)

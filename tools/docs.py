@@ -25,6 +25,7 @@ NAVIGATION = {
     "Start": ("docs/user-guide.md", "docs/command-line.md", "examples/README.md", "docs/glossary.md", "CHANGELOG.md"),
     "Guides": (
         *("docs/rendering.md", "docs/simulation.md", "docs/deformation.md", "docs/decoupling.md", "docs/capture.md"),
+        *("docs/reconstruct-settings.md", "docs/published-sets.md"),
         *("docs/gpu.md", "docs/benchmarks.md"),
     ),
     "Formats and farm": (

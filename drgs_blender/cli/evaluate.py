@@ -1,6 +1,7 @@
 """Score an asset against its capture: views left out, and lights, poses, materials and shape where they are known.
 
-With --make-scenes, Cycles renders scenes of which everything is known, for this command and any other program.
+With --make-scenes, Cycles renders scenes of which everything is known, for this command and any other program. With
+--protocol, the figures of published tables are computed for whoever has their sets.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from ..core.errors import UsageError
 from ..core.file_types import CAMERAS
 from ..core.frame import Camera, Frame, ObjectState, RenderSettings, Visibility, World
 from ..formats.axes import UP_AXES
-from . import sampling
+from . import evaluate_protocol, sampling
 from .output import check_writable
 from .progress import WORK_SECONDS, FractionBar
 
@@ -33,6 +34,8 @@ EXAMPLES = """examples:
   drgs evaluate head.drgs photographs/head --test-every 8
   drgs evaluate spot.drgs scenes/spot --json
   drgs evaluate lego.drgs TensoIR/lego --relit TensoIR/lego lights/city.hdr --relit TensoIR/lego lights/night.hdr
+  drgs evaluate --protocol tensoir TensoIR_Synthetic --out assets --objects lego
+  drgs evaluate --protocol stanford-orb assets stanfordorb --json
   drgs evaluate --make-scenes scenes
   drgs evaluate --make-scenes scenes --objects spot fern --size 128 --train 40 --test 8 --spp 24
 """
@@ -61,8 +64,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--lpips",
         type=Path,
         nargs=2,
-        metavar=("ALEXNET", "HEADS"),
-        help="weights for LPIPS: torchvision's AlexNet and LPIPS's linear layers; without them it is not computed",
+        metavar=("NETWORK", "HEADS"),
+        help="weights for LPIPS: torchvision's AlexNet or VGG-16 and LPIPS's linear layers of it; without them it is "
+        "not computed",
     )
     parser.add_argument(
         "--relit",
@@ -74,11 +78,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a capture of the object under a known light (EXR, HDR), which is named as the pictures where a layout "
         "has several lights (TensoIR); may be given several times",
     )
+    evaluate_protocol.add_arguments(parser)
     scenes = parser.add_argument_group("scenes with known truth")
     scenes.add_argument("--make-scenes", type=Path, metavar="OUT", help="render them; goes on where it was stopped")
     scenes.add_argument("--small", action="store_true", help="one object, small and few views, in a minute")
     scenes.add_argument(
-        "--objects", nargs="+", metavar="NAME", help="which of spot, cat, robot, helmet, fern; default all"
+        "--objects",
+        nargs="+",
+        metavar="NAME",
+        help="which of spot, cat, robot, helmet, fern; default all. Of --protocol: objects of the set",
     )
     scenes.add_argument("--size", type=sampling.int_range(16, 4096), metavar="N", help="pixels of a side; default 256")
     scenes.add_argument("--train", type=sampling.int_range(2, 10000), metavar="N", help="training views; default 120")
@@ -104,6 +112,11 @@ def run(args: argparse.Namespace) -> int:
         if args.asset is not None:
             raise UsageError("--make-scenes", "takes no asset", "Score assets in a second command")
         return make(args)
+    if args.protocol is not None:
+        return evaluate_protocol.run(args, sampling.override(RenderSettings(), args))
+    for name in ("out", "lights_from", "most_views", "config", "set"):
+        if getattr(args, name):
+            raise UsageError(f"--{name.replace('_', '-')}", "is an option of --protocol", "Leave it out")
     if args.asset is None or args.capture is None:
         raise UsageError("evaluate", "needs an asset and its capture", "See `drgs evaluate --help`")
     return score(args)

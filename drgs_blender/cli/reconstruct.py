@@ -4,6 +4,9 @@ CAPTURE is a folder or file of NeRF-synthetic, NGP, nerfstudio, COLMAP, LLFF, Ne
 folder of photographs or a video without cameras these are found first, as by `drgs capture`, in A.capture. A run that
 was stopped goes on when the same command is given again. While surfels are learned, a picture beside the output,
 A.preview.png, shows a view as it is now and its photograph.
+
+Every setting of both stages has a name (--print-settings, docs/reconstruct-settings.md), for a file (--config) and for
+--set. Options and --set come before the file; the asset keeps them all, and --config A.drgs repeats its run.
 """
 
 from __future__ import annotations
@@ -14,8 +17,9 @@ import logging
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from ..core.errors import UsageError
 from ..core.file_types import CAMERAS
 from ..core.phases import is_preparing
 from ..formats.axes import UP_AXES
@@ -27,13 +31,32 @@ from .sampling import above_zero, int_range
 
 if TYPE_CHECKING:
     from ..reconstruct.pipeline import Progress
+    from ..reconstruct.settings import Reading, Settings
 
 logger = logging.getLogger(__name__)
 
 EXAMPLES = """examples:
   drgs reconstruct lego --out lego.drgs --resolution 400 --time-budget 10
   drgs reconstruct statue/colmap --out statue.drgs --test-every 8 --variant m
+  drgs reconstruct --print-settings --set schedule.iterations=8000 > long.toml
+  drgs reconstruct lego --out lego.drgs --config long.toml --set decoupling.metal_albedo_prior=0
+  drgs reconstruct lego --out again.drgs --config lego.drgs
 """
+
+#: Options -> the settings that they give.
+OPTIONS = {
+    "variant": "variant",
+    "resolution": "capture.resolution",
+    "iterations": "schedule.iterations",
+    "surfels": "schedule.surfels",
+    "voxels": "mesh_resolution",
+    "time_budget": "minutes",
+    "test_every": "capture.test_every",
+    "materials": "materials",
+    "device": "device",
+    "axes": "capture.axes",
+    "up": "capture.up",
+}
 
 #: Seconds between two lines of progress on stdout.
 _REPORT_EVERY = 2.0
@@ -41,12 +64,13 @@ _REPORT_EVERY = 2.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs reconstruct``."""
-    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder or file of photographs, or a video")
-    parser.add_argument("--out", type=Path, required=True, metavar="A.drgs", help="asset to write")
+    parser.add_argument(
+        "capture", type=Path, nargs="?", metavar="CAPTURE", help="folder or file of photographs, or a video"
+    )
+    parser.add_argument("--out", type=Path, metavar="A.drgs", help="asset to write; required")
     parser.add_argument(
         "--variant",
         choices=("p", "m"),
-        default="p",
         help="p keeps free surfels, for particles and for meshes (default); m attaches them to the mesh's faces",
     )
     parser.add_argument(
@@ -79,54 +103,63 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--materials",
         action=argparse.BooleanOptionalAction,
-        default=True,
-        help="separate materials from lighting; without, the albedo is the photographed colour",
+        help="separate materials from lighting (default); without, the albedo is the photographed colour",
     )
     parser.add_argument(
         "--device",
         choices=("cpu", "cuda"),
-        default="cpu",
         help="device of the optimisation: cpu or cuda; falls back to cpu. Default cpu",
     )
     parser.add_argument(
         "--axes",
         choices=tuple(CAMERAS),
-        default="opengl",
         help="convention of the camera matrices; default opengl: that of the layout",
     )
     parser.add_argument("--up", choices=tuple(UP_AXES), help="up axis of the capture's world; default: found")
+    group = parser.add_argument_group("all settings")
+    group.add_argument(
+        "--config", type=Path, metavar="FILE", help="TOML file of settings, or an asset whose settings to use again"
+    )
+    group.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="one setting, such as schedule.iterations=5000 or decoupling.normals=false; may be given several times",
+    )
+    group.add_argument("--print-settings", action="store_true", help="write all settings as TOML, and stop")
 
 
 def run(args: argparse.Namespace) -> int:
     """Reconstruct one capture."""
+    given = {OPTIONS[name]: value for name in OPTIONS if (value := getattr(args, name)) is not None}
+    settings, reading = resolved_settings(args.config, given, args.set)
+    if args.print_settings:
+        from ..reconstruct.settings_file import as_toml
+
+        print(as_toml(settings, reading), end="")
+        return 0
+    if args.capture is None or args.out is None:
+        raise UsageError("reconstruct", "needs CAPTURE and --out A.drgs", "See `drgs reconstruct --help`")
     check_suffix(args.out, (".drgs",))
     check_writable(args.out, (args.capture,))
 
     from ..core.errors import Cancelled, DeviceError
 
     try:
-        from ..reconstruct.pipeline import Settings, reconstruct
+        from ..reconstruct.pipeline import reconstruct
     except ImportError as error:
         if error.name != "torch":
             raise
         raise DeviceError(
             "reconstruct", "needs PyTorch", f'Install it: "{sys.executable}" -m pip install "torch>=2.5"'
         ) from error
-    from ..reconstruct.optim.schedule import Schedule
     from ..reconstruct.readers import read_capture
+    from ..reconstruct.settings_table import as_tables
 
     source = _with_cameras(args)
-    capture = read_capture(source, args.resolution, args.test_every, args.axes, args.up)
+    capture = read_capture(source, reading.resolution, reading.test_every, reading.axes, reading.up)
     logger.info("%d views to learn from, %d left out", len(capture.training), len(capture.testing))
-    given = {"iterations": args.iterations, "surfels": args.surfels}
-    settings = Settings(
-        variant=args.variant,
-        schedule=Schedule(**{name: value for name, value in given.items() if value is not None}),
-        mesh_resolution=args.voxels or Settings().mesh_resolution,
-        minutes=args.time_budget,
-        materials=args.materials,
-        device=args.device,
-    )
     work = args.out.with_name(f"{args.out.stem}.reconstruct")
 
     def note(text: str) -> None:
@@ -142,8 +175,9 @@ def run(args: argparse.Namespace) -> int:
             raise
         finally:
             _remove_if_empty(work)  # where there is nothing to go on from
+    asset.provenance["settings"] = as_tables(settings, reading)
     write_and_report(args.out, asset)
-    _clear(work)
+    clear(work)
     report = asset.provenance["report"]
     if "psnr" in report:
         # Not what `drgs evaluate` says, which renders the asset under the light that was found.
@@ -152,6 +186,46 @@ def run(args: argparse.Namespace) -> int:
         shown = report["decoupling"]["psnr"]
         print(f"  materials in the light that was found, pixels learned from: PSNR {shown:.2f} dB")
     return 0
+
+
+def resolved_settings(config: Path | None, options: dict[str, Any], sets: list[str]) -> tuple[Settings, Reading]:
+    """The settings that a file, options and --set give together, each before the one before it.
+
+    Parameters
+    ----------
+    config : Path or None
+        Of --config.
+    options : dict of str to object
+        Value by name of a setting.
+    sets : list of str
+        Of --set.
+
+    Raises
+    ------
+    UsageError
+        One cannot be used, or is given as an option and by --set.
+    AssetError
+        The asset of --config is damaged.
+    """
+    from ..reconstruct.settings import Reading, Settings
+    from ..reconstruct.settings_file import parse_setting, read_settings
+    from ..reconstruct.settings_table import with_values
+
+    settings, reading = Settings(), Reading()
+    if config is not None:
+        settings, reading = with_values(settings, reading, read_settings(config), str(config))
+    settings, reading = with_values(settings, reading, options)
+    seen: set[str] = set()
+    for text in sets:
+        name, value = parse_setting(text)
+        if name in options or name in seen:
+            flags = {of: f"--{key.replace('_', '-')}" for key, of in OPTIONS.items()}
+            other = flags[name] if name in options else "--set"
+            raise UsageError(f"--set {text}", f"is given twice, also by {other}", "Leave one of them out")
+        seen.add(name)
+        settings, reading = with_values(settings, reading, {name: value}, "--set")
+    settings.check()
+    return settings, reading
 
 
 def _with_cameras(args: argparse.Namespace) -> Path:
@@ -185,7 +259,7 @@ def _with_cameras(args: argparse.Namespace) -> Path:
     return folder
 
 
-def _clear(folder: Path) -> None:
+def clear(folder: Path) -> None:
     """Remove what a run kept to go on from, and nothing else: a folder of this name may have been there before."""
     for pattern in ("*.state", ".*.state.*.tmp"):  # the latter of runs that were killed
         for file in folder.glob(pattern):

@@ -15,7 +15,7 @@ from ..deform.gmls import bind_points, carry
 from ..deform.sources import MeshSource
 from ..reconstruct.capture.capture import Capture, View
 from .flip import find_flip
-from .metrics import depth_error, material_scores, mean_psnr, normal_error, on_white, relight_scores, ssim
+from .metrics import depth_error, material_scores, mean_psnr, normal_error, on_white, relight_scores, ssim, straight
 from .truth import Truth, TruthSet
 
 Array = np.ndarray
@@ -143,13 +143,6 @@ def posed_vertices(asset: Asset, truth: Truth) -> Array:
     return points.astype(np.float32)
 
 
-def _straight(picture: dict[str, Array]) -> tuple[Array, Array]:
-    """((h, w, 3) linear, not premultiplied; (h, w) alpha) of a picture."""
-    combined = np.nan_to_num(picture["Combined"])
-    alpha = np.clip(combined[..., 3], 0, 1)
-    return combined[..., :3] / np.maximum(alpha, 1e-6)[..., None] * (alpha > 0)[..., None], alpha
-
-
 def _white(view: View, background: tuple[float, float, float] | None) -> tuple[Array, Array]:
     """((h, w, 3) encoded picture on white, (h, w) mask) of a photograph."""
     if view.mask is None:
@@ -178,7 +171,7 @@ def _novel(
     wanted = [_white(view, background) for view in views]
     ours = []
     for view, picture in zip(views, pictures):
-        linear, alpha = _straight(picture)
+        linear, alpha = straight(picture)
         # Surroundings that were photographed and not cut out are not ours to show.
         ours.append(on_white(linear, alpha if view.mask is not None else np.ones_like(alpha)))
     true = [picture for picture, _ in wanted]
@@ -196,8 +189,7 @@ def _novel(
 
 
 def _relit(item: TruthSet, pictures: list[dict[str, Array]], distances: Distances, show: Show | None) -> dict[str, Any]:
-    straight = [_straight(picture) for picture in pictures]
-    linear, alpha = (np.stack(parts) for parts in zip(*straight))
+    linear, alpha = (np.stack(parts) for parts in zip(*map(straight, pictures)))
     wanted = [_white(view, (1.0, 1.0, 1.0)) for view in item.views]
     true, mask = (np.stack(parts) for parts in zip(*wanted))
     scores = relight_scores(linear, alpha, true, mask)

@@ -7,7 +7,7 @@ scale and measure on white, which the white background dominates: `relight_score
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -51,23 +51,27 @@ def psnr(picture: Array, reference: Array, mask: Array | None = None) -> float:
     return float(np.minimum(MOST_PSNR, -10 * np.log10(np.maximum(error, 1e-30))))  # unlike Python's, these keep NaN
 
 
-def ssim(picture: Array, reference: Array) -> float:
-    """Structural similarity of (h, w, 3) pictures in [0, 1]: Wang et al. 2004, Gaussian of 1.5, mean of channels."""
+def ssim(picture: Array, reference: Array, border: bool = False) -> float:
+    """Structural similarity of (h, w, 3) pictures in [0, 1]: Wang et al. 2004, Gaussian of 1.5, mean of channels.
+
+    Pixels whose window the picture does not hold whole are left out, unless `border`: then all count, as in the tables
+    of methods that follow 3DGS.
+    """
     from skimage.metrics import structural_similarity
 
     if min(picture.shape[:2]) < 11:
         return float("nan")
-    return float(
-        structural_similarity(
-            np.asarray(picture, np.float64),
-            np.asarray(reference, np.float64),
-            data_range=1.0,
-            channel_axis=-1,
-            gaussian_weights=True,
-            sigma=1.5,
-            use_sample_covariance=False,
-        )
+    mean, whole = structural_similarity(
+        np.asarray(picture, np.float64),
+        np.asarray(reference, np.float64),
+        data_range=1.0,
+        channel_axis=-1,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
     )
+    return float(whole.mean() if border else mean)
 
 
 def fit_scale(values: Array, reference: Array) -> Array:
@@ -196,6 +200,13 @@ def on_white(linear: Array, alpha: Array) -> Array:
     """(..., 3) encoded pictures laid on white, as the published sets are: mixed in encoded values."""
     encoded = np.clip(linear_to_srgb(np.clip(linear, 0, 1)), 0, 1)
     return encoded * alpha[..., None] + (1 - alpha[..., None])
+
+
+def straight(passes: Mapping[str, Array]) -> tuple[Array, Array]:
+    """((h, w, 3) linear, not premultiplied; (h, w) alpha) of the pass Combined."""
+    combined = np.nan_to_num(passes["Combined"])
+    alpha = np.clip(combined[..., 3], 0, 1)
+    return combined[..., :3] / np.maximum(alpha, 1e-6)[..., None] * (alpha > 0)[..., None], alpha
 
 
 def mean_psnr(

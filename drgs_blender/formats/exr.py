@@ -66,6 +66,20 @@ def read_exr(path: Path) -> tuple[Array, bool, list[str]]:
     return np.ascontiguousarray(pixels), cube, notes
 
 
+def exr_size(path: Path) -> tuple[int, int]:
+    """(width, height) from the header of an EXR file. Raises AssetError."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            header = dict(file.parts[0].header)
+    except Exception as error:  # the binding raises whatever the C++ library threw, of no common type
+        raise AssetError(str(path), f"is damaged ({str(error).replace(str(path), 'it')})", _DAMAGED) from error
+    _check_size(header, path)
+    (x0, y0), (x1, y1) = (corner.astype(int) for corner in header["dataWindow"])
+    return int(x1 - x0 + 1), int(y1 - y0 + 1)
+
+
 def _check_size(header: dict[str, Any], path: Path) -> None:
     (x0, y0), (x1, y1) = (corner.astype(np.int64) for corner in header["dataWindow"])
     pixels = int(x1 - x0 + 1) * int(y1 - y0 + 1)

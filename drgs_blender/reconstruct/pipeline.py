@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from ..build.transfer import surfels_to_vertices
 from ..compute.prepare import PHASE, prepare_kernels
 from ..core.arrays import Array
 from ..core.asset.model import BASE_CHANNELS, Asset, Binding, Environment, Mesh, Surfels
-from ..core.errors import Cancelled, WriteError
+from ..core.errors import Cancelled, WriteError, first_of
 from ..deform.binding import bind
 from ..deform.mesh_driven import MeshDriven
 from ..geometry.normals import VertexNormals
@@ -26,7 +26,6 @@ from .capture.capture import Capture, View
 from .capture.training_views import background_of, composed
 from .gpu.select_backend import select_backend
 from .inverse_rendering.run import Decoupled, decouple
-from .inverse_rendering.settings import Settings as Decoupling
 from .jit_warmup import warm_up
 from .losses.photometric import Photograph, structural_similarity
 from .meshing.depth_fusion import fuse, grid
@@ -36,8 +35,9 @@ from .meshing.visual_hull import Region, find_region, have_silhouettes, silhouet
 from .model.attached import attach_learned, bound
 from .model.gaussians import Gaussians
 from .model.thin_structures import is_thin, normals_of
-from .optim.schedule import Schedule
 from .optim.train import Training
+from .settings import Settings
+from .settings_table import as_tables
 
 log = logging.getLogger(__name__)
 
@@ -58,40 +58,6 @@ CHECKPOINT_SETTINGS = {
 }
 #: Fainter surfels do not come into the asset.
 UNSEEN = 0.05
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Settings of a reconstruction.
-
-    Attributes
-    ----------
-    variant : {"p", "m"}
-        "p" keeps the free surfels (driven by particles or mesh), "m" makes surfels on the mesh's faces.
-    schedule : Schedule
-        How surfels are learned.
-    mesh_resolution : int
-        Most voxels along the mesh's longest side.
-    minutes : float, optional
-        The time budget of all stages together, once kernels are compiled; None: the steps of the schedule decide.
-    materials : bool
-        Inverse rendering: materials apart from the light; else albedo is the photographed colour.
-    decoupling : Settings
-        How; its ``seconds`` follow from `minutes`. Normals are learned too: a mesh of photographs has errors.
-    fixed : tuple of str
-        Parameters of surfels on faces that are not learned: "offset", "opacity" (the paper's ablation).
-    device : {"cpu", "cuda"}
-        "cpu", or "cuda" to learn on the first NVIDIA card; without one the CPU does.
-    """
-
-    variant: Literal["p", "m"] = "p"
-    schedule: Schedule = field(default_factory=Schedule)
-    mesh_resolution: int = 256
-    minutes: float | None = None
-    materials: bool = True
-    decoupling: Decoupling = field(default_factory=lambda: Decoupling(normals=True))
-    fixed: tuple[str, ...] = ()
-    device: Literal["cpu", "cuda"] = "cpu"
 
 
 @dataclass(slots=True)
@@ -143,14 +109,19 @@ def reconstruct(
     -------
     Asset
         In the capture's world space. ``provenance["report"]`` holds counts, "psnr" and "ssim" of the views left out;
-        ``provenance["learned_from"]`` the names of the others.
+        ``provenance["learned_from"]`` the names of the others, ``provenance["settings"]`` all settings.
 
     Raises
     ------
+    UsageError
+        Settings out of range.
     UsageError, AssetError: what cannot be reconstructed, see `visual_hull.find_region`, `training_views.targets` and
         `depth_fusion.fuse`.
     """
     settings = settings or Settings()
+    settings.check()
+    if idle := settings.without_effect():
+        log.warning("%s: no effect with variant %s, materials %s", first_of(idle), settings.variant, settings.materials)
     work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)
     region = find_region(capture)
     grid([view.camera for view in capture.training], region, settings.mesh_resolution)  # before minutes of learning
@@ -196,8 +167,9 @@ def reconstruct(
         _copy_materials(surfels, mesh, binding)
         environment, origin = Environment(found.environment), "separated from the lighting"
     learned = [view.name for view in capture.training]
-    provenance = {"capture": capture.name, "learned_from": learned, "variant": settings.variant, "materials": origin}
-    return Asset(surfels, mesh, binding, environment, provenance | {"report": report})
+    provenance: dict[str, Any] = {"capture": capture.name, "learned_from": learned, "variant": settings.variant}
+    provenance |= {"materials": origin, "settings": as_tables(settings), "report": report}
+    return Asset(surfels, mesh, binding, environment, provenance)
 
 
 def mesh_of(gaussians: Gaussians, capture: Capture, region: Region, resolution: int = 256) -> tuple[Mesh, dict]:
@@ -297,10 +269,13 @@ def _on_mesh(
 
 def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: dict[str, Any]) -> Decoupled:
     """Materials, normals and light."""
+    settings = work.settings.decoupling
+    if (seconds := work.seconds(MATERIAL_TIME_FRACTION)) is not None:
+        settings = replace(settings, seconds=seconds)
     found = decouple(
         work.capture,
         mesh,
-        replace(work.settings.decoupling, seconds=work.seconds(MATERIAL_TIME_FRACTION) or 0.0),
+        settings,
         lambda at: work.on_progress(Progress("materials", 0.7 + 0.3 * at.part, len(surfels), at.psnr)),
         work.cancelled,
         work.file("materials"),
@@ -310,8 +285,8 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: 
     done, of = found.report["iterations"], work.settings.decoupling.iterations
     if done < min(FEW_STEPS, of):
         log.warning(
-            "materials got %d of %d steps in their part of %g minutes, too few to separate them from the light: give "
-            "more minutes, or photographs of a lower resolution", done, of, work.settings.minutes,
+            "materials got %d of %d steps in their %g seconds, too few to separate them from the light: give "
+            "more time, or photographs of a lower resolution", done, of, settings.seconds,
         )  # fmt: skip
     # Without the clock: the same run gives the same bytes.
     report["decoupling"] = {key: value for key, value in found.report.items() if key != "seconds"}

@@ -147,11 +147,14 @@ def test_it_works_beside_the_window_until_cancelled(scene, photographs, tmp_path
     stand_in = type("StandIn", (program.CommandOperator,), own)()
     values = {"filepath": str(photographs), "out": "", "minutes": 5.0, "resolution": 0, "variant": "p"}
     values |= {"use_materials": True, "test_every": 0, "axes": "opengl", "use_environment": False}
+    values |= {name: 0 for name in ("surfels", "voxels", "iterations", "material_iterations")}
+    values |= {"settings": "", "config": ""}
     for name, value in values.items():
         setattr(stand_in, name, value)
     scene.drgs.device = "CUDA"
     assert stand_in.run(context) == {"RUNNING_MODAL"}
     process = stand_in._process
+    assert "minutes=5" in process.args
     assert process.args[process.args.index("--device") + 1] == "cuda"
     tick, escape = SimpleNamespace(type="TIMER"), SimpleNamespace(type="ESC")
     assert stand_in.modal(context, tick) == {"PASS_THROUGH"} and not cls.poll(context)
@@ -160,3 +163,84 @@ def test_it_works_beside_the_window_until_cancelled(scene, photographs, tmp_path
     assert bpy.ops.drgs.reconstruct_cancel() == {"FINISHED"}
     assert stand_in.modal(context, tick) == {"CANCELLED"}
     assert process.poll() is not None and reconstruction.job is None and context.texts[-1] is None
+
+
+def test_new_settings_are_a_text_with_what_the_fields_say_and_that_text_is_used(scene, photographs, monkeypatch):
+    """In the background there is no dialog: its fields are those of a stand-in."""
+    texts = set(bpy.data.texts)
+    assert bpy.ops.drgs.reconstruct_settings() == {"FINISHED"}
+    (text,) = set(bpy.data.texts) - texts
+    said = text.as_string()
+    assert (
+        "[schedule]" in said and "[decoupling]" in said and "iterations = 3000 " in said and "grey_light_prior" in said
+    )
+    fields = SimpleNamespace(
+        bl_idname="DRGS_OT_reconstruct", minutes=0.25, resolution=64, test_every=0, surfels=900, voxels=40, variant="m",
+        iterations=10_000_000, material_iterations=0, axes="opencv", use_materials=False, settings="", config="",
+    )  # fmt: skip
+    cls = operator.DRGS_OT_reconstruct_settings
+    assert cls.run(SimpleNamespace(), SimpleNamespace(space_data=SimpleNamespace(active_operator=fields))) == {
+        "FINISHED"
+    }
+    said = bpy.data.texts[fields.settings].as_string()
+    for line in (
+        "minutes = 0.25 ",
+        "surfels = 900 ",
+        "iterations = 10000000 ",
+        "mesh_resolution = 40 ",
+        "test_every = ",
+    ):
+        assert line in said
+    assert 'variant = "m" ' in said and "materials = false " in said and 'axes = "opencv" ' in said
+    # A text that cannot be used is refused by its name and what is wrong in it.
+    bpy.data.texts[fields.settings].from_string("[schedule]\niteration = 3")
+    with pytest.raises(RuntimeError, match=r"toml, schedule.iteration: .*did you mean schedule.iterations"):
+        bpy.ops.drgs.reconstruct(filepath=str(photographs), settings=fields.settings)
+    with pytest.raises(RuntimeError, match=r'Text "none": is not in this \.blend'):
+        bpy.ops.drgs.reconstruct(filepath=str(photographs), settings="none")
+    with pytest.raises(RuntimeError, match="Leave one of them out"):
+        bpy.ops.drgs.reconstruct(filepath=str(photographs), settings=text.name, config="//a.toml")
+    assert reconstruction.job is None
+    before = set(bpy.data.texts)
+    monkeypatch.setattr(part("addon.engine_link"), "command_line", lambda: ["/nowhere/python", "-m", "drgs"])
+    with pytest.raises(RuntimeError, match="does not answer"):
+        bpy.ops.drgs.reconstruct_settings()
+    assert set(bpy.data.texts) == before
+
+
+class Layout:
+    """A layout that knows which properties and operators it is asked to show."""
+
+    def __init__(self, shown, opened=True):
+        self.shown, self.opened = shown, opened
+
+    def column(self, **_):
+        return Layout(self.shown, self.opened)
+
+    row = column
+
+    def panel(self, *_, **__):
+        return Layout(self.shown), Layout(self.shown) if self.opened else None
+
+    def prop(self, owner, name, **_):
+        assert hasattr(owner, name)
+        self.shown.append(name)
+
+    def prop_search(self, owner, name, *_):
+        self.prop(owner, name)
+
+    def operator(self, name, **_):
+        assert hasattr(bpy.ops.drgs, name.removeprefix("drgs."))
+
+    def label(self, **_):
+        pass
+
+
+@pytest.mark.parametrize("opened", [False, True])
+def test_the_dialog_shows_every_field_once_and_the_advanced_ones_where_they_are_opened(opened):
+    known = [p.identifier for p in bpy.ops.drgs.reconstruct.get_rna_type().properties if not p.is_hidden]
+    fields = SimpleNamespace(**dict.fromkeys(known, ""), layout=Layout(shown := [], opened))
+    operator.DRGS_OT_reconstruct.draw(fields, bpy.context)
+    hidden = {"surfels", "voxels", "iterations", "material_iterations", "settings", "config"}
+    expected = set(known) - {"rna_type", "filepath"} - (set() if opened else hidden)
+    assert sorted(shown) == sorted(expected)

@@ -181,21 +181,37 @@ def test_materials():
     assert np.allclose(metrics.on_white(linear[:, None], np.ones(11)), linear_to_srgb(linear)[:, None])
 
 
-def test_lpips_with_given_weights(tmp_path):
-    torch = pytest.importorskip("torch")
+def networks():
+    """Name -> the layers of the paper by torch's own modules, and those that are compared."""
     from torch import nn
 
-    torch.manual_seed(0)
-    alexnet = nn.Sequential(  # the layers of the paper, by torch's own modules
+    alexnet = nn.Sequential(
         nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2),
         nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2),
         nn.Conv2d(192, 384, 3, padding=1), nn.ReLU(),
         nn.Conv2d(384, 256, 3, padding=1), nn.ReLU(),
         nn.Conv2d(256, 256, 3, padding=1), nn.ReLU(),
     )  # fmt: skip
-    heads = [torch.rand(1, c, 1, 1) for c in (64, 192, 384, 256, 256)]
-    torch.save({f"features.{k}": v for k, v in alexnet.state_dict().items()}, tmp_path / "alexnet.pth")
-    torch.save({f"lin{k}.model.1.weight": h for k, h in enumerate(heads)}, tmp_path / "alex.pth")
+    layers, before = [], 3
+    for block in ((4, 4), (6, 6), (8, 8, 8), (10, 10, 10), (10, 10, 10)):  # narrower than the real one
+        layers += [] if before == 3 else [nn.MaxPool2d(2, 2)]
+        for channels in block:
+            layers += [nn.Conv2d(before, channels, 3, padding=1), nn.ReLU()]
+            before = channels
+    return {"AlexNet": (alexnet, (1, 4, 7, 9, 11)), "VGG": (nn.Sequential(*layers), (3, 8, 15, 22, 29))}
+
+
+@pytest.mark.parametrize(("name", "least"), [("AlexNet", 31), ("VGG", 16)])
+def test_lpips_with_given_weights(tmp_path, name, least):
+    torch = pytest.importorskip("torch")
+    from torch import nn
+
+    torch.manual_seed(0)
+    network, compared = networks()[name]
+    channels = (64, 192, 384, 256, 256) if name == "AlexNet" else (4, 6, 8, 10, 10)
+    heads = [torch.rand(1, c, 1, 1) for c in channels]
+    torch.save({f"features.{k}": v for k, v in network.state_dict().items()}, tmp_path / "network.pth")
+    torch.save({f"lin{k}.model.1.weight": h for k, h in enumerate(heads)}, tmp_path / "heads.pth")
     a, b = np.random.default_rng(6).random((2, 64, 64, 3)).astype(np.float32)
     wanted = 0.0
     with torch.no_grad():
@@ -205,17 +221,23 @@ def test_lpips_with_given_weights(tmp_path):
             for p in (a, b)
         )
         head = iter(heads)
-        for layer in alexnet:
+        for k, layer in enumerate(network):
             x, y = layer(x), layer(y)
-            if isinstance(layer, nn.ReLU):
+            if k in compared:
+                assert isinstance(layer, nn.ReLU)
                 difference = nn.functional.normalize(x, dim=1) - nn.functional.normalize(y, dim=1)
                 wanted += float((difference**2 * next(head)).sum(dim=1).mean())
-    lpips = Lpips(tmp_path / "alexnet.pth", tmp_path / "alex.pth")
+    lpips = Lpips(tmp_path / "network.pth", tmp_path / "heads.pth")
+    assert lpips.network == name
     assert lpips(a, b) == pytest.approx(wanted, rel=1e-4) and wanted > 0.01
     assert lpips(a, a) == 0
-    assert lpips(a[:31], b[:31]) > 0 and np.isnan(lpips(a[:, :30], b[:, :30]))  # too small for the last layers
+    assert lpips(a[:least], b[:least]) > 0  # with fewer pixels nothing is left for the last layers
+    assert np.isnan(lpips(a[:, : least - 1], b[:, : least - 1]))
     with pytest.raises(AssetError, match="AlexNet"):
-        Lpips(tmp_path / "alex.pth", tmp_path / "alexnet.pth")
+        Lpips(tmp_path / "heads.pth", tmp_path / "network.pth")
+    torch.save({f"lin{k}.model.1.weight": torch.rand(1, 7, 1, 1) for k in range(5)}, tmp_path / "others.pth")
+    with pytest.raises(AssetError, match=rf"others\.pth: has the heads of another network than {name}"):
+        Lpips(tmp_path / "network.pth", tmp_path / "others.pth")
     (tmp_path / "bad.pth").write_bytes(b"no weights")
     with pytest.raises(AssetError, match=r"bad\.pth"):
-        Lpips(tmp_path / "bad.pth", tmp_path / "alex.pth")
+        Lpips(tmp_path / "bad.pth", tmp_path / "heads.pth")

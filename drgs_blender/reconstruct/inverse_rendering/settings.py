@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Literal
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 from ...core.errors import UsageError
+from ..ranges import Part, Range, Weight, check
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +22,7 @@ class Settings:
     pixels : int
         Drawn in each step, over all training views.
     cosine, ggx, light : int
-        Directions that each strategy draws at a pixel, even numbers.
+        Directions that this strategy draws at a pixel.
     shading_model : {"principled", "paper"}
         BRDF, "principled" (Blender's) or "paper".
     indirect : bool
@@ -30,11 +31,13 @@ class Settings:
         Other parts of the object stand before the environment; without, every point sees all of it, as in the split-sum
         shading of other methods.
     environment : int
-        Rows of the learned lat-long light at the end, a power of two.
+        Rows of the learned lat-long light at the end.
     coarse_to_fine : bool
         Begin with a quarter of the rows and double them on a schedule.
-    rate, light_rate : float
-        First step sizes of materials and light (Adam), in logits and log radiance.
+    rate : float
+        First step size of materials (Adam), in logits.
+    light_rate : float
+        First step size of the light, in log radiance.
     coarse : int
         Also learn materials on this many nested grids of cells, which carry what many pixels agree on quickly.
     smoothness : float
@@ -64,6 +67,8 @@ class Settings:
         end; "dielectric" albedo alone, metallic is 0.
     normals : bool
         Also learn an offset of each vertex normal, held by `normal_smoothness`.
+    normal_smoothness : float
+        Weight of the differences of these offsets along edges.
     exposure : bool
         Also learn the brightness of every photograph.
     most_pixels : int
@@ -72,58 +77,39 @@ class Settings:
         Of all random numbers.
     """
 
-    iterations: int = 2500
-    seconds: float = 0.0
-    pixels: int = 2048
-    cosine: int = 16
-    ggx: int = 8
-    light: int = 8
+    iterations: Annotated[int, Range(1, 10_000_000)] = 2500
+    seconds: Weight = 0.0
+    pixels: Annotated[int, Range(1, 1 << 24)] = 2048
+    cosine: Annotated[int, Range(0, 4096, "even")] = 16
+    ggx: Annotated[int, Range(0, 4096, "even")] = 8
+    light: Annotated[int, Range(0, 4096, "even")] = 8
     shading_model: Literal["principled", "paper"] = "principled"
     indirect: bool = True
     shadows: bool = True
-    environment: int = 64
+    environment: Annotated[int, Range(8, 1024, "power of two")] = 64
     coarse_to_fine: bool = True
-    rate: float = 0.04
-    light_rate: float = 0.4
-    coarse: int = 3
-    smoothness: float = 0.01
-    light_smoothness: float = 0.001
-    grey_light_prior: float = 0.0003
-    binary_metallic_prior: float = 0.0
-    metal_albedo_prior: float = 0.05
-    metal_smoothness: float = 5.0
+    rate: Weight = 0.04
+    light_rate: Weight = 0.4
+    coarse: Annotated[int, Range(0, 8)] = 3
+    smoothness: Weight = 0.01
+    light_smoothness: Weight = 0.001
+    grey_light_prior: Weight = 0.0003
+    binary_metallic_prior: Weight = 0.0
+    metal_albedo_prior: Weight = 0.05
+    metal_smoothness: Weight = 5.0
     unbiased: bool = True
     weight_by_prediction: bool = True
-    clipped_neighbour_weight: float = 0.5
+    clipped_neighbour_weight: Part = 0.5
     parametrisation: Literal["metallic", "specular", "dielectric"] = "metallic"
     normals: bool = False
-    normal_smoothness: float = 0.3
+    normal_smoothness: Weight = 0.3
     exposure: bool = False
-    most_pixels: int = 2_000_000
-    seed: int = 0
+    most_pixels: Annotated[int, Range(1, 1 << 31)] = 2_000_000
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
 
-    def check(self) -> None:
-        """Raise UsageError on what cannot be used."""
-        counts = (self.cosine, self.ggx, self.light)
-        rows = self.environment
-        wrong = {
-            "iterations": self.iterations < 1,
-            "pixels": self.pixels < 1,
-            "most_pixels": self.most_pixels < 1,
-            "cosine, ggx, light": min(counts) < 0 or sum(counts) == 0 or any(c % 2 for c in counts),
-            "environment": not 8 <= rows <= 1024 or rows & (rows - 1) != 0,
-            "shading_model": self.shading_model not in ("principled", "paper"),
-            "parametrisation": self.parametrisation not in ("metallic", "specular", "dielectric"),
-            "coarse": not 0 <= self.coarse <= 8,
-        }
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, float) and not 0.0 <= value < float("inf"):
-                wrong[field.name] = True
-        bad = [name for name, is_wrong in wrong.items() if is_wrong]
-        if bad:
-            raise UsageError(
-                "decoupling settings",
-                f"{', '.join(bad)} cannot be used",
-                "Numbers are positive, samples even, rows of the environment a power of two from 8 to 1024",
-            )
+    def check(self, prefix: str = "decoupling.") -> None:
+        """Raise UsageError on what cannot be used; `prefix` is put before names."""
+        check(self, prefix)
+        if not self.cosine + self.ggx + self.light:
+            problem = "are 0: no direction would be drawn"
+            raise UsageError(f"{prefix}cosine, {prefix}ggx and {prefix}light", problem, "Set one of them above 0")

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
 from ...core.arrays import Array
+from ...core.errors import UsageError
+from ..ranges import Part, Range, Weight, check
 
 #: Learning rates at the start, and what is left of them at the end; of centres a part of the object's radius.
 RATES = {"centre": (1.5e-3, 0.01), "scale": (8e-3, 0.2), "rotation": (4e-3, 0.2), "opacity": (4e-2, 0.3)}
@@ -24,33 +27,49 @@ class Schedule:
     iterations : int
         Steps, one view each.
     surfels : int
-        How many there are at the end of densification, at most: see `initialisation.surfel_limit`.
+        At most so many at the end of densification; for small pictures fewer.
     coarse : float
         Part of the steps that is done at half size.
     densify : tuple of float
-        Parts of the steps between which surfels are cut; `rounds` times.
+        Parts of the steps between which surfels are cut, `rounds` times.
+    rounds : int
+        How often surfels are cut.
     shape : float
         Part of the steps after which distortion and normals count.
-    mask, distortion, consistency : float
-        Weights of the losses.
+    mask : float
+        Weight of the mask's loss.
+    distortion : float
+        Weight of the depth distortion, which gathers the surfels of a ray at one depth.
+    consistency : float
+        Weight of the consistency of normals with those of the depth map.
     reflections : float
         Part of the steps after which reflections are learned; 1 never.
     bands : int
         Highest band of the colour's harmonics.
+    seed : int
+        Of all random numbers.
     """
 
-    iterations: int = 3000
-    surfels: int = 16000
-    coarse: float = 0.3
-    densify: tuple[float, float] = (0.08, 0.6)
-    rounds: int = 16
-    shape: float = 0.15
-    mask: float = 0.1
-    distortion: float = 1.0
-    consistency: float = 0.25
-    reflections: float = 0.1
-    bands: int = 2
-    seed: int = 0
+    iterations: Annotated[int, Range(1, 10_000_000)] = 3000
+    surfels: Annotated[int, Range(10, 5_000_000)] = 16000
+    coarse: Part = 0.3
+    densify: tuple[Part, Part] = (0.08, 0.6)
+    rounds: Annotated[int, Range(0, 1000)] = 16
+    shape: Part = 0.15
+    mask: Weight = 0.1
+    distortion: Weight = 1.0
+    consistency: Weight = 0.25
+    reflections: Part = 0.1
+    bands: Annotated[int, Range(0, 3)] = 2
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
+
+    def check(self, prefix: str = "schedule.") -> None:
+        """Raise UsageError on what cannot be used; `prefix` is put before names."""
+        check(self, prefix)
+        begin, end = self.densify
+        if begin >= end:
+            problem = f"ends at {end:g} of the steps and begins at {begin:g}"
+            raise UsageError(f"{prefix}densify", problem, "Give the smaller part first")
 
     def on_mesh(self, part: float) -> Schedule:
         """For surfels that have their place: `part` of the steps, in full size, and no more surfels."""

@@ -14,7 +14,8 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 
 from ...core.color import to_unit
 from ...core.errors import AssetError, first_of
-from ...formats.images import load_image
+from ...formats.exr import exr_size, read_exr
+from ...formats.images import image_size, load_image
 from .lens import Lens
 
 Array = np.ndarray
@@ -24,6 +25,8 @@ Array = np.ndarray
 OPENCV_TO_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
 #: Extensions of photographs, in the order in which they are looked for.
 PICTURES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
+#: Of pictures in high dynamic range, which are read where a capture names them.
+EXR = ".exr"
 #: Bytes of a JSON file; 10,000 frames take about 10 MB.
 LARGEST_JSON = 256 << 20
 #: Cameras farther from the origin than this are a program's slip: what follows from such distances overflows.
@@ -158,7 +161,18 @@ def find_picture(stem: Path) -> Path | None:
     # Not Path.is_file, which raises where a name is too long.
     if stem.suffix and os.path.isfile(stem):
         return stem
-    return next((found for end in PICTURES if os.path.isfile(found := stem.with_name(stem.name + end))), None)
+    ends = (*PICTURES, EXR)
+    return next((found for end in ends if os.path.isfile(found := stem.with_name(stem.name + end))), None)
+
+
+def load_picture(path: Path) -> Array:
+    """(h, w, c) pixels of a photograph: whole numbers are sRGB-encoded, floats linear. Raises AssetError."""
+    return read_exr(path)[0] if path.suffix.lower() == EXR else load_image(path)
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """(width, height) of a photograph, from its header. Raises AssetError."""
+    return exr_size(path) if path.suffix.lower() == EXR else image_size(path)
 
 
 def find_mask(folder: Path, image: Path, relative: str = "") -> Path | None:

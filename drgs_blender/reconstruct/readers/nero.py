@@ -1,7 +1,8 @@
 """NeRO's GlossySynthetic: k.png, k-depth.png, k-camera.pkl (world-to-camera pose, intrinsics).
 
 The cameras are pickles. Only the few names that a numpy array needs are ever resolved, so a file can make arrays and
-nothing else. Far depths are the background. The scenes are Y up. Every eighth view is the usual test set.
+nothing else. Far depths are the background. The scenes are Y up. Of the 128 views of GlossySynthetic, 32 are left out
+by the published split; of others every eighth.
 """
 
 from __future__ import annotations
@@ -22,6 +23,12 @@ from .lens import Lens
 
 Array = np.ndarray
 
+#: Views left out of 128 by NeRO's `synthetic_split_128.pkl`, as GS-ROR's `nero2blender.py` lists them.
+SPLIT_OF = 128
+SPLIT = frozenset(
+    (0, 2, 3, 4, 5, 7, 11, 14, 19, 29, 30, 31, 33, 49, 56, 57, 59, 61, 66, 68, 71, 73, 75, 91, 93, 95, 109, 110, 111,
+     113, 120, 127)
+)  # fmt: skip
 _TEST_EVERY = 8
 #: 16-bit depths end at 15 units, and what is farther than 14.5 is background (NeRO's dataset/database.py).
 _BACKGROUND = 14.5 / 15.0
@@ -64,6 +71,7 @@ def read(path: Path) -> Layout:
     turn = np.eye(4)
     turn[:3, :3] = UP_AXES["y"]
     photographs = []
+    published = numbers == list(range(SPLIT_OF))
     for k in numbers:
         file = path / f"{k}-camera.pkl"
         to_camera, intrinsics = _camera(file)
@@ -73,7 +81,8 @@ def read(path: Path) -> Layout:
         matrix = turn @ invert(rigid(to_camera, str(file))) @ OPENCV_TO_BLENDER
         depth = path / f"{k}-depth.png"
         mask = depth if depth.is_file() else None
-        photographs.append(Photograph(f"{k:03d}", path / f"{k}.png", matrix, lens, mask, k % _TEST_EVERY == 0))
+        test = k in SPLIT if published else k % _TEST_EVERY == 0
+        photographs.append(Photograph(f"{k:03d}", path / f"{k}.png", matrix, lens, mask, test))
     return Layout(photographs, upright=True, decode_mask=_nearer_than_background)
 
 

@@ -11,9 +11,8 @@ from scipy.ndimage import binary_erosion, binary_fill_holes, label
 from ...core.color import linear_to_srgb, to_unit
 from ...core.errors import AssetError
 from ...core.frame import Camera
-from ...formats.images import load_image
 from ..capture.capture import View
-from .layout import Layout, Photograph
+from .layout import Layout, Photograph, load_picture
 from .lens import Lens, resample, undistorted
 
 Array = np.ndarray
@@ -52,7 +51,7 @@ def load_photograph(
         The file cannot be decoded; photograph, mask and calibration have different shapes; too few pixels.
     """
     subject = str(photograph.image)
-    pixels = _shown(load_image(photograph.image))
+    pixels = _shown(load_picture(photograph.image))
     height, width = pixels.shape[:2]
     lens = _fitting(photograph.lens, width, height, subject)
     mask = _mask(photograph, layout, pixels)

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import AssetError
-from ...formats.images import image_size
 from ...formats.ply import read_ply
 from .layout import (
     PICTURES,
@@ -24,6 +23,7 @@ from .layout import (
     complain_of_missing,
     find_mask,
     find_picture,
+    picture_size,
     read_json,
     rigid,
 )
@@ -148,7 +148,9 @@ def _check_shapes(photographs: list[Photograph], path: Path) -> None:
 
 def _mask(path: Path, frame: dict[str, Any], image: Path, name: str) -> Path | None:
     if "mask_path" not in frame:
-        return find_mask(path.parent / "masks", image)
+        # Stanford-ORB has those of train/0000.exr in train_mask.
+        own = image.parent.with_name(f"{image.parent.name}_mask")
+        return find_mask(path.parent / "masks", image) or find_mask(own, image)
     mask = find_picture(path.parent / str(frame["mask_path"]))
     if mask is None:
         problem = f"names the mask {frame['mask_path']} for {name}, which is not there"
@@ -165,7 +167,7 @@ def _lens(values: dict[str, Any], image: Path, subject: str) -> Lens:
             raise AssetError(subject, f"has no number {key}" if value is None else f"has {key} = {value!r}")
         return float(value)
 
-    width, height = image_size(image)
+    width, height = picture_size(image)
     if "fl_x" not in values:
         if "camera_angle_x" not in values:
             raise AssetError(subject, "has neither camera_angle_x nor fl_x", "Export the capture with its cameras")

@@ -1,0 +1,229 @@
+"""`drgs evaluate --protocol`: the figures of published tables, for whoever has the sets."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..core.errors import AssetError, UsageError, first_of
+from ..core.frame import Adjustment, Camera, Frame, ObjectState, RenderSettings, World
+from .interrupt import interruptible
+from .output import check_writable
+from .progress import WORK_SECONDS, FractionBar
+
+if TYPE_CHECKING:
+    from ..core.asset import Asset
+    from ..evaluate.protocols import Protocol
+    from ..evaluate.protocols.bench import Renderer
+    from ..reconstruct.settings import Reading, Settings
+
+logger = logging.getLogger(__name__)
+
+#: Names of the table of protocols, which is not imported for a parser.
+NAMES = ("glossysynthetic", "tensoir", "stanford-orb", "shiny-blender")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of protocols."""
+    group = parser.add_argument_group(
+        "published sets", "A.drgs (or a folder of OBJECT.drgs) and the folder of the set; or that folder and --out"
+    )
+    group.add_argument("--protocol", choices=NAMES, help="score as the tables of this set are made")
+    group.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="reconstruct each object there first, as OBJECT.drgs, where it is not yet",
+    )
+    group.add_argument("--lights-from", type=Path, metavar="DIR", help="folder of the set's lights, if not in the set")
+    group.add_argument(
+        "--most-views", type=int, metavar="N", help="of each part at most, evenly chosen: for a try, not for a table"
+    )
+    group.add_argument("--config", type=Path, metavar="FILE", help="of --out: as for drgs reconstruct")
+    group.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="of --out: likewise")
+
+
+def run(args: argparse.Namespace, settings: RenderSettings) -> int:
+    """Score the objects of a set and print the table."""
+    from ..evaluate.flip import find_flip
+    from ..evaluate.lpips import Lpips
+    from ..evaluate.protocols import PROTOCOLS, Bench
+    from ..evaluate.protocols.table import complete, table
+
+    protocol = PROTOCOLS[args.protocol]
+    root, assets = _places(args)
+    _check(args, protocol)
+    names = _objects(args, protocol, root, assets)
+    if args.out is not None:
+        _reconstruct(args, protocol, root, names)
+    lpips = Lpips(*args.lpips) if args.lpips else None
+    flip = find_flip()
+    report: dict[str, Any] = {"protocol": protocol.name, "samples": settings.samples, "objects": {}}
+    with FractionBar(args, "rendering", every=WORK_SECONDS) as bar:
+        for k, name in enumerate(names):
+            file = assets if assets.is_file() else assets / f"{name}.drgs"
+            asset, render, digest = _loaded(file, settings)
+
+            begun: list[str] = []  # parts of this object
+
+            def tell(part: str, done: int, of: int, k: int = k, name: str = name, begun: list[str] = begun) -> None:
+                if part not in begun:
+                    begun.append(part)
+                done_here = (len(begun) - 1 + done / of) / protocol.parts
+                bar(f"{name}, {part}, {done} of {of}", (k + done_here) / len(names))
+
+            bench = Bench(asset, render, args.resolution, args.most_views, flip, lpips, tell, _writer(args, name))
+            report["objects"][name] = {"asset": digest, **protocol.measure(bench, root, name, args.lights_from)}
+    network = lpips.network if lpips else ""
+    report = complete(report, protocol, network, args.most_views, args.resolution)
+    print(json.dumps(report, indent=1, allow_nan=False) if args.json else "\n".join(table(report, protocol)))
+    return 0
+
+
+def _places(args: argparse.Namespace) -> tuple[Path, Path]:
+    """(folder of the set, asset or folder of assets)."""
+    given = [path for path in (args.asset, args.capture) if path is not None]
+    wanted = 1 if args.out is not None else 2
+    if len(given) != wanted:
+        remedy = f"drgs evaluate --protocol {args.protocol} " + ("SET --out DIR" if args.out else "A.drgs SET")
+        raise UsageError("--protocol", f"needs {'the folder of the set' if args.out else 'assets and the set'}", remedy)
+    root, assets = given[-1], args.out or given[0]
+    if not root.is_dir():
+        raise AssetError(str(root), "is no folder" if root.exists() else "is not there", "Give the folder of the set")
+    if args.out is None and not assets.exists():
+        raise AssetError(str(assets), "is not there", "Give an asset, or a folder of assets named as the objects")
+    return root, assets
+
+
+def _check(args: argparse.Namespace, protocol: Protocol) -> None:
+    """Raise UsageError on options that have no meaning here."""
+    idle = {
+        "--relit": args.relit, "--test-every": args.test_every, "--up": args.up, "--axes": args.axes != "opengl",
+        "--lights-from": args.lights_from and not protocol.lights, "--config": args.config and not args.out,
+        "--set": args.set and not args.out,
+    }  # fmt: skip
+    if wrong := [name for name, given in idle.items() if given]:
+        problem = f"has no effect with --protocol {protocol.name}" + ("" if args.out else " without --out")
+        raise UsageError(first_of(wrong), problem, "Leave it out")
+    if args.most_views is not None and args.most_views < 1:
+        raise UsageError("--most-views", f"is {args.most_views}", "Choose at least 1")
+
+
+def _objects(args: argparse.Namespace, protocol: Protocol, root: Path, assets: Path) -> list[str]:
+    """Names of the objects that are scored: of --objects, else those of the tables that are there."""
+    there = [name for name in protocol.objects if protocol.folder(root, name).is_dir()]
+    if args.objects:
+        wrong = [name for name in args.objects if not protocol.folder(root, name).is_dir()]
+        if wrong:
+            problem = f"has no object {first_of(wrong)}; there are {first_of(there) or 'none of ' + protocol.name}"
+            raise AssetError(str(root), problem, "Check the folder of the set and --objects")
+        there = list(dict.fromkeys(args.objects))
+    if not there:
+        example = protocol.folder(root, protocol.objects[0])
+        raise AssetError(str(root), f"holds no object of {protocol.name}: no {example}", "Give the folder of the set")
+    if args.out is not None:
+        return there
+    if assets.is_file():
+        named = [name for name in there if name == assets.stem] or there
+        if len(named) != 1:
+            problem = f"may be any of {first_of(there)}"
+            raise UsageError(str(assets), problem, "Say by --objects which one, or name the file as the object")
+        return named
+    found = [name for name in there if (assets / f"{name}.drgs").is_file()]
+    lacking = [name for name in there if name not in found]
+    if not found or (args.objects and lacking):
+        raise AssetError(str(assets), f"has no {first_of(lacking)}.drgs", "Reconstruct it there, or let --out do it")
+    if lacking:
+        logger.warning("%s: has no asset of %s, which are not scored", assets, first_of(lacking))
+    return found
+
+
+def _reconstruct(args: argparse.Namespace, protocol: Protocol, root: Path, names: list[str]) -> None:
+    """Make the assets that are not there yet."""
+    from ..reconstruct.settings_table import as_tables
+    from .reconstruct import resolved_settings
+
+    settings, reading = resolved_settings(args.config, {}, args.set)
+    if args.resolution is not None and reading.resolution is None:
+        reading = replace(reading, resolution=args.resolution)
+    for name in names:
+        file = args.out / f"{name}.drgs"
+        if not file.exists():
+            _make(args, protocol, root, name, file, settings, reading)
+            continue
+        from ..core.asset.container import inspect_asset
+
+        kept = inspect_asset(file, verify=False)["provenance"].get("settings")
+        if (args.config or args.set) and kept != as_tables(settings, reading):
+            logger.warning(
+                "%s: is there, made with other settings; it is scored as it is. Remove it to make it again", file
+            )
+
+
+def _make(
+    args: argparse.Namespace,
+    protocol: Protocol,
+    root: Path,
+    name: str,
+    file: Path,
+    settings: Settings,
+    reading: Reading,
+) -> None:
+    from ..core.asset.container import write_asset
+    from ..reconstruct.pipeline import Progress, reconstruct
+    from ..reconstruct.settings_table import as_tables
+    from .reconstruct import clear
+
+    check_writable(file)
+    work = file.with_name(f"{name}.reconstruct")
+    with interruptible() as cancelled, FractionBar(args, "reconstructing", every=WORK_SECONDS) as bar:
+
+        def tell(progress: Progress) -> None:
+            bar(f"{name}, {progress.phase}", progress.part)
+
+        capture = protocol.read(root, name, reading.resolution)
+        asset = reconstruct(capture, settings, tell, cancelled, work)
+    asset.provenance["settings"] = as_tables(settings, reading)
+    write_asset(file, asset)
+    clear(work)
+    if not args.quiet:
+        print(f"drgs: {file}: {len(asset.surfels)} surfels", file=sys.stderr)
+
+
+def _loaded(file: Path, settings: RenderSettings) -> tuple[Asset, Renderer, str]:
+    """(asset, what renders it, its digest)."""
+    from ..core.asset.container import digest_asset
+    from ..engine.session import Session
+    from ..evaluate.compare import COMPARED_PASSES
+
+    session = Session()
+    key = session.load_asset(file)
+    settings = replace(settings, film_transparent=True)
+
+    def render(camera: Camera, radiance: np.ndarray, factors: tuple[float, float, float]) -> dict[str, np.ndarray]:
+        adjustment = None if factors == (1.0, 1.0, 1.0) else Adjustment(tint=factors)
+        state = ObjectState(file.stem, key, adjustment=adjustment)
+        frame = Frame(
+            noise_index=1, camera=camera, objects=[state], world=World(radiance), settings=settings,
+            passes=COMPARED_PASSES,
+        )  # fmt: skip
+        return dict(session.render(frame))
+
+    return session.asset(key), render, digest_asset(key)
+
+
+def _writer(args: argparse.Namespace, name: str) -> Any:
+    """Writes pictures to --pictures/OBJECT, else does nothing."""
+    if args.pictures is None:
+        return lambda *_: None
+    from .evaluate import writer
+
+    check_writable(args.pictures / name / "views-000.png")
+    return writer(args.pictures / name)

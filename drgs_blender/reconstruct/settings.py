@@ -1,0 +1,88 @@
+"""Settings of a reconstruction: of reading the photographs, of the run, of its two stages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Literal
+
+from ..core.errors import UsageError
+from .inverse_rendering.settings import Settings as Decoupling
+from .optim.schedule import Schedule
+from .ranges import Range, check
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """How photographs are read, see `readers.read_capture`.
+
+    Attributes
+    ----------
+    resolution : int, optional
+        Pixels of the longer side, at most; None: all.
+    test_every : int, optional
+        Leave out every n-th view, where the capture does not say which; None: none.
+    axes : {"opengl", "opencv", "opengl-inverse", "opencv-inverse"}
+        Convention of the camera matrices; "opengl" is that of the layout.
+    up : {"z", "y", "-z", "-y"}, optional
+        Up axis of the capture's world; None: found.
+    """
+
+    resolution: Annotated[int | None, Range(8, 1 << 16)] = None
+    test_every: Annotated[int | None, Range(2, 1_000_000)] = None
+    axes: Literal["opengl", "opencv", "opengl-inverse", "opencv-inverse"] = "opengl"
+    up: Literal["z", "y", "-z", "-y"] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Settings of a reconstruction.
+
+    Attributes
+    ----------
+    variant : {"p", "m"}
+        "p" keeps the free surfels (driven by particles or mesh), "m" makes surfels on the mesh's faces.
+    schedule : Schedule
+        How surfels are learned.
+    mesh_resolution : int
+        Most voxels along the mesh's longest side.
+    minutes : float, optional
+        The time budget of all stages together, once kernels are compiled; None: the steps decide.
+    materials : bool
+        Inverse rendering: materials apart from the light; else albedo is the photographed colour.
+    decoupling : Settings
+        How. Normals are learned too: a mesh of photographs has errors.
+    fixed : tuple of str
+        Parameters of surfels on faces that are not learned: "offset", "opacity" (the paper's ablation).
+    device : {"cpu", "cuda"}
+        "cpu", or "cuda" to learn on the first NVIDIA card; without one the CPU does.
+    """
+
+    variant: Literal["p", "m"] = "p"
+    schedule: Schedule = field(default_factory=Schedule)
+    mesh_resolution: Annotated[int, Range(16, 1024)] = 256
+    minutes: Annotated[float | None, Range(0.001, 1e6)] = None
+    materials: bool = True
+    decoupling: Decoupling = field(default_factory=lambda: Decoupling(normals=True))
+    fixed: tuple[Literal["offset", "opacity"], ...] = ()
+    device: Literal["cpu", "cuda"] = "cpu"
+
+    def check(self) -> None:
+        """Raise UsageError on what cannot be used."""
+        check(self)
+        self.schedule.check()
+        self.decoupling.check()
+        if self.minutes is not None and self.decoupling.seconds:
+            problem = "is given beside minutes, of which it would be a part"
+            raise UsageError("decoupling.seconds", problem, "Leave one of them out")
+
+    def without_effect(self) -> list[str]:
+        """Names of settings that are not the default and decide nothing, because of others."""
+        default = Settings()
+        names = (
+            [] if self.materials else [f"decoupling.{name}" for name in _changed(self.decoupling, default.decoupling)]
+        )
+        return names + (["fixed"] if self.fixed and self.variant == "p" else [])
+
+
+def _changed(one: Decoupling, other: Decoupling) -> list[str]:
+    return [field.name for field in fields(one) if getattr(one, field.name) != getattr(other, field.name)]
