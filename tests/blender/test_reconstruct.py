@@ -194,7 +194,7 @@ def test_new_settings_are_a_text_with_what_the_fields_say_and_that_text_is_used(
     assert 'variant = "m" ' in said and "materials = false " in said and 'axes = "opencv" ' in said
     # A text that cannot be used is refused by its name and what is wrong in it.
     bpy.data.texts[fields.settings].from_string("[schedule]\niteration = 3")
-    with pytest.raises(RuntimeError, match=r"toml, schedule.iteration: .*did you mean schedule.iterations"):
+    with pytest.raises(RuntimeError, match=r"toml, schedule.iteration: .*the nearest is schedule.iterations"):
         bpy.ops.drgs.reconstruct(filepath=str(photographs), settings=fields.settings)
     with pytest.raises(RuntimeError, match=r'Text "none": is not in this \.blend'):
         bpy.ops.drgs.reconstruct(filepath=str(photographs), settings="none")

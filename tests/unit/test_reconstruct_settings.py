@@ -98,9 +98,9 @@ def test_what_is_printed_can_be_given_again(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ("schedule.iteration=5", "did you mean schedule.iterations?"),
-        ("iterations=5", "did you mean schedule.iterations or decoupling.iterations?"),
-        ("metal_albedo_prio=0", "did you mean decoupling.metal_albedo_prior?"),
+        ("schedule.iteration=5", "the nearest is schedule.iterations"),
+        ("iterations=5", "the nearest is schedule.iterations or decoupling.iterations"),
+        ("metal_albedo_prio=0", "the nearest is decoupling.metal_albedo_prior"),
         ("zebra=1", "zebra: is no setting of a reconstruction. `drgs"),
         ("schedule.iterations=0", "is 0, not a whole number from 1 to 10000000"),
         ("schedule.iterations=1.5", "is 1.5, not a whole number from"),
@@ -139,7 +139,7 @@ def test_contradictions_are_refused(capsys):
         (b"variant = ", "is not TOML"),
         (b"[schedule]\niterations = 5\n[schedule]\n", "is not TOML"),
         (b"\xff\xfev\0", "is not UTF-8 text"),
-        (b"[schedul]\niterations = 5", "did you mean schedule.iterations"),
+        (b"[schedul]\niterations = 5", "the nearest is schedule.iterations"),
         (b"[schedule.iterations]\nx = 5", "schedule.iterations.x: is no setting"),
         (b"[schedule]\niterations = 2024-01-01", "not a whole number"),
         (b"#" * ((1 << 20) + 1), "more than"),
