@@ -89,16 +89,15 @@ def tangent_at(layer, corners, place, normals, layers):  # type: ignore[no-untyp
     _, _, face, u, v = place
     words, first, w = load_int64(layers, 2 * layer), 3 * np.int64(face), ONE - u - v
     i, j, k = corners
-    ax, ay, az, a = _unpacked(load_uint32(words, first), normals, i)
-    bx, by, bz, b = _unpacked(load_uint32(words, first + 1), normals, j)
-    cx, cy, cz, c = _unpacked(load_uint32(words, first + 2), normals, k)
+    ax, ay, az, a = _unpacked(np.int64(load_uint32(words, first)), normals, i)
+    bx, by, bz, b = _unpacked(np.int64(load_uint32(words, first + 1)), normals, j)
+    cx, cy, cz, c = _unpacked(np.int64(load_uint32(words, first + 2)), normals, k)
     return w * ax + u * bx + v * cx, w * ay + u * by + v * cy, w * az + u * bz + v * cz, w * a + u * b + v * c
 
 
 @njit
 def _unpacked(word, normals, corner):  # type: ignore[no-untyped-def]
     """Unit tangent of a corner, and the sign of its bitangent."""
-    word = np.int64(word)
     if word == _NONE:
         return ONE, ZERO, ZERO, ONE
     part = F((word >> 1) & _STEPS) * _STEP
