@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
+from ..drgs_blender.core.arrays import shareable
 from ..drgs_blender.core.asset import MATERIAL_CHANNELS, Mesh
 
 Array = np.ndarray
@@ -158,8 +159,8 @@ def group_weights(mesh: bpy.types.Mesh, index: int) -> Array:
 
 
 def read_vertices(mesh: bpy.types.Mesh) -> Array:
-    """(n, 3) float32 positions in object space."""
-    vertices = np.empty((len(mesh.vertices), 3), np.float32)
+    """(n, 3) float32 positions in object space, which the engine can map."""
+    vertices = shareable((len(mesh.vertices), 3), np.float32)
     if len(vertices):
         mesh.attributes["position"].data.foreach_get("vector", vertices.ravel())
     return vertices
@@ -196,13 +197,22 @@ def read_corner_normals(mesh: bpy.types.Mesh) -> Array:
     return normals
 
 
-def smooth_or_corner_normals(mesh: bpy.types.Mesh) -> Array | None:
-    """(l, 3) float32 unit normals, object space, of all corners; None where smooth vertex normals are the same.
+def _is_smooth(mesh: bpy.types.Mesh) -> bool:
+    """Whether all corners of a vertex have its normal."""
+    return mesh.normals_domain == "POINT" and not mesh.has_custom_normals
 
-    They are not where the engine gets triangles of polygons: those of a bent quad differ from it, in normal and angle.
+
+def has_smooth_triangles(mesh: bpy.types.Mesh) -> bool:
+    """Whether normals that are made of the triangles are those of the mesh.
+
+    They are not where polygons are cut into triangles: those of a bent quad differ from it, in normal and angle.
     """
-    triangles = len(mesh.loops) == 3 * len(mesh.polygons)
-    if triangles and mesh.normals_domain == "POINT" and not mesh.has_custom_normals:
+    return len(mesh.loops) == 3 * len(mesh.polygons) and _is_smooth(mesh)
+
+
+def smooth_or_corner_normals(mesh: bpy.types.Mesh) -> Array | None:
+    """(l, 3) float32 unit normals, object space, of all corners; None where `has_smooth_triangles`."""
+    if has_smooth_triangles(mesh):
         return None
     normals = np.empty((len(mesh.loops), 3), np.float32)
     mesh.corner_normals.foreach_get("vector", normals.ravel())
@@ -210,10 +220,13 @@ def smooth_or_corner_normals(mesh: bpy.types.Mesh) -> Array | None:
 
 
 def read_vertex_normals(mesh: bpy.types.Mesh) -> Array | None:
-    """(n, 3) float32 unit normals, object space; None where corners of a vertex may have normals of their own."""
-    if mesh.normals_domain != "POINT" or mesh.has_custom_normals:
+    """(n, 3) float32 unit normals, object space; None where corners of a vertex may have normals of their own.
+
+    Cheap where there are some: Blender makes and keeps normals of corners when they are asked for.
+    """
+    if not _is_smooth(mesh):
         return None
-    normals = np.empty((len(mesh.vertices), 3), np.float32)
+    normals = shareable((len(mesh.vertices), 3), np.float32)
     mesh.vertex_normals.foreach_get("vector", normals.ravel())
     return normals
 

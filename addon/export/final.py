@@ -8,6 +8,7 @@ from pathlib import Path
 import bpy
 
 from ...drgs_blender.core.frame import Camera, Frame
+from ...drgs_blender.core.memory import give_back
 from ..bakes.manager import manager
 from ..bakes.requests import Wanted
 from .frame import export_frame
@@ -64,4 +65,5 @@ def export_baked(
     if manager.store.trouble:
         warn(manager.store.trouble)
         manager.store.trouble = ""
+    give_back()  # while the engine takes memory
     return frame

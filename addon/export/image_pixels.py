@@ -18,7 +18,7 @@ LINEAR = {"Linear Rec.709", "Linear", "Non-Color", "Raw", "scene_linear"}
 #: Those that are no colour.
 DATA = {"Non-Color", "Raw"}
 #: Rows that are worked on at once: whole copies of a large image are larger than all the rest.
-_STRIP = 256
+_STRIP = 32
 
 
 def _read(image: bpy.types.Image) -> Array | None:
@@ -95,7 +95,8 @@ def _rgba(image: bpy.types.Image) -> Array | None:
     for first in range(0, len(found), _STRIP):
         part, into = pixels[first : first + _STRIP], found[first : first + _STRIP]
         if not image.is_float:
-            part = np.rint(part * 255)
+            part = part * 255
+            np.rint(part, out=part)
         into[..., :3] = part[..., : min(channels, 3 if count >= 3 else 1)]
         if channels == 4:
             into[..., 3] = (1 if image.is_float else 255) if opaque else part[..., 3]

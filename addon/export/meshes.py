@@ -51,16 +51,21 @@ class _Arrays:
     @classmethod
     def read(cls, mesh: bpy.types.Mesh) -> _Arrays:
         """Read them, vertices and their normals frozen."""
-        corner_normals = mesh_arrays.smooth_or_corner_normals(mesh)
-        vertex_normals = None if corner_normals is None else mesh_arrays.read_vertex_normals(mesh)
+        made = mesh_arrays.has_smooth_triangles(mesh)
+        vertex_normals = None if made else mesh_arrays.read_vertex_normals(mesh)
+        at_corners = not made and vertex_normals is None
         return cls(
             _frozen(mesh_arrays.read_vertices(mesh)),
             *mesh_arrays.read_loop_triangles(mesh),
             mesh_arrays.read_corner_vertices(mesh),
             mesh_arrays.read_material_index(mesh),
             None if vertex_normals is None else _frozen(vertex_normals),
-            corner_normals if vertex_normals is None else None,
+            mesh_arrays.smooth_or_corner_normals(mesh) if at_corners else None,
         )
+
+
+#: Reads them of an evaluated mesh, or knows them.
+ReadArrays = Callable[[bpy.types.Mesh], _Arrays]
 
 
 class Meshes:
@@ -88,10 +93,14 @@ class Meshes:
         owners = uid(obj.data), uid(obj)
         stands = (*owners, obj.data.as_pointer(), obj.data.is_editmode)
 
-        def arrays() -> _Arrays:
-            return self._cache.get(("arrays", *stands), owners, lambda: self._arrays(obj))
+        def arrays(mesh: bpy.types.Mesh) -> _Arrays:
+            return self._cache.get(("arrays", *stands), owners, lambda: _Arrays.read(mesh))
 
-        item = self._holdouts.cut_out(item, slots, lambda: arrays().material_index)
+        def material_index() -> Array | None:
+            with _read(obj, self._depsgraph) as mesh:
+                return arrays(mesh).material_index
+
+        item = self._holdouts.cut_out(item, slots, material_index)
         rays = item.visibility
         key = (
             obj.data.as_pointer(),
@@ -106,7 +115,7 @@ class Meshes:
         shape = self._shapes.get(key)
         if shape is None:
             state, pictures, bakes = self._cache.get(
-                ("mesh", *stands, obj.name, *key), owners, lambda: self._state(item, slots, arrays())
+                ("mesh", *stands, obj.name, *key), owners, lambda: self._state(item, slots, arrays)
             )
             self._materials.images |= pictures
             shape = self._shapes[key] = _Shape(state)
@@ -136,12 +145,8 @@ class Meshes:
         """Instance keys of each of `states`, one per matrix."""
         return [shape.keys for shape in self._shapes.values() if shape.state is not None]
 
-    def _arrays(self, obj: bpy.types.Object) -> _Arrays:
-        with _read(obj, self._depsgraph) as mesh:
-            return _Arrays.read(mesh)
-
     def _state(
-        self, item: Visible, slots: list[bpy.types.Material | None], arrays: _Arrays
+        self, item: Visible, slots: list[bpy.types.Material | None], arrays: ReadArrays
     ) -> tuple[MeshState | None, dict[str, Image], SurfaceBakes | None]:
         """What all instances share, the images on it and its bakes; None where the mesh has no faces that are seen."""
         with _read(item.object, self._depsgraph) as mesh:
@@ -156,7 +161,7 @@ class Meshes:
         item: Visible,
         mesh: bpy.types.Mesh,
         slots: list[bpy.types.Material | None],
-        arrays: _Arrays,
+        read: ReadArrays,
         bakes: SurfaceBakes | None,
     ) -> MeshState | None:
         if len(mesh.polygons) == 0:
@@ -166,6 +171,7 @@ class Meshes:
             if material not in known:
                 known[material] = self._materials.export(material, mesh, bakes)
         exported = [known[material] for material in slots or [None]]
+        arrays = read(mesh)  # after the images, which take much memory while Blender reads them
         corners, polygons, index = arrays.corners, arrays.polygons, arrays.material_index
         if index is not None:
             index = np.clip(index, 0, len(exported) - 1)[polygons]  # as Cycles reads what is out of range
@@ -182,7 +188,7 @@ class Meshes:
             corner_normals=None if normals is None else _taken(normals, corners),
             uvs=self._uvs(item.object.name, mesh, corners, index, exported),
             uv_map=self._uv_map(mesh, corners),
-            material_index=None if index is None or not index.any() else _frozen(index.astype(np.int32)),
+            material_index=None if index is None or not index.any() else _shared(index, np.int32),
             materials=[material.material or DEFAULT_MATERIAL for material in exported],
             visibility=item.visibility,
             layers=self._layers(item.object.name, mesh, (corners, polygons, arrays.corner_vertices), exported),
@@ -202,7 +208,7 @@ class Meshes:
             if values is None:
                 self._lacks_uvs(name, ref.name)
                 values = np.zeros((len(elements[0]), 3, 2), np.float32)
-            found.append(Layer(ref.label, _frozen(np.ascontiguousarray(values))))
+            found.append(Layer(ref.label, _shared(values, np.float32)))
         return found
 
     def _lacks_uvs(self, name: str, uv_map: str) -> None:
@@ -234,7 +240,10 @@ class Meshes:
                 faces: slice | Array = slice(None) if requested[0] == uv_map else slice(0)
             else:
                 faces = np.isin(index, [i for i, u in enumerate(requested) if u == uv_map])
-            uvs[faces] = values[corners[faces]]
+            if isinstance(faces, slice):
+                np.take(values, corners[faces], axis=0, out=uvs[faces], mode="clip")
+            else:
+                uvs[faces] = values[corners[faces]]
         return _frozen(uvs)
 
 
@@ -278,6 +287,13 @@ def _taken(values: Array, corners: Array) -> Array:
     """Frozen rows of `values` at corners, which the engine can map."""
     found = shareable((*corners.shape, *values.shape[1:]), values.dtype)
     np.take(values, corners, axis=0, out=found, mode="clip")  # others are buffered
+    return _frozen(found)
+
+
+def _shared(values: Array, dtype: type) -> Array:
+    """A frozen copy, which the engine can map."""
+    found = shareable(values.shape, dtype)
+    found[:] = values
     return _frozen(found)
 
 

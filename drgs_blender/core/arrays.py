@@ -15,8 +15,10 @@ Array = np.ndarray
 
 #: Smaller arrays are copied: a file of their own is no gain.
 SHARED_BYTES = 1 << 20
-#: Most arrays that have a file; each takes two of the process's open files.
+#: Most arrays that have a file; each takes two of the process's open files. Arrays below `LARGE_BYTES` take at most
+#: half of them, so that images find some in scenes of many meshes.
 SHARED_FILES = 128
+LARGE_BYTES = 8 << 20
 
 
 class SharedMemory(mmap.mmap):
@@ -59,7 +61,8 @@ def shareable(shape: tuple[int, ...], dtype: Any) -> Array:
     """
     dtype = np.dtype(dtype)
     size = math.prod(shape) * dtype.itemsize
-    if sys.platform != "linux" or size < SHARED_BYTES or len(_living) >= SHARED_FILES:
+    most = SHARED_FILES if size >= LARGE_BYTES else SHARED_FILES // 2
+    if sys.platform != "linux" or size < SHARED_BYTES or len(_living) >= most:
         return np.zeros(shape, dtype)
     import fcntl
 

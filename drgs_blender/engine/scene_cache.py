@@ -16,6 +16,7 @@ from ..core.asset.model import Asset, PosedSurfels
 from ..core.errors import AssetError, UsageError
 from ..core.frame import Frame, MeshState, MotionStep, ObjectState, RenderSettings, World
 from ..core.materials import Image
+from ..core.memory import give_back
 from ..deform.gpu.mesh_driven import Deformer
 from ..deform.mesh_driven import MeshDriven
 from ..ipc.change_detection import reuse_equal
@@ -198,7 +199,10 @@ class SceneCache:
             others = [*meshes, *(item.glowing for item in glowing if item.glowing is not None)]
             others += [item.mesh for item in objects if item.mesh is not None]
             textures = {image.name: image for item in objects for image in item.images}
+            layout = self.scene.layout
             self.scene.update([item.met for item in objects], others, [*images, *glows.values(), *textures.values()])
+            if self.scene.layout is not layout:
+                give_back()
             self._current = True
         self.objects, self.meshes, self.images, self._captured_faults = objects, meshes, images, faults
         used = {state.asset for state in frame.objects}

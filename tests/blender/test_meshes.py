@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import bpy
 import numpy as np
 import pytest
@@ -71,6 +73,35 @@ def textured(name: str, uv_map: str | None = None) -> bpy.types.Material:
         node.uv_map = uv_map
         tree.links.new(node.outputs["UV"], texture.inputs["Vector"])
     return material
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no such memory")
+def test_large_arrays_reach_the_engine_without_a_copy(scene, export):
+    """All of a mesh, of quads and smooth: Blender is not asked for normals of corners, which it would keep."""
+    bpy.ops.mesh.primitive_grid_add(x_subdivisions=600, y_subdivisions=600)
+    mesh = bpy.context.active_object.data
+    mesh.shade_smooth()
+    mesh.color_attributes.new("Paint", "FLOAT_COLOR", "POINT").data[0].color = (1, 0, 0, 1)
+    for name in "AB":
+        mesh.materials.append(material := bpy.data.materials.new(name))
+        material.use_nodes = True
+        nodes, links = material.node_tree.nodes, material.node_tree.links
+        paint = nodes.new("ShaderNodeVertexColor")
+        paint.layer_name = "Paint"
+        links.new(paint.outputs["Color"], nodes["Principled BSDF"].inputs["Base Color"])
+        image = nodes.new("ShaderNodeTexImage")
+        image.image = bpy.data.images.new(name, 2, 2)
+        links.new(image.outputs["Color"], nodes["Principled BSDF"].inputs["Roughness"])
+    mesh.polygons.foreach_set("material_index", np.arange(len(mesh.polygons), dtype=np.int32) % 2)
+    frame, warnings = export()
+    (state,) = frame.meshes
+    assert not warnings
+    assert state.corner_normals is None
+    arrays = part("drgs_blender.core.arrays")
+    large = {"layer": state.layers[0].values}
+    for name in ("vertices", "faces", "vertex_normals", "uvs", "material_index"):
+        large[name] = getattr(state, name)
+    assert {name for name, array in large.items() if arrays.shared_file(array) is None} == set()
 
 
 def test_linked_duplicates_are_one_shape(scene, export):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from drgs_blender.core.memory import available_memory, total_memory
+from drgs_blender.core.memory import available_memory, give_back, total_memory
 
 GIB = 1 << 30
 
@@ -55,3 +58,16 @@ def test_a_system_that_does_not_say_sets_no_limit(tmp_path, monkeypatch):
 @pytest.mark.skipif(sys.platform != "linux", reason="reads files of Linux")
 def test_of_this_machine():
     assert 1 << 20 < available_memory() <= total_memory() < 1 << 50
+
+
+@pytest.mark.skipif(sys.platform != "linux" or not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="not glibc")
+def test_what_lies_free_between_arrays_in_use_is_given_back():
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    parts = [np.ones(96 << 10, np.uint8) for _ in range(400)]
+    last = parts.pop()
+    before = resident()
+    parts.clear()
+    give_back()
+    assert before - resident() > 30 << 20 and last.all()

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from test_surface import MATRICES, aimed_rays, lumpy, matrix, meet, mesh_state
 
+from drgs_blender.compute.jit import njit, plain
 from drgs_blender.core.errors import AssetError, UsageError
 from drgs_blender.core.frame import Layer
 from drgs_blender.core.materials import Image, Material, SurfaceDetail, Texture
-from drgs_blender.render.scene.tangents import corner_tangents
+from drgs_blender.render.memory import address
+from drgs_blender.render.scene.tangents import WORDS, corner_tangents, tangent_at
 from drgs_blender.render.scene.trace_scene import TraceScene
 
 SQUARE = np.float32([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]])
@@ -126,6 +128,59 @@ def test_instances_are_shaded_as_copies(kind):
     assert (np.abs(found[0] - found[1]).max(axis=1) < 2e-3).mean() > 0.995
 
 
+@njit
+def _at_corners(faces, rows, normals, layers, out):  # type: ignore[no-untyped-def]
+    for face in range(len(faces)):
+        corners = (3 * np.int64(rows[face, 0]), 3 * np.int64(rows[face, 1]), 3 * np.int64(rows[face, 2]))
+        for k in range(3):
+            place = np.float32(0), np.float32(0), face, np.float32(k == 1), np.float32(k == 2)
+            x, y, z, sign = tangent_at(np.int64(0), corners, place, normals, layers)
+            out[face, k, 0], out[face, k, 1], out[face, k, 2], out[face, k, 3] = x, y, z, sign
+
+
+def tangents(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, uvs: np.ndarray) -> np.ndarray:
+    """(m, 3, 4) tangents and signs as shading reads them, of (m, 3, 3) normals of the corners."""
+    normals, rows = (
+        np.ascontiguousarray(normals.reshape(-1, 3)),
+        np.arange(3 * len(faces), dtype=np.int32).reshape(-1, 3),
+    )
+    words = corner_tangents(vertices, faces, normals, rows, uvs)
+    layers, out = np.array([[address(words), WORDS]], np.int64), np.empty((len(faces), 3, 4), np.float32)
+    _at_corners(plain(faces), rows, address(normals), address(layers), out)
+    return out
+
+
+def test_tangents_of_flat_triangles_are_derivatives_by_u():
+    """Of each alone, in closed form; the sign is which way round it lies in the texture."""
+    rng = np.random.default_rng(11)
+    places = rng.normal(size=(3000, 3, 3)).astype(np.float32)
+    places[:6, :, 2], places[:2, :, 0] = 0, 0  # along axes, where frames and quarters end
+    places[:2, :, 2] = rng.normal(size=(2, 3))
+    uvs = rng.normal(size=(3000, 3, 2)).astype(np.float32)
+    uvs[2], uvs[3] = places[2, :, :2], places[3, :, :2] * (-1, 1)
+    uvs[4], uvs[5] = places[4, :, 1::-1], places[5, :, 1::-1] * (-1, 1)
+    a, b = (places[:, i].astype(float) - places[:, 0] for i in (1, 2))
+    normals = np.cross(a, b)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    (au, av), (bu, bv) = ((uvs[:, i].astype(float) - uvs[:, 0]).T[..., None] for i in (1, 2))
+    area = au * bv - av * bu
+    expected = np.sign(area) * (bv * a - av * b)
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    faces = np.arange(9000, dtype=np.int32).reshape(-1, 3)
+    at_corners = np.repeat(normals[:, None], 3, axis=1).astype(np.float32)
+    found = tangents(places.reshape(-1, 3), faces, at_corners, uvs)
+    usual = np.abs(area[:, 0]) > 1e-2
+    np.testing.assert_allclose(found[usual, :, :3], np.repeat(expected[usual, None], 3, axis=1), atol=3e-5)
+    np.testing.assert_allclose(np.linalg.norm(found[..., :3], axis=2), 1, atol=3e-7)
+    np.testing.assert_allclose((found[..., :3] * at_corners).sum(axis=2), 0, atol=3e-7)
+    np.testing.assert_array_equal(found[..., 3], np.repeat(np.sign(area), 3, axis=1))
+
+
+def test_a_face_that_is_a_point_in_the_texture_has_the_tangent_of_mikktspace():
+    found = tangents(SQUARE, FACES, np.tile(np.float32([0.6, 0, 0.8]), (2, 3, 1)), np.full((2, 3, 2), 0.5, np.float32))
+    np.testing.assert_array_equal(found, np.tile(np.float32([1, 0, 0, 1]), (2, 3, 1)))
+
+
 def test_tangents_follow_u_over_a_sphere():
     """Where u runs around the axis, tangents point east, and the bitangents north; mirrored in u, west."""
     vertices, faces = lumpy()
@@ -136,7 +191,7 @@ def test_tangents_follow_u_over_a_sphere():
     normals = vertices[faces].astype(np.float32)
     for sign in (1, -1):
         uvs = np.stack([sign * turn, vertices[faces][..., 2]], axis=-1).astype(np.float32)
-        found = corner_tangents(vertices.astype(np.float32), faces, normals, uvs)
+        found = tangents(vertices.astype(np.float32), faces, normals, uvs)
         east = np.cross((0, 0, 1), normals)
         east /= np.linalg.norm(east, axis=-1, keepdims=True)
         cosine = (found[..., :3] * east).sum(axis=-1) * sign

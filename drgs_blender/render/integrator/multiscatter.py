@@ -29,10 +29,12 @@ _TINY = F(1e-6)
 @functools.cache
 def energy_tables() -> tuple[Array, Array]:
     """E, (32, 32) float32 over cosine to the viewer and roughness, and its mean E', (32,) float32 over roughness."""
-    _, normals, alpha = sampled(_NODES, 1024)
-    _, above, o = reflected(*normals)
-    energy = np.where(above, shadowed(normals[0], o, alpha), 0).mean(-1)
-    mu = grid_of(_NODES)
+    rows = []
+    for cosine in range(_NODES):  # one by one: together their samples take more memory than many a scene
+        _, normals, alpha = sampled(_NODES, 1024, slice(cosine, cosine + 1))
+        _, above, o = reflected(*normals)
+        rows.append(np.where(above, shadowed(normals[0], o, alpha), 0).mean(-1))
+    energy, mu = np.concatenate(rows), grid_of(_NODES)
     mean = np.trapezoid(2 * mu[:, None] * energy, mu, axis=0)
     return np.clip(energy, 0, 1).astype(np.float32), np.clip(mean, 0, 1).astype(np.float32)
 
@@ -41,12 +43,12 @@ def grid_of(nodes: int) -> Array:
     return np.clip(np.arange(nodes) / (nodes - 1), 1e-4, 1 - 1e-4)
 
 
-def sampled(nodes: int, count: int) -> tuple[Array, tuple[Array, Array], Array]:
+def sampled(nodes: int, count: int, cosines: slice = slice(None)) -> tuple[Array, tuple[Array, Array], Array]:
     """Grid; directions to the viewer and visible normals of each of its cosines and roughnesses; and alpha."""
     index = np.arange(count)
     u, turn = (index + 0.5) / count, 2 * np.pi * ((index * 0.6180339887498949) % 1.0)
-    mu, rough = np.meshgrid(grid_of(nodes), np.clip(np.arange(nodes) / (nodes - 1), 1e-2, 1), indexing="ij")
-    alpha, zero = (rough**2)[..., None], np.zeros((nodes, nodes, 1))
+    mu, rough = np.meshgrid(grid_of(nodes)[cosines], np.clip(np.arange(nodes) / (nodes - 1), 1e-2, 1), indexing="ij")
+    alpha, zero = (rough**2)[..., None], np.zeros((*mu.shape, 1))
     i = np.stack([np.sqrt(1 - mu**2)[..., None], zero, mu[..., None]])
     stretched = i * np.stack([alpha, alpha, zero + 1])
     stretched /= np.sqrt((stretched**2).sum(0))

@@ -14,7 +14,8 @@ import numpy as np
 from ...compute.jit import njit
 from ..memory import load_float, load_int32, load_int64
 from ..sampling import ONE, TWO, ZERO, F
-from .texture_lookup import blend, colour_at, layer_at
+from .tangents import tangent_at
+from .texture_lookup import blend, colour_at
 from .texture_slopes import slopes_at
 
 #: Kinds of steps. The two of Blender's own have y and z the other way round.
@@ -24,7 +25,7 @@ _TANGENT, _OBJECT, _WORLD, _BLENDER_OBJECT, _BLENDER_WORLD, _BUMP = range(6)
 KIND, TEXTURE, TANGENTS, STEP_INTS = 0, 1, 2, 4
 STRENGTH, DISTANCE, COLOUR, STEP_FLOATS = 0, 1, 2, 8
 ALPHA, FIRST_STEP, STEPS, FRAME, SLOTS = 4, 5, 6, 7, 8
-NORMALS, EDGES, MATRICES, TURNS, FRAME_INTS = 0, 1, 2, 3, 4
+NORMALS, VERTICES, FACES, MATRICES, TURNS, FRAME_INTS = 0, 1, 2, 3, 4, 5
 #: Places of the tables in ``Geometry.materials``.
 STEP_TABLE, NUMBER_TABLE, ALPHA_TABLE, MULTISCATTER_TABLE, FRAME_TABLE = 7, 8, 9, 10, 11
 _TINY = F(1e-30)
@@ -63,7 +64,7 @@ def _in_tangent_frame(corners, place, tangents, frames, frame, layers):  # type:
     nx = blend(rows, i, j, k, w, u, v)
     ny = blend(rows, i + 1, j + 1, k + 1, w, u, v)
     nz = blend(rows, i + 2, j + 2, k + 2, w, u, v)
-    tx, ty, tz, sign = layer_at(tangents, place, layers)
+    tx, ty, tz, sign = tangent_at(tangents, corners, place, rows, layers)
     return nx, ny, nz, tx, ty, tz, sign
 
 
@@ -93,11 +94,25 @@ def _mapped(kind, strength, colour, normal, side, frame_of, at):  # type: ignore
 
 
 @njit
+def _edges(face, frames, frame):  # type: ignore[no-untyped-def]
+    """Both edges of a face from its first corner, object space."""
+    faces, v = load_int64(frames, frame + FACES), load_int64(frames, frame + VERTICES)
+    i = 3 * np.int64(load_int32(faces, 3 * face))
+    j, k = 3 * np.int64(load_int32(faces, 3 * face + 1)), 3 * np.int64(load_int32(faces, 3 * face + 2))
+    x, y, z = load_float(v, i), load_float(v, i + 1), load_float(v, i + 2)
+    return (
+        (load_float(v, j) - x, load_float(v, j + 1) - y, load_float(v, j + 2) - z),
+        (load_float(v, k) - x, load_float(v, k + 1) - y, load_float(v, k + 2) - z),
+    )
+
+
+@njit
 def _bumped(height, strength, normal, edges, matrix, instance):  # type: ignore[no-untyped-def]
     """The normal of a surface that rises by `height`, metres along the two edges of its face."""
     nx, ny, nz = normal
-    ax, ay, az = _turned(matrix, 12 * instance, 4, load_float(edges, 0), load_float(edges, 1), load_float(edges, 2))
-    bx, by, bz = _turned(matrix, 12 * instance, 4, load_float(edges, 3), load_float(edges, 4), load_float(edges, 5))
+    first, second = edges
+    ax, ay, az = _turned(matrix, 12 * instance, 4, first[0], first[1], first[2])
+    bx, by, bz = _turned(matrix, 12 * instance, 4, second[0], second[1], second[2])
     cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
     det = cx * nx + cy * ny + cz * nz
     # (height_1 b - height_2 a) x n, the gradient along the surface times the determinant.
@@ -158,7 +173,7 @@ def detailed_normal(material, corners, place, instance, normal, side, geometry):
             if texture >= 0:
                 up, right = slopes_at(texture, place, addresses, geometry.uvs)
                 scale = r * distance
-                edges = load_int64(frames, frame + EDGES) + 24 * np.int64(place[2])
+                edges = _edges(np.int64(place[2]), frames, frame)
                 matrix = load_int64(frames, frame + MATRICES)
                 height = (scale * up, scale * right)
                 nx, ny, nz = _bumped(height, strength, (nx, ny, nz), edges, matrix, which)

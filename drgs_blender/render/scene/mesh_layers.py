@@ -17,7 +17,7 @@ from ...core.asset.model import as_float
 from ...core.errors import UsageError
 from ...core.frame import MeshState
 from ..memory import AddressOf, address
-from .detailed_normal import EDGES, FRAME_INTS, MATRICES, NORMALS, TURNS
+from .detailed_normal import FACES, FRAME_INTS, MATRICES, NORMALS, TURNS, VERTICES
 from .instances import Instances, normal_matrices
 from .tangents import corner_tangents
 from .trace_mesh import Part
@@ -51,7 +51,7 @@ class Placements(NamedTuple):
 
 @dataclass(slots=True)
 class _Values:
-    """A layer made ready, or tangents or edges, and what it was made of."""
+    """A layer made ready, or tangents, and what it was made of."""
 
     given: tuple[Array | None, ...]
     values: Array
@@ -76,9 +76,8 @@ class MeshLayers:
         self.warnings: list[str] = []
         self._rows: dict[tuple[int, str, bool], int] = {}
         self._values: dict[tuple[int, str, bool], _Values] = {}
-        self._edges: dict[int, _Values] = {}
         self._first_face: dict[int, int] = {}
-        self._frames: list[tuple[Array, int, Array, int, Array, Array]] = []
+        self._frames: list[tuple[int, Part, Array, Array, Array]] = []
 
     def begin(self) -> None:
         """Forget which layers are referred to; what was made of them stays until the next `update`."""
@@ -115,12 +114,8 @@ class MeshLayers:
         for mesh, state in enumerate(meshes):
             if mesh not in parts or not detailed[mesh]:
                 continue
-            part = parts[mesh]
-            assert part.own_normals is not None
-            self._frames.append(
-                (part.own_normals, part.row.start, self._edges_of(mesh, state, part), mesh, *placed.of(part))
-            )
-        self._edges = {mesh: self._edges[mesh] for *_, mesh, _, _ in self._frames}
+            vertices = as_float(state.vertices, (-1, 3), f"vertices of {state.name}")
+            self._frames.append((mesh, parts[mesh], vertices, *placed.of(parts[mesh])))
 
     def tables(self, first_face: int, address_of: AddressOf = address) -> tuple[Array, Array]:
         """Tables for compiled code.
@@ -135,10 +130,11 @@ class MeshLayers:
         Returns
         -------
         layers : (l, 2) int64 array
-            Address of each layer's values, as if it were of all faces of meshes; numbers a corner.
+            Address of each layer's values, as if it were of all faces of meshes; numbers a corner, `WORDS` of
+            tangents.
         frames : (meshes, FRAME_INTS) int64 array
-            Of each mesh: addresses of the normals of its corners, as if of all rows of normals; of the two edges of its
-            faces from the first corner, object space; of matrices and of turns of normals.
+            Of each mesh: addresses of the normals of its corners, as if of all rows of normals; of its vertices, object
+            space; of its faces, as if of all faces of meshes; of matrices and of turns of normals.
         """
         layers = np.zeros((len(self._rows), 2), np.int64)
         for key, row in self._rows.items():
@@ -146,22 +142,14 @@ class MeshLayers:
                 values = self._values[key].values
                 width = values.shape[2]
                 layers[row] = address_of(values) - 12 * width * (self._first_face[key[0]] - first_face), width
-        frames = np.zeros((1 + max((frame[3] for frame in self._frames), default=0), FRAME_INTS), np.int64)
-        for normals, row, edges, mesh, matrices, turns in self._frames:
-            frames[mesh, NORMALS] = address_of(normals) - 12 * row
-            frames[mesh, EDGES] = address_of(edges) - 24 * (self._first_face[mesh] - first_face)
+        frames = np.zeros((1 + max((frame[0] for frame in self._frames), default=0), FRAME_INTS), np.int64)
+        for mesh, part, vertices, matrices, turns in self._frames:
+            assert part.own_normals is not None
+            frames[mesh, NORMALS] = address_of(part.own_normals) - 12 * part.row.start
+            frames[mesh, VERTICES] = address_of(vertices)
+            frames[mesh, FACES] = address_of(part.faces) - 12 * (part.face.start - first_face)
             frames[mesh, MATRICES], frames[mesh, TURNS] = address_of(matrices), address_of(turns)
         return layers, frames
-
-    def _edges_of(self, mesh: int, state: MeshState, part: Part) -> Array:
-        """(m, 6) float32: both edges of each face from its first corner, object space."""
-        known, made_of = self._edges.get(mesh), (state.vertices, part.faces)
-        if known is None or not known.fits(made_of):
-            vertices = as_float(state.vertices, (-1, 3), f"vertices of {state.name}")
-            a, b, c = np.moveaxis(vertices[part.faces], 1, 0)
-            known = _Values(made_of, np.concatenate([b - a, c - a], axis=1))
-        self._edges[mesh] = known
-        return known.values
 
     def _made(self, mesh: MeshState, part: Part, name: str, tangents: bool, known: _Values | None) -> _Values:
         given = _given(mesh, name)
@@ -176,10 +164,9 @@ class MeshLayers:
             values, bad = finite(values)
             if tangents:
                 assert part.own_normals is not None
-                normals = _at_corners(part, part.own_normals)
                 vertices = as_float(mesh.vertices, (-1, 3), f"vertices of {mesh.name}")
-                values = corner_tangents(vertices, part.faces, normals, values)
-            known = _Values(made_of, plain(np.ascontiguousarray(values, np.float32)), bad)
+                values = corner_tangents(vertices, part.faces, part.own_normals, part.corner_rows, values)
+            known = _Values(made_of, plain(values), bad)
         if known.bad:
             what = f'values "{name}"' if name else "texture coordinates"
             self.warnings.append(f"{mesh.name}: {known.bad} {what} are not finite; 0 is used")
@@ -198,8 +185,3 @@ def _given(mesh: MeshState, name: str) -> Array | None:
     if not name:
         return mesh.uvs
     return next((layer.values for layer in mesh.layers if layer.name == name), None)
-
-
-def _at_corners(part: Part, normals: Array) -> Array:
-    """(m, 3, 3) of the (n, 3) or (3 m, 3) normals of a part."""
-    return normals[part.faces] if part.smooth else normals.reshape(-1, 3, 3)

@@ -144,6 +144,11 @@ class Part:
         return self.item.owner if isinstance(self.item, ObjectMesh) else self.source
 
     @property
+    def corner_rows(self) -> Array:
+        """(m, 3) int32: which of its rows of normals each corner has."""
+        return self.faces if self.smooth else np.arange(self.faces.size, dtype=np.int32).reshape(-1, 3)
+
+    @property
     def traced_faces(self) -> Array:
         """Its faces with the dead ones collapsed to one point, where no ray meets them."""
         if self.dead is None:

@@ -25,7 +25,7 @@ from .object_mesh import ObjectMesh
 from .ray_masks import object_flags
 from .terminator import TerminatorOffsets
 from .trace_mesh import Part, TraceObject, mask_of, own_faces, place_vertices, take_mesh, take_object
-from .triangle_bvh import Group, TriangleBVH
+from .triangle_bvh import Group, TriangleBVH, corners
 
 Array = np.ndarray
 
@@ -228,7 +228,7 @@ class TraceScene:
         if not same:
             parts = self._lay_out(items, instances, order)
         before = [part.item for part in parts]
-        vertices = self.bvh.vertices if same else np.zeros((self._vertex_count, 3), np.float32)
+        vertices = self.bvh.vertices if same else corners(self._vertex_count, np.float32)
         moved, elsewhere, died = set(), set(), not same
         for index, part in enumerate(parts):
             item, where = items[part.source], instances[part.source]
@@ -293,19 +293,14 @@ class TraceScene:
         self, items: Sequence[TraceObject | MeshState], instances: Sequence[Instances | None], order: list[int]
     ) -> list[Part]:
         """Lay out the scene's arrays: all that depends on topology alone."""
-        parts = []
-        faces, owners = [np.empty((0, 3), np.int32)], [np.empty(0, np.int32)]
+        parts, rows = list[Part](), {True: 0, False: 0}
         vertex = face = self.vertex_faces = 0
-        rows = {True: 0, False: 0}
         for source in order:
             item, where = items[source], instances[source]
             own, n = own_faces(item), len(item.vertices)
             m, smooth, surfels = len(own), item.corner_normals is None, isinstance(item, TraceObject)
             row = rows[surfels]
             # Corners with normals of their own get a row each.
-            corner = own if smooth else np.arange(3 * m, dtype=np.int32).reshape(m, 3)
-            faces.append(corner + np.int32(row))
-            owners.append(np.full(m, item.owner if isinstance(item, ObjectMesh) else source, np.int32))
             rows[surfels] += n if smooth else 3 * m
             spans = slice(vertex, vertex + n), slice(face, face + m), slice(row, rows[surfels])
             instanced = where is not None and where.instanced
@@ -314,7 +309,11 @@ class TraceScene:
             self.vertex_faces += m if surfels else 0
         self._vertex_count, self.layout = vertex, object()
         self.any_drgs = any(isinstance(items[source], TraceObject | ObjectMesh) for source in order)
-        self.shading_faces, self.face_object = np.concatenate(faces), np.concatenate(owners)
+        self.shading_faces, self.face_object = np.empty((face, 3), np.int32), np.empty(face, np.int32)
+        for part in parts:
+            np.add(part.corner_rows, np.int32(part.row.start), out=self.shading_faces[part.face])
+            item = items[part.source]
+            self.face_object[part.face] = item.owner if isinstance(item, ObjectMesh) else part.source
         self.shading = np.zeros((rows[True], VERTEX), np.float32)
         self.normals = np.zeros((rows[False], 3), np.float32)
         self.mesh_materials.clear(face - self.vertex_faces)
@@ -366,12 +365,14 @@ class TraceScene:
                 count += len(where.matrices)
         self._first_instance = np.array(first_instance or [0], np.int32)
         if other_faces:
-            faces = [part.traced_faces + np.int32(part.vertex.start) for part in parts]
+            faces = corners(len(self.face_object), np.int32)
+            for part in parts:
+                np.add(part.traced_faces, np.int32(part.vertex.start), out=faces[part.face])
             groups = [
                 Group(parts[m[0]].face.start, parts[m[-1]].face.stop, parts[m[0]].mask, matrices.get(i))
                 for i, m in enumerate(self._groups)
             ]
-            self.bvh.build(vertices, np.concatenate([np.empty((0, 3), np.int32), *faces]), groups)
+            self.bvh.build(vertices, faces, groups, take=True)
         else:
             changed = [i for i, members in enumerate(self._groups) if moved.intersection(members)]
             placed = {i: m for i, m in matrices.items() if elsewhere.intersection(self._groups[i])}

@@ -151,6 +151,11 @@ def neighbours(vertices: Array, faces: Array) -> Array:
     return np.ascontiguousarray(runs[:: max(1, math.ceil(len(runs) / _RUNS))])
 
 
+def corners(count: int, kind: type) -> Array:
+    """(count, 3) zeros, with the room behind them that Embree reads."""
+    return aligned(3 * count, kind).reshape(count, 3)
+
+
 class _Part:
     """Embree geometry of one group: its triangles and instances."""
 
@@ -277,14 +282,16 @@ class TriangleBVH:
         self._parts: list[_Part] = []
         self.build(self.vertices, self.faces)
 
-    def build(self, vertices: Array, faces: Array, groups: Sequence[Group] | None = None) -> None:
-        """Rebuild the trees from (n, 3) vertices and (m, 3) faces, both copied.
+    def build(self, vertices: Array, faces: Array, groups: Sequence[Group] | None = None, take: bool = False) -> None:
+        """Rebuild the trees from (n, 3) vertices and (m, 3) faces.
 
         Parameters
         ----------
         vertices, faces : array
         groups : sequence of Group, optional
             Runs of `faces`; by default one of them all, which every ray meets.
+        take : bool
+            Take arrays of `corners` as they are; others are copied.
 
         Raises
         ------
@@ -297,10 +304,11 @@ class TriangleBVH:
         if m and (np.min(faces) < 0 or np.max(faces) >= n):
             raise UsageError("mesh", f"faces refer to vertices outside 0..{n - 1}", "Check the mesh's indices")
         self._release()
-        self.vertices = aligned(3 * n, np.float32).reshape(n, 3)
-        self.faces = aligned(3 * m, np.int32).reshape(m, 3)
-        self.vertices[:] = vertices
-        self.faces[:] = faces
+        if not take:
+            given = vertices, faces
+            vertices, faces = corners(n, np.float32), corners(m, np.int32)
+            vertices[:], faces[:] = given
+        self.vertices, self.faces = vertices, faces
         groups = [Group(0, m)] if groups is None else groups
         self.first_face = np.array([g.first for g in groups] or [0], np.int32)
         self.scene = new_scene()

@@ -9,16 +9,28 @@ import numpy as np
 from ....compute.jit import inlined, njit
 from ...memory import load_float, load_int32, load_int64
 from ...sampling import ONE, ZERO, F
-from ...scene.detailed_normal import FRAME, FRAME_INTS, FRAME_TABLE, SLOTS, TURNS
+from ...scene.detailed_normal import FRAME, FRAME_INTS, FRAME_TABLE, NORMALS, SLOTS, TURNS
 from ...scene.interaction import place_of, tables_of
 from ...scene.material_rows import ALONG, COAT_DETAILS, MULTISCATTER, OF_POINT, THIN
 from ...scene.material_rows import KIND as ROW_KIND
+from ...scene.tangents import WORDS, tangent_at
 from ...scene.texture_lookup import blend, layer_at
 from .. import brdf
 from ..multiscatter import has_multiscatter
 from .lobes import DIFFUSE, KIND, LOBE, METAL, MIRROR, SHEEN, normalise_probabilities
 from .principled import add_material
 from .surface_parameters import parameters_at, plain_parameters, put_base
+
+
+@njit
+def _corners(face, geometry):  # type: ignore[no-untyped-def]
+    """Where the normals of a face's corners lie."""
+    corner = 3 * np.int64(face)
+    return (
+        3 * np.int64(load_int32(geometry.shading_faces, corner)),
+        3 * np.int64(load_int32(geometry.shading_faces, corner + 1)),
+        3 * np.int64(load_int32(geometry.shading_faces, corner + 2)),
+    )
 
 
 @njit
@@ -48,11 +60,8 @@ def side_of(place, facing, geometry):  # type: ignore[no-untyped-def]
     float32
     """
     face, instance, u, v = place
-    corner, w = 3 * np.int64(face), ONE - u - v
-    i = 3 * np.int64(load_int32(geometry.shading_faces, corner))
-    j = 3 * np.int64(load_int32(geometry.shading_faces, corner + 1))
-    k = 3 * np.int64(load_int32(geometry.shading_faces, corner + 2))
-    rows = geometry.normals
+    i, j, k = _corners(face, geometry)
+    rows, w = geometry.normals, ONE - u - v
     x = blend(rows, i, j, k, w, u, v)
     y = blend(rows, i + 1, j + 1, k + 1, w, u, v)
     z = blend(rows, i + 2, j + 2, k + 2, w, u, v)
@@ -68,9 +77,14 @@ def _along(row, material, place, instance, rows, geometry):  # type: ignore[no-u
     if layer < 0:
         return ZERO, ZERO, ZERO
     m = geometry.materials
-    x, y, z, _ = layer_at(layer, place, load_int64(m, 6))
+    layers, frames = load_int64(m, 6), load_int64(m, FRAME_TABLE)
     frame = FRAME_INTS * np.int64(load_int32(load_int64(m, 1), SLOTS * material + FRAME))
-    return _turned(load_int64(load_int64(m, FRAME_TABLE), frame + TURNS), instance, x, y, z)
+    if load_int64(layers, 2 * layer + 1) == WORDS:
+        corners = _corners(place[2] + geometry.vertex_faces, geometry)
+        x, y, z, _ = tangent_at(layer, corners, place, load_int64(frames, frame + NORMALS), layers)
+    else:
+        x, y, z, _ = layer_at(layer, place, layers)
+    return _turned(load_int64(frames, frame + TURNS), instance, x, y, z)
 
 
 @inlined
