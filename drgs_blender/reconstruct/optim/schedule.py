@@ -33,6 +33,14 @@ class Schedule:
         Part of the steps after which distortion and normals count.
     mask, distortion, consistency : float
         Weights of the losses.
+    median : float
+        Part of the median in the depth whose normals surfels are to have (`consistency`); the rest is the mean.
+    patches : float
+        Weight of the consistency of patches between a view and a neighbour of it (`losses.patches`), 0 for none.
+    patches_from : float
+        Part of the steps after which it counts.
+    patches_spread : float
+        Difference of a patch's grey between both views at which it counts 1 / e: what mirrors counts less; 0: no less.
     reflections : float
         Part of the steps after which reflections are learned; 1 never.
     bands : int
@@ -48,6 +56,10 @@ class Schedule:
     mask: float = 0.1
     distortion: float = 1.0
     consistency: float = 0.25
+    median: float = 0.0
+    patches: float = 0.0
+    patches_from: float = 0.3
+    patches_spread: float = 0.1
     reflections: float = 0.1
     bands: int = 2
     seed: int = 0
