@@ -43,6 +43,8 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "as it is": {},
     "harmonics alone, nothing mirrored": {"mirrors": 1.0},
     "without normal consistency": {"consistency": 0.0},
+    "normal consistency with the median depth": {"median": 1.0},
+    "consistency of patches of two views": {"patches": 1.0},
     "without distortion": {"distortion": 0.0},
     "without mask": {"mask": 0.0},
     "without harmonics beyond the mean": {"bands": 0},
@@ -188,24 +190,25 @@ def formatted(value: Any) -> Any:
 
 
 def ablations(options: argparse.Namespace) -> None:
-    """What each part of stage (i) is worth, at equal steps."""
+    """What each part of stage (i) is worth, at equal steps, on the capture's object and on those measured before."""
     capture = read_capture(options.capture, options.size, 8)
     warm(capture)
     base = Schedule(iterations=options.iterations or 800, surfels=8000)
-    rows: dict[str, Any] = {}
+    pixels = capture.views[0].camera.width
+    file, rows = ROWS / "ablations.json", {}
     for name, change in ABLATIONS.items():
         if options.only and name not in options.only:
             continue
         training, row = trained(capture, replace(base, **change), None)
         row |= against_truth(training.gaussians, training, capture, options.capture)
-        rows = store_row(ROWS / "ablations.json", name, row)
-    cells = [
-        (name, *(formatted(row[key]) for key in ("psnr", "ssim", "normal", "depth", "overlap", "cpu")))
-        for name, row in rows.items()
-    ]
-    head = ("Stage (i)", "PSNR dB", "SSIM", "Normals deg", "Depth", "Silhouettes", "processor s")
-    pixels = capture.views[0].camera.width
-    body = f"{options.capture.name}, {base.iterations} steps, {base.surfels} surfels, {pixels} pixels.\n\n"
+        row["run"] = f"{base.iterations} steps, {base.surfels} surfels, {pixels} pixels"
+        rows = store_row(file, f"{name}|{options.capture.name}", row)
+    order = {name: k for k, name in enumerate(ABLATIONS)}
+    named = sorted((key.split("|")[1], order[key.split("|")[0]], row) for key, row in rows.items())
+    names = ("psnr", "ssim", "normal", "depth", "overlap", "cpu")
+    cells = [(one, [*ABLATIONS][k], *(formatted(row[name]) for name in names)) for one, k, row in named]
+    head = ("Object", "Stage (i)", "PSNR dB", "SSIM", "Normals deg", "Depth", "Silhouettes", "processor s")
+    body = " / ".join(sorted({row["run"] for row in rows.values()})) + ".\n\n"
     write_section("reconstruct-ablations", "Ablations of stage (i)", body + table(head, cells))
 
 

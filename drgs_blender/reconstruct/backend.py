@@ -17,6 +17,7 @@ from ..core.frame import Camera
 from ..render.scene.triangle_bvh import TriangleBVH
 from .capture.training_views import Target
 from .inverse_rendering.gatherer import Gatherer
+from .losses.patches import Pair, patch_loss
 from .losses.photometric import difference
 from .losses.shape import shape_loss
 from .model.attributes import attributes
@@ -68,6 +69,14 @@ class LearningBackend:
         """`shape.shape_loss`."""
         known = None if mask is None else mask.numpy()
         return shape_loss(alpha, depth, distortion, normal, known, rays.numpy(), counts.numpy(), weights)
+
+    def patch_loss(
+        self, depth: Tensor, normal: Tensor, counts: Tensor, rays: Tensor, greys: tuple[Tensor, Tensor],
+        behind: Tensor, pair: Pair, spread: float,
+    ) -> Tensor:  # fmt: skip
+        """`patches.patch_loss`."""
+        grey, other = (g.numpy() for g in greys)
+        return patch_loss(depth, normal, counts.numpy(), rays.numpy(), (grey, other), behind.numpy(), pair, spread)
 
     def descend(self, value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: Array) -> None:
         """`adam.descend`."""

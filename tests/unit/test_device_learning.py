@@ -14,6 +14,7 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from capture_cases import balls  # noqa: E402
 from test_reconstruct_attributes import EYE, surfels  # noqa: E402
+from test_reconstruct_patches import given as two_views  # noqa: E402
 
 from drgs_blender.compute.warp.kernels import WarpKernel  # noqa: E402
 from drgs_blender.compute.warp.runtime import parts_of  # noqa: E402
@@ -114,6 +115,12 @@ def test_losses_of_the_shape(on_device: WarpLearningBackend, weights: tuple[floa
     rays, counts = random(HEIGHT, WIDTH, 3, seed=5, low=-1), random(HEIGHT, WIDTH, seed=6)
     work = lambda by, a, z, d, n: by.shape_loss(a, z, d, n, mask, rays, counts, weights)  # noqa: E731
     assert_alike(work, [*maps, normal], on_device)
+
+
+def test_patches_of_two_views(on_device: WarpLearningBackend) -> None:
+    given = two_views()
+    moving = [given.pop("depth"), given.pop("normal")]
+    assert_alike(lambda by, depth, normal: by.patch_loss(depth, normal, **given), moving, on_device, close=1e-2)
 
 
 def test_a_step_down(on_device: WarpLearningBackend) -> None:

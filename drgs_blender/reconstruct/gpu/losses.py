@@ -14,6 +14,7 @@ from torch.nn.functional import normalize
 
 from ...compute.warp.kernels import WarpKernel
 from ...render.sampling import ZERO
+from ..losses.patches import DISPLACED, FAINT, GRAZING, REACH, Pair
 from ..losses.photometric import C1, C2, DISSIMILARITY, SATURATED, WINDOW
 from ..losses.shape import COVERED, THIN
 from .launch import TensorLauncher
@@ -126,3 +127,67 @@ def shape_loss(
         inner = torch.where(covered > float(COVERED), counts[1:-1, 1:-1] * away, torch.zeros_like(away))
         loss = loss + by_normals * inner.mean()
     return loss
+
+
+def patch_loss(
+    depth: Tensor, normal: Tensor, counts: Tensor, rays: Tensor, greys: tuple[Tensor, Tensor], behind: Tensor,
+    pair: Pair, spread: float,
+) -> Tensor:  # fmt: skip
+    """`patches.patch_loss`."""
+    grey, other = greys
+    place = depth.device
+    there, back = (torch.from_numpy(m).to(depth) for m in pair)
+    facing = (normal * rays).sum(-1)
+    known = depth.detach()
+    usable = (known > 0) & (counts > 0) & (facing < -float(GRAZING) * normal.norm(dim=-1) * rays.norm(dim=-1))
+    usable[:REACH], usable[-REACH:], usable[:, :REACH], usable[:, -REACH:] = False, False, False, False
+    y, x = torch.nonzero(usable, as_tuple=True)
+    with torch.no_grad():
+        seen = torch.cat([depth[y, x, None] * rays[y, x], torch.ones_like(depth[y, x, None])], -1) @ there.T
+        at = seen[:, :2] / seen[:, 2:] - 0.5
+        z, inside = _sample(behind, at)
+        lowest = _corners(behind, at).amin(-1)
+        returned = torch.cat([(at + 0.5) * z[:, None], z[:, None], torch.ones_like(z[:, None])], -1) @ back.T
+        displaced = (returned[:, :2] / returned[:, 2:] - 0.5 - torch.stack([x, y], -1)).norm(dim=-1)
+        keep = (seen[:, 2] > 0) & inside & (lowest > 0) & (returned[:, 2] > 0) & (displaced < float(DISPLACED))
+    step = torch.arange(-REACH, REACH + 1, device=place)
+    dy, dx = (t.reshape(-1) for t in torch.meshgrid(step, step, indexing="ij"))
+    y, x, displaced = y[keep], x[keep], displaced[keep]
+
+    def homography(y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Taps (m, taps, 3) in the other view, see `patches`, and on which side of the plane they are."""
+        taps = rays[y[:, None] + dy, x[:, None] + dx]
+        side = (taps * normal[y, x, None]).sum(-1, keepdim=True)
+        return side * there[:, 3] + (depth[y, x] * facing[y, x])[:, None, None] * (taps @ there[:, :3].T), side[..., 0]
+
+    with torch.no_grad():
+        h, side = homography(y, x)
+        _, inside = _sample(other, h[..., :2] / h[..., 2:] - 0.5)
+        whole = (inside & (side < 0) & (h[..., 2] < 0) & (known[y[:, None] + dy, x[:, None] + dx] > 0)).all(-1)
+    y, x, displaced = y[whole], x[whole], displaced[whole]
+    h, _ = homography(y, x)
+    ours, (theirs, _) = grey[y[:, None] + dy, x[:, None] + dx], _sample(other, h[..., :2] / h[..., 2:] - 0.5)
+    weight = counts[y, x] * torch.exp(-displaced)
+    if spread:
+        weight = weight * torch.exp(-((ours.mean(-1) - theirs.detach().mean(-1)) / spread).square())
+    ours, theirs = ours - ours.mean(-1, keepdim=True), theirs - theirs.mean(-1, keepdim=True)
+    variances = (ours.square().mean(-1) + float(FAINT)) * (theirs.square().mean(-1) + float(FAINT))
+    return (weight * (1 - (ours * theirs).mean(-1) / variances.sqrt())).sum() / depth.numel()
+
+
+def _sample(picture: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """Bilinear values of a picture (h, w) at places (..., 2) from the first pixel's centre, and which are inside."""
+    h, w = picture.shape
+    inside = ((at >= 0) & (at < torch.tensor([w - 1, h - 1], device=at.device))).all(-1)
+    fraction = at - at.detach().floor()
+    a, b, c, d = _corners(picture, at).unbind(-1)
+    top, bottom = torch.lerp(a, b, fraction[..., 0]), torch.lerp(c, d, fraction[..., 0])
+    return torch.lerp(top, bottom, fraction[..., 1]), inside
+
+
+def _corners(picture: Tensor, at: Tensor) -> Tensor:
+    """(..., 4) pixels around places."""
+    h, w = picture.shape
+    first = at.detach().nan_to_num(0, 0, 0).floor()
+    x, y = first[..., 0].clamp(0, w - 2).long(), first[..., 1].clamp(0, h - 2).long()
+    return torch.stack([picture[y, x], picture[y, x + 1], picture[y + 1, x], picture[y + 1, x + 1]], -1)

@@ -14,6 +14,7 @@ from ...core.frame import Camera
 from ...render.scene.triangle_bvh import TriangleBVH
 from ..backend import LearningBackend
 from ..capture.training_views import Target
+from ..losses.patches import Pair
 from ..model.raster import GradientStatistics, Maps
 from ..optim.adam import step_rows
 from . import appearance, losses
@@ -83,6 +84,12 @@ class WarpLearningBackend(LearningBackend):
         counts: Tensor, weights: tuple[float, float, float],
     ) -> Tensor:  # fmt: skip
         return losses.shape_loss(alpha, depth, distortion, normal, mask, rays, counts, weights)
+
+    def patch_loss(
+        self, depth: Tensor, normal: Tensor, counts: Tensor, rays: Tensor, greys: tuple[Tensor, Tensor],
+        behind: Tensor, pair: Pair, spread: float,
+    ) -> Tensor:  # fmt: skip
+        return losses.patch_loss(depth, normal, counts, rays, greys, behind, pair, spread)
 
     def descend(self, value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: Array) -> None:
         there = torch.from_numpy(rate).to(self.device)

@@ -13,9 +13,10 @@ from torch import Tensor
 from ...core.arrays import Array
 from ..backend import LearningBackend
 from ..capture.training_views import Target, pixel_rays
+from ..losses.patches import Pair
 from ..model.attributes import TINT
 from ..model.gaussians import Gaussians, RenderedView
-from ..model.raster import GradientStatistics
+from ..model.raster import GradientStatistics, Maps
 from .adam import Adam
 from .densification import densify
 from .schedule import LIGHT_RATE, Schedule, learning_rates
@@ -24,6 +25,8 @@ log = logging.getLogger(__name__)
 
 #: Part of the weight of `Schedule.consistency` that matte pixels have, and what the tint of mirrors adds to it.
 MATTE, MIRRORED = 0.2, 5.0
+#: Weights of sRGB-encoded red, green and blue in grey (ITU-R BT.601).
+LUMA = (0.299, 0.587, 0.114)
 
 
 class Learner:
@@ -64,8 +67,8 @@ class Learner:
         self.statistics = GradientStatistics.of(len(self.gaussians), backend.device)
         self.iteration, self.error = 0, 0.0
 
-    def step(self, target: Target, part: float) -> None:
-        """Learn from one view.
+    def step(self, target: Target, part: float, beside: Target | None = None) -> None:
+        """Learn from one view, and from what it has in common with another.
 
         Parameters
         ----------
@@ -73,12 +76,17 @@ class Learner:
             Where the CPU can read it.
         part : float
             Fraction of the schedule that is done, 0..1.
+        beside : Target, optional
+            A view of the same from another place, for the consistency of patches.
         """
         # Also when done again, after a device has left it half-done.
         self.optimiser.steps = self.light.steps = self.iteration
         with _one_thread():
             rendered, rays = self._render(target, part)
-            self._loss(rendered, target, rays, part).backward()
+            loss = self._loss(rendered, target, rays, part)
+            if beside is not None:
+                loss = loss + self._schedule.patches * self._patch_loss(rendered, target, rays, beside)
+            loss.backward()
             self._optimise(part)
             squared = _squared_error(rendered, target)
         self.error = squared if not self.iteration else 0.98 * self.error + 0.02 * squared
@@ -107,11 +115,25 @@ class Learner:
             schedule.distortion / self._radius**2 if shaped else 0.0,
             schedule.consistency if shaped else 0.0,
         )
-        counts = _importance(maps.features)
+        counts, depth = _importance(maps.features), maps.depth
+        if schedule.median and shaped:
+            depth = torch.lerp(depth, _weighted_median(maps), schedule.median)
         shape = self._backend.shape_loss(
-            maps.alpha, maps.depth, maps.distortion, rendered.normal, target.mask, rays, counts, weights
+            maps.alpha, depth, maps.distortion, rendered.normal, target.mask, rays, counts, weights
         )
         return self._backend.difference(rendered.colour, target.photograph) + shape
+
+    def _patch_loss(self, rendered: RenderedView, target: Target, rays: Tensor, beside: Target) -> Tensor:
+        """Consistency of patches with those of the view `beside`."""
+        gaussians, backend = self.gaussians, self._backend
+        with torch.no_grad():
+            centre, eye = gaussians.centres(), np.asarray(beside.camera.matrix_world)[:3, 3]
+            u, v, opacity, features = backend.attributes(gaussians.parameters, centre, eye, 0, False)
+            behind = backend.rasterise(centre, u, v, opacity, features[:, :1], beside.camera).median
+        median, greys = rendered.maps.median, (_grey(target), _grey(beside))
+        pair, spread = Pair.of(target.camera, beside.camera), self._schedule.patches_spread
+        counts = torch.ones_like(median)
+        return backend.patch_loss(median, rendered.normal, counts, rays, greys, behind, pair, spread)
 
     def densify(self, budget: int) -> None:
         """Cut surfels, until there are `budget` at most."""
@@ -150,6 +172,16 @@ class Learner:
         self.gaussians = self.gaussians.like(part("value."))
         self.optimiser.first, self.optimiser.second = part("first."), part("second.")
         self.statistics = GradientStatistics(there("gradient"), there("views"))
+
+
+def _weighted_median(maps: Maps) -> Tensor:
+    """(h, w): median depth times alpha, by which `shape_loss` divides; where less than half is covered, the mean's."""
+    return torch.where(maps.median > 0, maps.median * maps.alpha, maps.depth)
+
+
+def _grey(target: Target) -> Tensor:
+    """(h, w) luma of the photograph."""
+    return target.colour @ torch.tensor(LUMA, device=target.colour.device)
 
 
 def _squared_error(rendered: RenderedView, target: Target) -> float:

@@ -42,6 +42,14 @@ class Schedule:
         Weight of the depth distortion, which gathers the surfels of a ray at one depth.
     consistency : float
         Weight of the consistency of normals with those of the depth map.
+    median : float
+        Part of the median in the depth whose normals surfels are to have (`consistency`); the rest is the mean.
+    patches : float
+        Weight of the consistency of patches between a view and a neighbour of it (`losses.patches`), 0 for none.
+    patches_from : float
+        Part of the steps after which it counts.
+    patches_spread : float
+        Difference of a patch's grey between both views at which it counts 1 / e: what mirrors counts less; 0: no less.
     reflections : float
         Part of the steps after which reflections are learned; 1 never.
     bands : int
@@ -59,6 +67,10 @@ class Schedule:
     mask: Weight = 0.1
     distortion: Weight = 1.0
     consistency: Weight = 0.25
+    median: Part = 0.0
+    patches: Weight = 0.0
+    patches_from: Part = 0.3
+    patches_spread: Weight = 0.1
     reflections: Part = 0.1
     bands: Annotated[int, Range(0, 3)] = 2
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0

@@ -17,6 +17,7 @@ import numpy as np
 from ...core.arrays import Array
 from ..backend import CPU, LearningBackend
 from ..capture.capture import Capture
+from ..capture.neighbours import neighbours
 from ..capture.training_views import background_of, targets
 from ..meshing.visual_hull import Region
 from ..model.gaussians import Gaussians
@@ -81,6 +82,8 @@ class Training:
     ) -> None:
         self.region, self.targets, self._background = region, targets(capture), background_of(capture)
         self.schedule = schedule = replace(schedule, surfels=min(schedule.surfels, surfel_limit(self.targets[0])))
+        if schedule.patches:
+            self._near = neighbours(capture.training, region.centre)
         rival = None
         if gaussians is None:
             gaussians = on_hull(capture, region, schedule.surfels, schedule.bands, schedule.seed)
@@ -139,8 +142,11 @@ class Training:
 
     def _learn(self) -> None:
         part = self.part
-        target = self.views.of_step(self.iteration, half=part < self.schedule.coarse, without_held_out=self.trying)
-        self.learner.step(target, part)
+        half = part < self.schedule.coarse
+        target, beside = self.views.of_step(self.iteration, half, without_held_out=self.trying), None
+        if self.schedule.patches and part >= self.schedule.patches_from:
+            beside = self.views.beside(self.iteration, half, self.trying, self._near)
+        self.learner.step(target, part, beside)
 
     def densify_when_due(self) -> None:
         """Cut surfels where the schedule has a round of it now."""

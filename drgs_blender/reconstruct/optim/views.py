@@ -55,10 +55,22 @@ class Views:
             Without the views that a trial holds out.
         """
         views = self.half if half else self.full
-        if without_held_out:
-            views = [view for k, view in enumerate(views) if not is_held_out(k)]
-        turn, place = divmod(iteration, len(views))
-        return self._backend.bring(views[np.random.default_rng([self._seed, turn]).permutation(len(views))[place]])
+        return self._backend.bring(views[self._number(iteration, without_held_out)])
+
+    def beside(self, iteration: int, half: bool, without_held_out: bool, near: list[list[int]]) -> Target | None:
+        """One of the views `near` (`capture.neighbours`) that of a step, drawn anew each time; None: it has none."""
+        views = self.half if half else self.full
+        numbers = near[self._number(iteration, without_held_out)]
+        numbers = [k for k in numbers if not (without_held_out and is_held_out(k))]
+        if not numbers:
+            return None
+        return self._backend.bring(views[np.random.default_rng([self._seed, iteration, 1]).choice(numbers)])
+
+    def _number(self, iteration: int, without_held_out: bool) -> int:
+        """Number of the view of a step."""
+        numbers = [k for k in range(len(self.full)) if not (without_held_out and is_held_out(k))]
+        turn, place = divmod(iteration, len(numbers))
+        return numbers[np.random.default_rng([self._seed, turn]).permutation(len(numbers))[place]]
 
     def held_out(self) -> Iterator[Target]:
         """The views that a trial holds out, in half size."""
