@@ -50,6 +50,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="of --out: likewise")
 
 
+def refuse_options(args: argparse.Namespace) -> None:
+    """Raise UsageError where options of protocols are given without one."""
+    for name in ("out", "lights_from", "most_views", "config", "set"):
+        if getattr(args, name):
+            raise UsageError(f"--{name.replace('_', '-')}", "is an option of --protocol", "Leave it out")
+
+
 def run(args: argparse.Namespace, settings: RenderSettings) -> int:
     """Score the objects of a set and print the table."""
     from ..evaluate.flip import find_flip

@@ -285,6 +285,8 @@ def test_what_cannot_be_scored_is_refused(maker, sets, tmp_path, capsys):
         assert f"{option[0]}: has no effect" in refused(capsys, 64, *words, maker.file, root, *option)
     assert "--most-views: is 0" in refused(capsys, 64, *words, maker.file, root, "--most-views", 0)
     assert "--most-views: is an option of --protocol" in refused(capsys, 64, maker.file, root, "--most-views", 2)
+    assert "--out: is an option of --protocol" in refused(capsys, 64, "--make-scenes", tmp_path, "--out", tmp_path)
+    assert "cannot be given with --protocol" in refused(capsys, 64, *words, root, "--make-scenes", tmp_path)
     without = read_asset(maker.file)
     without.environment = None
     write_asset(tmp_path / "toaster.drgs", without)
