@@ -68,6 +68,8 @@ def run(args: argparse.Namespace, settings: RenderSettings) -> int:
     root, assets = _places(args)
     _check(args, protocol)
     names = _objects(args, protocol, root, assets)
+    for name in names:
+        protocol.check(root, name, args.lights_from)  # before hours of work
     if args.out is not None:
         _reconstruct(args, protocol, root, names)
     lpips = Lpips(*args.lpips) if args.lpips else None
