@@ -274,6 +274,20 @@ def test_what_is_missing_or_damaged_is_named(protocol, what, how, said, maker, s
     assert said in refused(capsys, 65, *words)
 
 
+def test_a_damaged_object_does_not_keep_the_others_from_being_scored(maker, sets, tmp_path, capsys):
+    root = tmp_path / "set"
+    for name in ("toaster", "ball"):
+        shutil.copytree(sets["shiny-blender"] / "toaster", root / name)
+        shutil.copy(maker.file, tmp_path / f"{name}.drgs")
+    (root / "ball" / "test" / "r_1.png").write_bytes((root / "ball" / "test" / "r_1.png").read_bytes()[:200])
+    words = ["--protocol", "shiny-blender", str(tmp_path), str(root), "--samples", "4", "--json"]
+    assert main(["evaluate", *words]) == 65
+    said = capsys.readouterr()
+    report = json.loads(said.out)
+    assert list(report["objects"]) == ["toaster"] and "r_1.png" in report["failed"]["ball"]
+    assert "ball is not scored" in said.err and "ball" in report["missing"]
+
+
 def test_maps_that_a_set_lacks_are_told_and_the_rest_is_scored(maker, sets, tmp_path, capsys):
     root = tmp_path / "set"
     shutil.copytree(sets["stanford-orb"], root)
