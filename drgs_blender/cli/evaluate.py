@@ -108,15 +108,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make scenes, or score one asset."""
+    if args.protocol is None:
+        evaluate_protocol.refuse_options(args)
+    elif args.make_scenes is not None:
+        raise UsageError("--make-scenes", "cannot be given with --protocol", "Leave one of them out")
     if args.make_scenes is not None:
         if args.asset is not None:
             raise UsageError("--make-scenes", "takes no asset", "Score assets in a second command")
         return make(args)
     if args.protocol is not None:
         return evaluate_protocol.run(args, sampling.override(RenderSettings(), args))
-    for name in ("out", "lights_from", "most_views", "config", "set"):
-        if getattr(args, name):
-            raise UsageError(f"--{name.replace('_', '-')}", "is an option of --protocol", "Leave it out")
     if args.asset is None or args.capture is None:
         raise UsageError("evaluate", "needs an asset and its capture", "See `drgs evaluate --help`")
     return score(args)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core.errors import AssetError, UsageError, first_of
+from ..core.errors import EXIT_BAD_ASSET, AssetError, UsageError, first_of
 from ..core.frame import Adjustment, Camera, Frame, ObjectState, RenderSettings, World
 from .interrupt import interruptible
 from .output import check_writable
@@ -50,6 +50,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="of --out: likewise")
 
 
+def refuse_options(args: argparse.Namespace) -> None:
+    """Raise UsageError where options of protocols are given without one."""
+    for name in ("out", "lights_from", "most_views", "config", "set"):
+        if getattr(args, name):
+            raise UsageError(f"--{name.replace('_', '-')}", "is an option of --protocol", "Leave it out")
+
+
 def run(args: argparse.Namespace, settings: RenderSettings) -> int:
     """Score the objects of a set and print the table."""
     from ..evaluate.flip import find_flip
@@ -61,10 +68,13 @@ def run(args: argparse.Namespace, settings: RenderSettings) -> int:
     root, assets = _places(args)
     _check(args, protocol)
     names = _objects(args, protocol, root, assets)
+    for name in names:
+        protocol.check(root, name, args.lights_from)  # before hours of work
+    lpips = Lpips(*args.lpips) if args.lpips else None
     if args.out is not None:
         _reconstruct(args, protocol, root, names)
-    lpips = Lpips(*args.lpips) if args.lpips else None
     flip = find_flip()
+    failed: dict[str, AssetError] = {}
     report: dict[str, Any] = {"protocol": protocol.name, "samples": settings.samples, "objects": {}}
     with FractionBar(args, "rendering", every=WORK_SECONDS) as bar:
         for k, name in enumerate(names):
@@ -80,11 +90,18 @@ def run(args: argparse.Namespace, settings: RenderSettings) -> int:
                 bar(f"{name}, {part}, {done} of {of}", (k + done_here) / len(names))
 
             bench = Bench(asset, render, args.resolution, args.most_views, flip, lpips, tell, _writer(args, name))
-            report["objects"][name] = {"asset": digest, **protocol.measure(bench, root, name, args.lights_from)}
+            try:
+                report["objects"][name] = {"asset": digest, **protocol.measure(bench, root, name, args.lights_from)}
+            except AssetError as error:  # the other objects are scored all the same
+                if len(names) == 1:
+                    raise
+                failed[name] = error
+                logger.error("%s is not scored: %s", name, error)
+    report["failed"] = {name: str(error) for name, error in failed.items()}
     network = lpips.network if lpips else ""
     report = complete(report, protocol, network, args.most_views, args.resolution)
     print(json.dumps(report, indent=1, allow_nan=False) if args.json else "\n".join(table(report, protocol)))
-    return 0
+    return EXIT_BAD_ASSET if failed else 0
 
 
 def _places(args: argparse.Namespace) -> tuple[Path, Path]:

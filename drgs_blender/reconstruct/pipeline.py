@@ -284,9 +284,13 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: 
     )
     done, of = found.report["iterations"], work.settings.decoupling.iterations
     if done < min(FEW_STEPS, of):
+        minutes = work.settings.minutes
+        limit, unit = f"{settings.seconds:g} seconds", "seconds"
+        if minutes is not None:
+            limit, unit = f"part of {minutes:g} minutes", "minutes"
         log.warning(
-            "materials got %d of %d steps in their %g seconds, too few to separate them from the light: give "
-            "more time, or photographs of a lower resolution", done, of, settings.seconds,
+            "materials got %d of %d steps in their %s, too few to separate them from the light: give more %s, or "
+            "photographs of a lower resolution", done, of, limit, unit,
         )  # fmt: skip
     # Without the clock: the same run gives the same bytes.
     report["decoupling"] = {key: value for key, value in found.report.items() if key != "seconds"}

@@ -70,13 +70,17 @@ def test_no_step_that_is_timed_compiles(variant, masks):
     assert said.stdout == "watched: True\n", said.stdout + said.stderr
 
 
-@pytest.mark.parametrize("minutes", [None, 0.01], ids=["by steps", "by the clock"])
-def test_too_little_time_for_materials_is_said(minutes, monkeypatch, caplog):
+@pytest.mark.parametrize(
+    ("minutes", "seconds"), [(None, 0.0), (0.01, 0.0), (None, 0.2)], ids=["by steps", "by the clock", "by seconds"]
+)
+def test_too_little_time_for_materials_is_said(minutes, seconds, monkeypatch, caplog):
     warmed, told = [], []
     monkeypatch.setattr("drgs_blender.reconstruct.pipeline.warm_up", lambda *_: warmed.append(1))
-    quick = Decoupling(iterations=4 if minutes is None else 10**6, pixels=64, normals=True)
+    limited = minutes is not None or seconds > 0
+    quick = Decoupling(iterations=10**6 if limited else 4, pixels=64, normals=True, seconds=seconds)
     settings = Settings(schedule=Schedule(iterations=10, surfels=400), mesh_resolution=16, decoupling=quick)
     reconstruct(balls(8, 24), replace(settings, minutes=minutes), told.append)
     assert bool(warmed) == any(progress.phase == PREPARING for progress in told) == (minutes is not None)
-    assert ("materials got" in caplog.text) == (minutes is not None)
-    assert minutes is None or "give more minutes" in caplog.text
+    assert ("materials got" in caplog.text) == limited
+    assert minutes is None or ("in their part of 0.01 minutes" in caplog.text and "give more minutes" in caplog.text)
+    assert not seconds or ("in their 0.2 seconds" in caplog.text and "give more seconds" in caplog.text)

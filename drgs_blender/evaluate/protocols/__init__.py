@@ -48,6 +48,9 @@ class Protocol:
         (folder of the set, object) -> its photographs.
     read : callable
         (folder of the set, object, pixels of the longer side or None) -> the capture to learn from.
+    check : callable
+        (folder of the set, object, folder of the lights or None): raises AssetError where a file that is measured by is
+        not there, before hours of work.
     measure : callable
         (bench, folder of the set, object, folder of the lights or None) -> figures of the object, nested by name.
     columns : tuple of Column
@@ -63,6 +66,7 @@ class Protocol:
     objects: tuple[str, ...]
     folder: Callable[[Path, str], Path]
     read: Callable[[Path, str, int | None], Capture]
+    check: Callable[[Path, str, Path | None], object]
     measure: Callable[[Bench, Path, str, Path | None], dict[str, Any]]
     columns: tuple[Column, ...]
     parts: int
@@ -84,37 +88,60 @@ def _hdr_pictures(part: str, title: str) -> tuple[Column, ...]:
     )  # fmt: skip
 
 
+def _of(module: Any, columns: tuple[Column, ...], parts: int, lights: bool, about: str) -> Protocol:
+    """The protocol of a module, which is named as it is but for underscores."""
+    name = module.__name__.rpartition(".")[2].replace("_", "-")
+    functions = module.folder, module.read, module.check, module.measure
+    return Protocol(name, module.OBJECTS, *functions, columns, parts, lights, about)
+
+
 #: The table, by name.
 PROTOCOLS: dict[str, Protocol] = {
     protocol.name: protocol
     for protocol in (
-        Protocol(
-            "glossysynthetic", glossysynthetic.OBJECTS, glossysynthetic.folder, glossysynthetic.read,
-            glossysynthetic.measure, (*_pictures("views", "Views"), *_pictures("relit", "Relit")), 4, True,
+        _of(
+            glossysynthetic,
+            (*_pictures("views", "Views"), *_pictures("relit", "Relit")),
+            4,
+            True,
             "GlossySynthetic (NeRO), relit as GS-ROR measures: 16 views a light, each picture scaled by one factor a "
             "channel over the whole frame on white. Chamfer distance and normals are left out: the set has neither "
             "mesh nor normals",
         ),
-        Protocol(
-            "tensoir", tensoir.OBJECTS, tensoir.folder, tensoir.read, tensoir.measure,
-            (*_pictures("views", "Views"), *_pictures("relit", "Relit"), Column("materials.albedo_psnr", "Albedo PSNR"),
-             Column("shape.normal_degrees", "Normals MAE")), 6, True,
+        _of(
+            tensoir,
+            (
+                *_pictures("views", "Views"),
+                *_pictures("relit", "Relit"),
+                Column("materials.albedo_psnr", "Albedo PSNR"),
+                Column("shape.normal_degrees", "Normals MAE"),
+            ),
+            6,
+            True,
             "TensoIR-Synthetic: relit with albedo scaled by the median ratio of each channel (20 views); albedo in a "
             "gamma of 2.2; pictures, albedo and normals over the whole frame, on white, normals on +Z",
         ),
-        Protocol(
-            "stanford-orb", stanford_orb.OBJECTS, stanford_orb.folder, stanford_orb.read, stanford_orb.measure,
-            (*_hdr_pictures("relit", "Relit"), *_hdr_pictures("views", "Views"),
-             Column("materials.albedo_psnr", "Albedo PSNR-L"), Column("shape.normal_distance", "Normals 1 - cos", 4),
-             Column("shape.depth_mse", "Depth MSE", 5)), 2, False,
+        _of(
+            stanford_orb,
+            (
+                *_hdr_pictures("relit", "Relit"),
+                *_hdr_pictures("views", "Views"),
+                Column("materials.albedo_psnr", "Albedo PSNR-L"),
+                Column("shape.normal_distance", "Normals 1 - cos", 4),
+                Column("shape.depth_mse", "Depth MSE", 5),
+            ),
+            2,
+            False,
             "Stanford-ORB at 512 pixels, inside of the eroded masks; relit pictures scaled by one factor a channel, "
             "others not. Chamfer distance is left out: it needs the benchmark's own sampling of the meshes",
         ),
-        Protocol(
-            "shiny-blender", shiny_blender.OBJECTS, shiny_blender.folder, shiny_blender.read, shiny_blender.measure,
-            (*_pictures("views", "Views"), Column("shape.normal_degrees", "Normals MAE")), 1, False,
+        _of(
+            shiny_blender,
+            (*_pictures("views", "Views"), Column("shape.normal_degrees", "Normals MAE")),
+            1,
+            False,
             "Shiny Blender (Ref-NeRF): views over the whole frame on white, normals weighted by alpha. Relit pictures "
             "are left out: the set has none, tables with them render their own",
         ),
     )
-}  # fmt: skip
+}

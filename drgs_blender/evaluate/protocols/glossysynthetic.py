@@ -39,10 +39,27 @@ def read(root: Path, name: str, resolution: int | None) -> Capture:
     return read_capture(folder(root, name), resolution)
 
 
+def check(root: Path, name: str, lights: Path | None) -> dict[str, Path]:
+    """File of each light. Raises AssetError where one, or a folder of relit pictures, is not there."""
+    existing(folder(root, name), f"photographs of {name}")
+    base = _base(root)
+    for light in LIGHTS:
+        source = existing(base / "relight_gt" / f"{name}_{light}", f"{name} relit by {light}")
+        if not nero.sniff(source):
+            raise AssetError(str(source), "holds no k-camera.pkl beside k.png", "Unpack glossy_relight again")
+    places = [lights] if lights else [base / inner for inner in ("hdr2k", "hdr", "hdr4k", ".")]
+    return {light: find_light(places, light) for light in LIGHTS}
+
+
+def _base(root: Path) -> Path:
+    """The folder of the relit pictures, in the set's or beside it."""
+    return (root if (root / "glossy_relight").is_dir() else root.parent) / "glossy_relight"
+
+
 def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[str, Any]:
     """Figures of views left out and of relit pictures."""
-    source = folder(root, name)
-    layout = nero.read(existing(source, f"photographs of {name}"))
+    files = check(root, name, lights)
+    layout = nero.read(folder(root, name))
     testing = [photograph for photograph in layout.photographs if photograph.test]
     bench.warn_of_known([photograph.name for photograph in testing], name)
     rows = []
@@ -53,17 +70,13 @@ def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[st
         bench.show("views", number, ours, true)
         rows.append(bench.scores(eight_bits(ours), eight_bits(true), border=True))
     report: dict[str, Any] = {"views": mean_of(rows), "lights": {}}
-    base = root if (root / "glossy_relight").is_dir() else root.parent
-    places = [lights] if lights else [base / "glossy_relight" / inner for inner in ("hdr2k", "hdr", "hdr4k", ".")]
-    for light in LIGHTS:
-        report["lights"][light] = _relit(bench, base, name, light, read_light(find_light(places, light)))
+    for light, file in files.items():
+        source = _base(root) / "relight_gt" / f"{name}_{light}"
+        report["lights"][light] = _relit(bench, source, light, read_light(file))
     return report | {"relit": mean_of(list(report["lights"].values()))}
 
 
-def _relit(bench: Bench, base: Path, name: str, light: str, radiance: np.ndarray) -> dict[str, float | None]:
-    source = existing(base / "glossy_relight" / "relight_gt" / f"{name}_{light}", f"{name} relit by {light}")
-    if not nero.sniff(source):
-        raise AssetError(str(source), "holds no k-camera.pkl beside k.png", "Unpack glossy_relight again")
+def _relit(bench: Bench, source: Path, light: str, radiance: np.ndarray) -> dict[str, float | None]:
     layout = nero.read(source)
     # Their alpha is the mask, not the depth.
     first = [replace(photograph, mask=None) for photograph in layout.photographs[:RELIT_VIEWS]]

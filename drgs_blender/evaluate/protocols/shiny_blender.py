@@ -18,6 +18,7 @@ from ...core.errors import AssetError
 from ...formats.images import load_image
 from ...reconstruct.capture.capture import Capture, View
 from ...reconstruct.readers import read_capture, transforms
+from ...reconstruct.readers.layout import Layout, complain_of_missing
 from ...reconstruct.readers.photograph_loading import shrink
 from .bench import Array, Bench, existing, mean_of, shown_on_white
 
@@ -34,12 +35,25 @@ def read(root: Path, name: str, resolution: int | None) -> Capture:
     return read_capture(folder(root, name), resolution)
 
 
-def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[str, Any]:
-    """Figures of an object."""
+def check(root: Path, name: str, lights: Path | None) -> Layout:
+    """The views. Raises AssetError where one, or its normals, are not there."""
     source = existing(folder(root, name), f"photographs of {name}")
     if not (source / "transforms_test.json").is_file():
         raise AssetError(str(source / "transforms_test.json"), "is not there", "Unpack the set again")
     layout = transforms.read(source)
+    testing = [photograph for photograph in layout.photographs if photograph.test]
+    missing = [file.name for photograph in testing if not (file := _normals(photograph.image)).is_file()]
+    complain_of_missing(str(source), missing, len(testing))
+    return layout
+
+
+def _normals(image: Path) -> Path:
+    return image.with_name(f"{image.stem}_normal.png")
+
+
+def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[str, Any]:
+    """Figures of an object."""
+    layout = check(root, name, lights)
     testing = [photograph for photograph in layout.photographs if photograph.test]
     bench.warn_of_known([photograph.name for photograph in testing], name)
     images = {photograph.name: photograph.image for photograph in testing}
@@ -55,10 +69,7 @@ def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[st
 
 def _normal_error(normals: Array, image: Path, view: View) -> float:
     """Mean angle in degrees, weighted by alpha; where there is no normal of ours, 90."""
-    file = image.with_name(f"{image.stem}_normal.png")
-    if not file.is_file():
-        raise AssetError(str(file), "is not there", "Unpack the set again")
-    true = 2 * shrink(to_unit(load_image(file))[..., :3], view.camera.width, view.camera.height) - 1
+    true = 2 * shrink(to_unit(load_image(_normals(image)))[..., :3], view.camera.width, view.camera.height) - 1
     if view.mask is None:
         raise AssetError(str(image), "has no alpha", "Use the set's own files")
     ours = np.nan_to_num(normals)

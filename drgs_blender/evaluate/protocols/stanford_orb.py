@@ -87,10 +87,19 @@ def read(root: Path, name: str, resolution: int | None) -> Capture:
     return read_capture(folder(root, name), resolution or SIDE)
 
 
+def check(root: Path, name: str, lights: Path | None) -> tuple[list[Frame], list[Frame]]:
+    """The frames of other scenes, and those left out. Raises AssetError where a picture or a light is not there."""
+    existing(folder(root, name), f"photographs of {name}")
+    novel, testing = (frames(root, name, split) for split in ("novel", "test"))
+    for frame in novel:
+        if not (file := frame.of("env_map", ".exr")).is_file():
+            raise AssetError(str(file), "is not there", _REMEDY)
+    return novel, testing
+
+
 def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[str, Any]:
     """Figures of a capture."""
-    source = existing(folder(root, name), f"photographs of {name}")
-    novel, testing = (frames(root, name, split) for split in ("novel", "test"))
+    novel, testing = check(root, name, lights)
     bench.warn_of_known([f"test/{frame.image.stem}" for frame in testing], name)
     rows = []
     for number, frame, true, mask in _pictures(bench, "relit", novel):
@@ -116,7 +125,7 @@ def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[st
     report["shape"]["depth_mse"] = orb_metrics.depth_error(depths) if len(depths) == len(rows) else None
     for part, count in (("surface_normal", len(shape)), ("z_depth", len(depths)), ("pseudo_gt_albedo", len(albedo))):
         if count < len(rows):
-            logger.warning("%s: ground_truth has %d of %d files %s", source.name, count, len(rows), part)
+            logger.warning("%s: ground_truth has %d of %d files %s", name, count, len(rows), part)
     return report
 
 
@@ -204,8 +213,6 @@ def _scores(
 
 
 def _exr(path: Path) -> Array:
-    if not path.is_file():
-        raise AssetError(str(path), "is not there", _REMEDY)
     return read_exr(path)[0]
 
 

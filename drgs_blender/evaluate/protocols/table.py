@@ -31,7 +31,7 @@ def complete(
     for column in protocol.columns:
         values = [figure(row, column.path) for row in rows]
         numbers = [value for value in values if value is not None]
-        _put(means, column.path, float(np.mean(numbers)) if len(numbers) == len(values) else None)
+        _put(means, column.path, float(np.mean(numbers)) if numbers and len(numbers) == len(values) else None)
     missing = [name for name in protocol.objects if name not in report["objects"]]
     notes = []
     if missing:

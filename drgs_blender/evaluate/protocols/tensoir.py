@@ -44,17 +44,25 @@ def read(root: Path, name: str, resolution: int | None) -> Capture:
     return read_capture(folder(root, name), resolution)
 
 
+def check(root: Path, name: str, lights: Path | None) -> dict[str, Path]:
+    """File of each light. Raises AssetError where one, or a file of a test view, is not there."""
+    source = existing(folder(root, name), f"photographs of {name}")
+    views = sorted(path.name for path in source.glob("test_*") if path.is_dir())
+    if not views:
+        raise AssetError(str(source), "has no test_000, test_001, ...", "Unpack the set again")
+    names = ("metadata.json", "albedo.png", "normal.png", *(f"rgba_{light}.png" for light in LIGHTS))
+    files = [f"{view}/{file}" for view in views for file in names]
+    complain_of_missing(str(source), [file for file in files if not (source / file).is_file()], len(files))
+    places = [lights] if lights else [root / place / size for place in _PLACES for size in _SIZES]
+    return {light: find_light(places, light) for light in LIGHTS}
+
+
 def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[str, Any]:
     """Figures of an object."""
-    source = existing(folder(root, name), f"photographs of {name}")
-    places = [lights] if lights else [root / place / size for place in _PLACES for size in _SIZES]
-    radiances = {light: read_light(find_light(places, light)) for light in LIGHTS}
+    files, source = check(root, name, lights), folder(root, name)
     layout = tensoir.read(source)
     testing = [photograph for photograph in layout.photographs if photograph.test]
-    if not testing:
-        raise AssetError(str(source), "has no test_000, test_001, ...", "Unpack the set again")
-    names = [photograph.name for photograph in testing]
-    bench.warn_of_known(names, name)
+    bench.warn_of_known([photograph.name for photograph in testing], name)
     rows, angles, albedos, pixels = [], [], [], 0
     for number, view in bench.views("views", layout, testing):
         passes = bench.render(view.camera, bench.own_light(), (1.0, 1.0, 1.0))
@@ -69,8 +77,8 @@ def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[st
     factors = albedo_factors(albedos)
     report: dict[str, Any] = {"views": mean_of(rows), "shape": mean_of(angles), "lights": {}}
     report["materials"] = {"albedo_psnr": _albedo_psnr(albedos, factors, pixels), "albedo_factors": list(factors)}
-    for light, radiance in radiances.items():
-        report["lights"][light] = _relit(bench, source, names, light, radiance, factors)
+    for light, file in files.items():
+        report["lights"][light] = _relit(bench, source, light, read_light(file), factors)
     return report | {"relit": mean_of(list(report["lights"].values()))}
 
 
@@ -102,8 +110,6 @@ def _maps(source: Path, view: View) -> tuple[Array, Array, Array]:
     """((h, w, 3) linear albedo on white, (h, w, 3) world normals on +Z, (h, w) alpha) of a view."""
     maps = []
     for name in ("albedo.png", "normal.png"):
-        if not (source / name).is_file():
-            raise AssetError(str(source / name), "is not there", "Unpack the set again")
         image = to_unit(load_image(source / name))
         if image.shape[2] != 4:
             raise AssetError(str(source / name), "has no alpha", "Use the set's own files")
@@ -133,14 +139,10 @@ def _unit(vectors: Array) -> Array:
 
 
 def _relit(
-    bench: Bench, source: Path, names: list[str], light: str, radiance: Array, factors: tuple[float, float, float]
+    bench: Bench, source: Path, light: str, radiance: Array, factors: tuple[float, float, float]
 ) -> dict[str, float | None]:
-    """Scores of the views of those names, relit."""
     layout = tensoir.read(source, light)
-    found = {photograph.name: photograph for photograph in layout.photographs}
-    missing = [f"{name}/rgba_{light}.png" for name in names if name not in found]
-    complain_of_missing(str(source), missing, len(names))
-    testing = [found[name] for name in names]
+    testing = [photograph for photograph in layout.photographs if photograph.test]
     rows = []
     for number, view in bench.views(light, layout, testing):
         ours = shown_on_white(bench.render(view.camera, radiance, factors))
