@@ -149,4 +149,4 @@ def _nearest(name: str) -> str:
     if not near:
         fields_of = {row.field: known for known, row in table().items()}
         near = [fields_of[k] for k in difflib.get_close_matches(name.rpartition(".")[2], fields_of, n=1, cutoff=0.6)]
-    return f"; did you mean {first_of(near).replace(', ', ' or ')}?" if near else ""
+    return f" (did you mean {first_of(near).replace(', ', ' or ')}?)" if near else ""
