@@ -49,6 +49,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "without mask": {"mask": 0.0},
     "without harmonics beyond the mean": {"bands": 0},
     "full size from the start": {"coarse": 0.0},
+    "half size for half as long": {"coarse": 0.15},
     "without densification": {"rounds": 0},
 }
 

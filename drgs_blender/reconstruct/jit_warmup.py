@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,7 +43,8 @@ def warm_up(settings: Settings, masked: bool, backend: LearningBackend, cancelle
     ------
     Cancelled
     """
-    capture, mesh = _photographs(), _octahedron()
+    # Neighbouring views only where they are compared.
+    capture, mesh = _photographs((0.0, 0.3) if settings.schedule.patches else (0.0,)), _octahedron()
     region = find_region(capture)
     if not masked:
         for view in capture.views:
@@ -65,14 +67,15 @@ def _all_steps(training: Training, cancelled: Callable[[], bool]) -> None:
         training.step()
 
 
-def _photographs() -> Capture:
-    """A ball of noise, seen from six sides."""
+def _photographs(turns: tuple[float, ...]) -> Capture:
+    """A ball of noise, seen from six sides, and from beside each, radians."""
     rng, views = np.random.default_rng(0), []
     y, x = np.mgrid[:_SIZE, :_SIZE] + 0.5 - _SIZE / 2
     mask = (np.hypot(x, y) < 0.4 * _SIZE).astype(np.float32)
     focal = 0.4 * _SIZE * _AWAY
-    for k, back in enumerate(np.concatenate([np.eye(3), -np.eye(3)])):
-        side = np.roll(back, 1)
+    for k, (turn, axis) in enumerate(product(turns, np.concatenate([np.eye(3), -np.eye(3)]))):
+        across = np.roll(axis, 1)
+        back, side = np.cos(turn) * axis + np.sin(turn) * across, np.cos(turn) * across - np.sin(turn) * axis
         matrix = np.eye(4)
         matrix[:3] = np.column_stack([side, np.cross(back, side), back, _AWAY * back])
         camera = Camera(matrix, _SIZE, _SIZE, focal, focal, _SIZE / 2, _SIZE / 2)

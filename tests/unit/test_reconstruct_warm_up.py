@@ -56,18 +56,19 @@ capture = balls(18, 24, masks=masked)
 if not masked:
     capture.background = None
 quick = Decoupling(iterations=8, pixels=64, normals=True)
-schedule = Schedule(iterations=30, surfels=400)
+schedule = Schedule(iterations=30, surfels=400, patches=float(sys.argv[4]))
 job.reconstruct(capture, job.Settings(variant, schedule, mesh_resolution=16, minutes=100.0, decoupling=quick))
 print("watched:", watching)
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("variant", "masks"), [("m", "masks"), ("p", "none")])
-def test_no_step_that_is_timed_compiles(variant, masks):
-    command = [sys.executable, "-c", STEPS, str(Path(__file__).parent), variant, masks]
+@pytest.mark.parametrize(("variant", "masks", "patches"), [("m", "masks", "0"), ("p", "none", "0.5")])
+def test_no_step_that_is_timed_compiles(variant, masks, patches):
+    command = [sys.executable, "-c", STEPS, str(Path(__file__).parent), variant, masks, patches]
     said = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert said.stdout == "watched: True\n", said.stdout + said.stderr
+    assert said.stderr.count("patches are not compared") <= 1, "of the capture alone"
 
 
 @pytest.mark.parametrize(
