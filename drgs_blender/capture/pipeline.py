@@ -53,7 +53,7 @@ class Settings:
     poses: str = "auto"
     marker_length: float | None = None
     distance: float | None = None
-    masks: str = "auto"
+    masks: str = "given"
 
 
 @dataclass(slots=True)

@@ -60,10 +60,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--masks",
-        choices=("auto", "given", "none"),
-        default="auto",
-        help="auto: use and check masks that are there, else make them, of an object on a ground that shows texture "
-        "(default); given: make none; none: neither make nor use any",
+        choices=("given", "auto", "none"),
+        default="given",
+        help="given: use and check masks that are there (default); auto: make them where there are none, of an object "
+        "on a ground that shows texture, in about two minutes; none: neither make nor use any",
     )
 
 

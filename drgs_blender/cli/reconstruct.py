@@ -86,10 +86,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--masks",
-        choices=("auto", "given", "none"),
-        default="auto",
-        help="auto: use masks that are there, else make them, of an object on a ground that shows texture (default); "
-        "given: make none; none: use none, the surroundings are learned, too",
+        choices=("given", "auto", "none"),
+        default="given",
+        help="given: use masks that are there (default); auto: make them where there are none, of an object on a "
+        "ground that shows texture; none: use none, the surroundings are learned, too",
     )
     parser.add_argument(
         "--device",

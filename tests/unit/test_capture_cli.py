@@ -44,8 +44,8 @@ def test_cameras_are_found_for_a_reconstruction_that_has_none(photographs, tmp_p
 
     monkeypatch.setattr(pipeline, "make_capture", refuse)
     words = ["reconstruct", str(photographs), "--out", str(tmp_path / "a.drgs")]
-    assert main(words) == main([*words, "--masks", "none"]) == EXIT_BAD_ASSET
-    assert asked == [(photographs, tmp_path / "a.capture", masks) for masks in ("auto", "none")]
+    assert main(words) == main([*words, "--masks", "auto"]) == EXIT_BAD_ASSET
+    assert asked == [(photographs, tmp_path / "a.capture", masks) for masks in ("given", "auto")]
     assert "has no cameras: they are found first, in" in capsys.readouterr().err
 
 

@@ -25,7 +25,7 @@ _FAINT, _LARGEST = 0.1, 0.3
 #: Cells along the box's largest side in which parts are connected; margin beyond the box, in parts of that side.
 _CELLS, _BEYOND = 40, 0.1
 #: Part of the main part's weight that another part of the object has at least.
-_SMALL = 0.02
+_SMALL = 0.004
 #: Margin of the box around the object, in parts of its largest side; part of its surfels left out on each side.
 _MARGIN, _STRAYS = 0.12, 0.002
 

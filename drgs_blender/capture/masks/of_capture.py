@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 
 def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled: Callable[[], bool]) -> None:
-    """Give the views masks where none has one, or take theirs away, in place.
+    """Give the views masks where none has one ("auto"), or take theirs away ("none"), in place.
 
     Parameters
     ----------
