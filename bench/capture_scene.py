@@ -1,10 +1,11 @@
-"""Runs inside Blender's Python: photographs of an object on a textured table, with the cameras they were taken with.
+"""Runs inside Blender's Python: photographs of an object on a textured table, with their cameras and masks.
 
-    .venv-blender/bin/python bench/capture_scene.py FOLDER --world SKY.hdr [--size 800] [--sheet SHEET.png]
+    .venv-blender/bin/python bench/capture_scene.py FOLDER --world SKY.hdr [--object MESH.glb] [--sheet SHEET.png]
 
-Cycles renders the cat of the examples from two rings of hand-held cameras. `FOLDER/images` has the pictures without
-cameras or masks, `FOLDER/truth.json` the true ones: camera to world, Blender's axes, metres. With `--sheet`, the
-picture of a marker sheet on A4 lies under the object.
+Cycles renders an object, the cat of the examples unless another is named, from two rings of hand-held cameras.
+`FOLDER/images` has the pictures without cameras or masks; `FOLDER/truth.json` the true cameras: camera to world,
+Blender's axes, metres; `FOLDER/truth` the true masks, the object's coverage. With `--sheet`, the picture of a marker
+sheet on A4 lies under the object; with `--camouflage` the object has the table's picture.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from cycles_job import add_world, reset  # noqa: E402
 #: Metres.
 HEIGHT, TABLE, DISTANCE = 0.16, 1.2, 0.55
 A4 = (0.210, 0.297)
+GROUND = ("table", "sheet")
 
 
 def picture_material(name: str, image: bpy.types.Image) -> bpy.types.Material:
@@ -64,26 +66,52 @@ def plane(name: str, width: float, height: float, z: float, image: bpy.types.Ima
     bpy.context.collection.objects.link(bpy.data.objects.new(name, mesh))
 
 
-def stand(path: Path) -> None:
-    """Import the object, `HEIGHT` high, its feet at the origin."""
-    bpy.ops.import_scene.gltf(filepath=str(path))
-    meshes = [obj for obj in bpy.data.objects if obj.type == "MESH" and obj.name not in ("table", "sheet")]
-    corners = np.array([obj.matrix_world @ Vector(corner) for obj in meshes for corner in obj.bound_box])
-    low, high = corners.min(0), corners.max(0)
+def stand(path: Path) -> list[bpy.types.Object]:
+    """Import the object, `HEIGHT` high, its feet at the origin; its meshes."""
+    if path.suffix.lower() == ".obj":
+        bpy.ops.wm.obj_import(filepath=str(path))
+    else:
+        bpy.ops.import_scene.gltf(filepath=str(path))
+    bpy.context.view_layer.update()
+    graph = bpy.context.evaluated_depsgraph_get()
+    meshes = [obj for obj in bpy.data.objects if obj.type == "MESH" and obj.name not in GROUND and not obj.hide_render]
+    parts = []
+    for obj in meshes:
+        posed = obj.evaluated_get(graph)
+        parts.append(np.array([posed.matrix_world @ vertex.co for vertex in posed.data.vertices]))
+    vertices = np.concatenate(parts)
+    low, high = vertices.min(0), vertices.max(0)
     scale = HEIGHT / (high[2] - low[2])
     foot = Vector((*((low + high) / 2)[:2], low[2]))
-    for obj in (obj for obj in bpy.data.objects if obj.parent is None and obj.name not in ("table", "sheet")):
+    for obj in (obj for obj in bpy.data.objects if obj.parent is None and obj.name not in GROUND):
         obj.matrix_world = Matrix.Scale(scale, 4) @ Matrix.Translation(-foot) @ obj.matrix_world
+    return meshes
 
 
-def cameras(count: int, seed: int) -> list[Matrix]:
-    """Two rings around the object, held about level."""
+def cover(meshes: list[bpy.types.Object], image: bpy.types.Image, whole: bool) -> None:
+    """Give meshes a picture, on their UV map or, `whole`, from all sides as on a box."""
+    material = picture_material("cover", image)
+    if whole:
+        nodes, links = material.node_tree.nodes, material.node_tree.links
+        texture = next(node for node in nodes if node.type == "TEX_IMAGE")
+        texture.projection, texture.projection_blend = "BOX", 0.2
+        coordinate, mapping = nodes.new("ShaderNodeNewGeometry"), nodes.new("ShaderNodeMapping")
+        mapping.inputs["Scale"].default_value = (1 / TABLE,) * 3
+        links.new(coordinate.outputs["Position"], mapping.inputs["Vector"])
+        links.new(mapping.outputs["Vector"], texture.inputs["Vector"])
+    for obj in meshes:
+        obj.data.materials.clear()
+        obj.data.materials.append(material)
+
+
+def cameras(count: int, seed: int, elevations: tuple[float, float]) -> list[Matrix]:
+    """Two rings around the object at elevations in radians, held about level."""
     random = np.random.default_rng(seed)
     found = []
     for k in range(count):
         ring = k % 2
         angle = 2 * math.pi * (k + 0.3 * random.random()) / count
-        height = (0.45, 0.95)[ring] + 0.1 * (random.random() - 0.5)
+        height = elevations[ring] + 0.1 * (random.random() - 0.5)
         distance = DISTANCE * (1 + 0.15 * (random.random() - 0.5))
         place = Vector((math.cos(angle) * math.cos(height), math.sin(angle) * math.cos(height), math.sin(height)))
         target = Vector((*(0.02 * (random.random(2) - 0.5)), 0.4 * HEIGHT))
@@ -93,23 +121,49 @@ def cameras(count: int, seed: int) -> list[Matrix]:
     return found
 
 
+def render_masks(scene: bpy.types.Scene, camera: bpy.types.Object, places: dict[str, Matrix], folder: Path) -> None:
+    """Coverage by the object alone, which nothing stands before."""
+    for name in GROUND:
+        if name in bpy.data.objects:
+            bpy.data.objects[name].hide_render = True
+    scene.render.film_transparent, scene.cycles.max_bounces, scene.cycles.use_denoising = True, 0, False
+    scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
+    for name, matrix in places.items():
+        target = folder / f"{Path(name).stem}.png"
+        if not target.exists():
+            camera.matrix_world = matrix
+            scene.render.filepath = str(target)
+            bpy.ops.render.render(write_still=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
+    parser.add_argument("--object", type=Path, default=ROOT / "examples" / "cat" / "egyptian_cat.glb")
+    parser.add_argument("--texture", type=Path, help="picture on the object's UV map")
+    parser.add_argument("--camouflage", action="store_true", help="the object has the table's picture")
+    parser.add_argument("--seed", type=int, default=1, help="of the table's picture")
+    parser.add_argument("--elevations", type=float, nargs=2, default=(0.45, 0.95), help="of the rings, radians")
     parser.add_argument("--pictures", type=int, default=36)
     parser.add_argument("--size", type=int, default=800)
     parser.add_argument("--samples", type=int, default=16)
+    parser.add_argument("--denoise", action="store_true")
     parser.add_argument("--sheet", type=Path)
     parser.add_argument("--world", type=Path, required=True)
     args = parser.parse_args()
     scene = reset()
-    plane("table", TABLE, TABLE, -0.0005, table_picture(1))
+    table = table_picture(args.seed)
+    plane("table", TABLE, TABLE, -0.0005, table)
     if args.sheet:
         plane("sheet", *A4, 0.0, bpy.data.images.load(str(args.sheet.resolve())))
-    stand(ROOT / "examples" / "cat" / "egyptian_cat.glb")
+    meshes = stand(args.object.resolve())
+    if args.camouflage:
+        cover(meshes, table, whole=True)
+    elif args.texture:
+        cover(meshes, bpy.data.images.load(str(args.texture.resolve())), whole=False)
     add_world(scene, str(args.world.resolve()), 0.0, 1.0)
     scene.render.engine = "CYCLES"
-    scene.cycles.samples, scene.cycles.use_denoising = args.samples, False
+    scene.cycles.samples, scene.cycles.use_denoising = args.samples, args.denoise
     scene.cycles.max_bounces, scene.render.use_persistent_data = 2, True
     scene.render.resolution_x, scene.render.resolution_y = args.size, args.size * 3 // 4
     scene.render.image_settings.file_format = "JPEG"
@@ -120,7 +174,7 @@ def main() -> None:
     scene.camera = camera
     images = args.folder / "images"
     images.mkdir(parents=True, exist_ok=True)
-    places = {f"photo_{k:03d}.jpg": matrix for k, matrix in enumerate(cameras(args.pictures, 5))}
+    places = {f"photo_{k:03d}.jpg": matrix for k, matrix in enumerate(cameras(args.pictures, 5, args.elevations))}
     truth = {
         "focal": args.size * camera.data.lens / camera.data.sensor_width,
         "frames": {name: [list(row) for row in matrix] for name, matrix in places.items()},
@@ -131,6 +185,7 @@ def main() -> None:
             camera.matrix_world = matrix
             scene.render.filepath = str(images / name)
             bpy.ops.render.render(write_still=True)
+    render_masks(scene, camera, places, args.folder / "truth")
 
 
 if __name__ == "__main__":

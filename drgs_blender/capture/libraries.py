@@ -1,4 +1,4 @@
-"""Optional libraries of the front end: structure from motion, markers, video, camera raw."""
+"""Optional libraries of the front end: structure from motion, markers, masks, video, camera raw."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ class Library(NamedTuple):
 #: The table; versions as in the extra "capture" of pyproject.toml.
 LIBRARIES = {
     "pycolmap": Library("pycolmap", "pycolmap>=4.2,<4.3", "structure from motion"),
-    "opencv": Library("cv2", "opencv-python-headless>=4.10", "marker sheets"),
+    "opencv": Library("cv2", "opencv-python-headless>=4.10", "marker sheets and masks"),
     "av": Library("av", "av>=14", "video"),
+    "torch": Library("torch", "torch>=2.5", "masks"),
     "rawpy": Library("rawpy", "rawpy>=0.24", "camera raw files"),
 }
 

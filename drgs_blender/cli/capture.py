@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("given", "auto", "none"),
         default="given",
         help="given: use and check masks that are there (default); auto: make them where there are none, of an object "
-        "on a ground that shows texture; none: neither make nor use any",
+        "on a ground that shows texture, in about two minutes; none: neither make nor use any",
     )
 
 

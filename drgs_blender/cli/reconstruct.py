@@ -16,6 +16,7 @@ import contextlib
 import logging
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,7 @@ from .progress import WORK_SECONDS, FractionBar
 from .sampling import above_zero, int_range
 
 if TYPE_CHECKING:
+    from ..reconstruct.capture.capture import Capture
     from ..reconstruct.pipeline import Progress
     from ..reconstruct.settings import Reading, Settings
 
@@ -106,6 +108,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="separate materials from lighting (default); without, the albedo is the photographed colour",
     )
     parser.add_argument(
+        "--masks",
+        choices=("given", "auto", "none"),
+        default="given",
+        help="given: use masks that are there (default); auto: make them where there are none, of an object on a "
+        "ground that shows texture; none: use none, the surroundings are learned, too",
+    )
+    parser.add_argument(
         "--device",
         choices=("cpu", "cuda"),
         help="device of the optimisation: cpu or cuda; falls back to cpu. Default cpu",
@@ -159,6 +168,7 @@ def run(args: argparse.Namespace) -> int:
 
     source = _with_cameras(args)
     capture = read_capture(source, reading.resolution, reading.test_every, reading.axes, reading.up)
+    _mask(args, capture)
     logger.info("%d views to learn from, %d left out", len(capture.training), len(capture.testing))
     work = args.out.with_name(f"{args.out.stem}.reconstruct")
 
@@ -243,20 +253,34 @@ def _with_cameras(args: argparse.Namespace) -> Path:
     folder = args.out.with_name(f"{args.out.stem}.capture")
     if not args.quiet:
         emit(f"drgs: {args.capture} has no cameras: they are found first, in {folder}\n", sys.stderr)
-    said = 0.0
     with interruptible() as cancelled, FractionBar(args, "capturing", every=WORK_SECONDS) as bar:
-
-        def tell(phase: str, part: float) -> None:
-            nonlocal said
-            bar(phase, part)
-            if not args.quiet and not sys.stdout.isatty() and time.monotonic() >= said + _REPORT_EVERY:
-                said = time.monotonic()
-                print(f'DRGS_PROGRESS part={part:.3f} surfels=0 phase="{phase}"', flush=True)
-
-        made = make_capture(args.capture, folder, Settings(), tell, cancelled)
+        made = make_capture(args.capture, folder, Settings(masks=args.masks), _telling(args, bar), cancelled)
     for line in made.lines if not args.quiet else ():
         emit(f"drgs: {line}\n", sys.stderr)
     return folder
+
+
+def _telling(args: argparse.Namespace, bar: FractionBar) -> Callable[[str, float], None]:
+    """Called as (phase, part done): the bar, and lines on stdout that programs may read."""
+    said = 0.0
+
+    def tell(phase: str, part: float) -> None:
+        nonlocal said
+        bar(phase, part)
+        if not args.quiet and not sys.stdout.isatty() and time.monotonic() >= said + _REPORT_EVERY:
+            said = time.monotonic()
+            print(f'DRGS_PROGRESS part={part:.3f} surfels=0 phase="{phase}"', flush=True)
+
+    return tell
+
+
+def _mask(args: argparse.Namespace, capture: Capture) -> None:
+    """Make masks of a capture that has none, or leave them out, as `--masks` says."""
+    from ..capture.masks.of_capture import mask_capture
+
+    with interruptible() as cancelled, FractionBar(args, "finding the object", every=WORK_SECONDS) as bar:
+        sheet = args.out.with_name(f"{args.out.stem}.masks.png")
+        mask_capture(capture, args.masks, sheet, _telling(args, bar), cancelled)
 
 
 def clear(folder: Path) -> None:

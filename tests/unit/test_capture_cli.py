@@ -38,13 +38,14 @@ def test_cameras_are_found_for_a_reconstruction_that_has_none(photographs, tmp_p
     pytest.importorskip("torch")
     asked = []
 
-    def refuse(source, folder, *_):
-        asked.append((source, folder))
+    def refuse(source, folder, settings, *_):
+        asked.append((source, folder, settings.masks))
         raise AssetError(str(source), "cannot be calibrated")
 
     monkeypatch.setattr(pipeline, "make_capture", refuse)
-    assert main(["reconstruct", str(photographs), "--out", str(tmp_path / "a.drgs")]) == EXIT_BAD_ASSET
-    assert asked == [(photographs, tmp_path / "a.capture")]
+    words = ["reconstruct", str(photographs), "--out", str(tmp_path / "a.drgs")]
+    assert main(words) == main([*words, "--masks", "auto"]) == EXIT_BAD_ASSET
+    assert asked == [(photographs, tmp_path / "a.capture", masks) for masks in ("given", "auto")]
     assert "has no cameras: they are found first, in" in capsys.readouterr().err
 
 

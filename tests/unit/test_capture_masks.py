@@ -26,7 +26,13 @@ LENS = Lens(160, 120, 190.0, 190.0, 80.0, 60.0, "RADIAL", (-0.03, 0.01))
 @pytest.fixture
 def cv2(monkeypatch):
     module = pytest.importorskip("cv2")
-    monkeypatch.setattr(stage, "_PART", 150)  # small, for speed
+    pytest.importorskip("torch")
+    from drgs_blender.capture.masks import making
+    from drgs_blender.capture.masks.learned_scene import Effort
+
+    # small, for speed
+    monkeypatch.setattr(making, "EFFORTS", (Effort(64, 150, 5000, 60.0), Effort(96, 400, 6000, 120.0)))
+    monkeypatch.setattr(making, "PART", 150)
     monkeypatch.setattr(stage, "_WHOLE", 160)
     return module
 
@@ -113,7 +119,7 @@ def test_the_box_holds_the_ball_without_ground_and_strays():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("points", [True])
+@pytest.mark.parametrize("points", [True, False])
 def test_masks_of_a_ball_on_a_pattern(cv2, tmp_path, points):
     views, true = scene()
     found, pictures = written(tmp_path, views, ball_points() if points else np.zeros((0, 3)))
@@ -121,9 +127,115 @@ def test_masks_of_a_ball_on_a_pattern(cv2, tmp_path, points):
     assert not any(fit.doubtful for fit in masked.fits) and (tmp_path / "sheet.png").is_file()
     scores = [iou(np.asarray(Image.open(pictures[v.name].mask)) > 127, mask) for v, mask in zip(views, true)]
     assert np.mean(scores) > 0.92 and min(scores) > 0.85
-    first = {name: picture.mask.read_bytes() for name, picture in pictures.items()}
-    run(tmp_path, "auto", found, pictures)
-    assert first == {name: picture.mask.read_bytes() for name, picture in pictures.items()}
+
+
+def test_straightening_and_distorting_are_inverse():
+    cv2 = pytest.importorskip("cv2")
+    view, mask = photograph(3, 12)
+    view.pixels[:] = np.where(mask[..., None], 255, 0)
+    straight = view.straightened(cv2, 160)
+    back = view.distorted(cv2, view.pinhole(160), straight.pixels[..., 0].astype(np.float32)) > 127
+    assert iou(back, mask) > 0.985
+    at, _ = view.project(view.centre + 0.7 * straight.rays()[30:33, 20:23].reshape(-1, 3))
+    assert np.abs(at - np.stack(np.mgrid[30:33, 20:23][::-1], -1).reshape(-1, 2) - 0.5).max() > 0.2  # distortion
+
+
+def test_behind_the_object_is_the_ground():
+    cv2 = pytest.importorskip("cv2")
+    from drgs_blender.capture.masks.ground_picture import GroundPicture
+
+    views, masks = scene(16)
+    box = ObjectBox(MIDDLE - np.array([0.2, 0.2, RADIUS]), MIDDLE + 0.2, np.zeros((0, 3)))
+    ground = GroundPicture(cv2, views, box)
+    view, mask = views[3], masks[3]
+    nothing = np.zeros(2), np.zeros(2)
+    behind = ground.without_object(view, box.outline(cv2, view), nothing)
+    assert np.array_equal(behind[~box.outline(cv2, view)], view.pixels[~box.outline(cv2, view)] / np.float32(255))
+    # the upper half of the ball, which hides ground that other views see
+    upper = mask & (np.arange(120)[:, None] < np.nonzero(mask)[0].mean())
+    assert view.pixels[upper].max() < 80 and np.median(behind[upper]) > 0.4
+    learned = ground.without_object(view, box.outline(cv2, view), (box.low[:2], box.high[:2]))
+    foot = view.project(np.array([[0.1, -0.15, 0.0]]))[0][0].astype(int)
+    assert len(np.unique(learned[foot[1] - 2 : foot[1] + 3, foot[0] - 2 : foot[0] + 3].reshape(-1, 3), axis=0)) == 1
+
+
+def strewn(low: list[float], high: list[float], count: int) -> np.ndarray:
+    return np.random.default_rng(7).uniform(low, high, (count, 3))
+
+
+def test_the_object_is_what_stands_on_the_ground_and_is_connected():
+    pytest.importorskip("torch")
+    from drgs_blender.capture.masks.object_surfels import box_around, cut_object
+    from drgs_blender.reconstruct.model.gaussians import Gaussians
+
+    tilted = strewn([-0.6, -0.6, 0], [0.6, 0.6, 0], 4000)
+    tilted[:, 2] = 0.02 * tilted[:, 0] + np.random.default_rng(8).normal(scale=4e-4, size=len(tilted))
+    body = strewn([-0.1, -0.1, 0.01], [0.1, 0.1, 0.4], 1500)
+    tail = strewn([0.1, -0.02, 0.012], [0.2, 0.02, 0.02], 300)  # it lies on the ground
+    stray = strewn([0.25, 0.25, 0.3], [0.26, 0.26, 0.31], 3)
+    places = np.concatenate([tilted, body, tail, stray])
+    scene = Gaussians.on_surface(places, np.tile([0.0, 0, 1], (len(places), 1)), np.full_like(places, 0.5), 0.006, 0)
+    box = ObjectBox(np.array([-0.25, -0.25, 0]), np.array([0.25, 0.25, 0.5]), np.zeros((0, 3)))
+    cut = cut_object(scene, box)
+    ground, rest = cut.surfels[:4000], cut.surfels[4000:]
+    beside = (tilted[:, 0] < -0.12) | (tilted[:, 0] > 0.22) | (np.abs(tilted[:, 1]) > 0.12)
+    assert not ground[beside].any() and rest[:1800].mean() > 0.98 and not rest[1800:].any() and 0 < cut.noise < 2e-3
+    found = box_around(scene, cut, box.points)
+    assert found.low[2] == 0 and (found.high >= [0.2, 0.1, 0.4]).all() and (found.high < [0.26, 0.16, 0.47]).all()
+
+
+def test_specks_and_pinholes_are_no_part_of_a_mask():
+    pytest.importorskip("torch")
+    from drgs_blender.capture.masks.making import without_specks
+
+    _, mask = photograph(2, 12)
+    rows, columns = np.nonzero(mask)
+    torn = mask.copy()
+    torn[2:4, 2:4] = True
+    torn[int(rows.mean()), int(columns.mean())] = False
+    assert np.array_equal(without_specks(torn), mask) and not without_specks(mask & False).any()
+
+
+def test_masks_of_a_capture_are_made_only_where_it_has_none(tmp_path, monkeypatch):
+    pytest.importorskip("cv2")
+    pytest.importorskip("torch")
+    from drgs_blender.capture.masks import of_capture
+    from drgs_blender.core.frame import Camera
+    from drgs_blender.reconstruct.capture.capture import Capture, View
+
+    class Made:
+        def whole(self, view, shape, size):
+            return np.full(shape, 51 * (view % 2), np.uint8)
+
+    asked = []
+    monkeypatch.setattr(of_capture, "make_masks", lambda cv2, views, *_: (asked.append(views), (Made(), []))[1])
+    views, masks = scene(6)
+    turned = np.array([[0, 0, 1.0, 0], [1, 0, 0, 0], [0, 1, 0, 3], [0, 0, 0, 1]])  # Z is not up
+
+    def capture() -> Capture:
+        shown = []
+        for view in views:
+            camera = Camera(turned @ view.matrix, 160, 120, 190.0, 190.0, 80.0, 60.0)
+            shown.append(View(view.name, camera, view.pixels / np.float32(255)))
+        points = ball_points() @ turned[:3, :3].T + turned[:3, 3]
+        return Capture(tmp_path, shown, None, points.astype(np.float32))
+
+    def mask(capture: Capture, mode: str) -> list[np.ndarray | None]:
+        of_capture.mask_capture(capture, mode, tmp_path / "sheet.png", lambda *_: None, lambda: False)
+        return [view.mask for view in capture.views]
+
+    assert mask(capture(), "given") == [None] * 6 and not asked
+    given = capture()
+    for view, true in zip(given.views, masks, strict=True):
+        view.mask = true.astype(np.float32)
+    assert mask(given, "auto")[0] is given.views[0].mask and not asked
+    assert mask(given, "none") == [None] * 6 and not asked
+    made = mask(capture(), "auto")
+    assert np.allclose(made[1], 0.2) and not made[0].any() and len(asked) == 1
+    # upright, on the ground
+    level = np.stack([view.matrix for view in asked[0]])
+    np.testing.assert_allclose(level[:, 2, 2], [view.matrix[2, 2] for view in views], atol=1e-2)
+    assert (level[:, 2, 3] > 0.2).all()
 
 
 def test_a_wrong_mask_is_found_among_right_ones(cv2):

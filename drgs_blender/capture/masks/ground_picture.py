@@ -1,4 +1,4 @@
-"""The picture of the ground as seen from all cameras, and which pixels of a photograph agree with it."""
+"""The picture of the ground as seen from all cameras, and what a photograph would show without the object."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from .mask_view import MaskView
 from .object_box import ObjectBox
 
 #: Side of the picture, pixels at most; views that make it.
-_SIDE, _VIEWS = 448, 24
-#: Half width in parts of the box's largest side; beyond it the ground is not compared.
-_REACH = 1.6
+_SIDE, _VIEWS = 640, 24
+#: Half width in parts of the box's largest side; beyond it the ground is not known.
+_REACH = 3.0
 #: Least number of views that must see a spot.
 _FEWEST = 3
 #: Agreement: difference in parts of the spread of the spot over the views, least difference (of 255).
@@ -34,11 +34,9 @@ class GroundPicture:
         OpenCV.
     views : sequence of MaskView
     box : ObjectBox
-    masks : sequence of (h, w) bool arrays, optional
-        What is no ground, per view.
     """
 
-    def __init__(self, cv2: Any, views: Sequence[MaskView], box: ObjectBox, masks: Sequence[Array] | None = None):
+    def __init__(self, cv2: Any, views: Sequence[MaskView], box: ObjectBox):
         self._cv2 = cv2
         size = box.high - box.low
         middle = (box.low + box.high)[:2] / 2
@@ -50,7 +48,7 @@ class GroundPicture:
         x, y = np.meshgrid(self._low[0] + step, self._low[1] + step)
         spots = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
         chosen = np.unique(np.linspace(0, len(views) - 1, min(_VIEWS, len(views))).round().astype(int))
-        stack = np.stack([self._seen(views[k], spots, None if masks is None else masks[k]) for k in chosen])
+        stack = np.stack([self._seen(views[k], spots) for k in chosen])
         enough = np.isfinite(stack[..., 0]).sum(axis=0) >= _FEWEST
         stack[:, ~enough] = 0
         self.colour = _median(stack)
@@ -65,19 +63,18 @@ class GroundPicture:
             unsure = cv2.morphologyEx(unsure, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
             enough &= cv2.dilate(unsure, np.ones((5, 5), np.uint8)) == 0
         self.spread = spread
+        self._mean = self.colour[enough].mean(axis=0) if enough.any() else np.full(3, 128.0)
         self.colour[~enough] = np.nan
 
     def _blurred(self, pixels: Array) -> Array:
         return self._cv2.GaussianBlur(pixels, (0, 0), _BLUR).astype(np.float32)
 
-    def _seen(self, view: MaskView, spots: Array, mask: Array | None) -> Array:
+    def _seen(self, view: MaskView, spots: Array) -> Array:
         """(side, side, 3) float32 of one view; NaN where it does not see the ground."""
         at, _ = view.project(spots)
         at = (at - 0.5).astype(np.float32).reshape(self._side, self._side, 2)
         at[~np.isfinite(at)] = -10
         pixels = self._blurred(view.pixels)
-        if mask is not None:
-            pixels[mask] = np.nan
         return self._cv2.remap(pixels, at, None, self._cv2.INTER_LINEAR, borderValue=(np.nan,) * 3)
 
     @staticmethod
@@ -88,10 +85,18 @@ class GroundPicture:
             return np.ones(3, np.float32)
         return np.median(colour[known] / picture[known], axis=0).astype(np.float32)
 
-    def agreement(self, view: MaskView) -> Array:
-        """(h, w) float32: the difference from the ground in parts of what is allowed; below 1 agrees; NaN unknown."""
+    def without_object(self, view: MaskView, outline: Array, near: tuple[Array, Array]) -> Array:
+        """(h, w, 3) float32 in 0..1, sRGB: what the view would show behind the object and the ground `near` it.
+
+        The photograph itself outside of the `outline` (h, w, bool) of the object's box, and inside where it agrees with
+        the ground; else the ground; where that is not known, what is around. Of the ground between the corners
+        `near`, (2,) each, the mean colour: it is learned.
+        """
         cv2 = self._cv2
-        at = ((view.on_ground() - self._low) / self._cell - 0.5).astype(np.float32)
+        places = view.on_ground()
+        with np.errstate(invalid="ignore"):
+            learned = ((places > near[0]) & (places < near[1])).all(axis=-1)
+        at = ((places - self._low) / self._cell - 0.5).astype(np.float32)
         at[~np.isfinite(at)] = -10
         expected = cv2.remap(self.colour, at, None, cv2.INTER_LINEAR, borderValue=(np.nan,) * 3)
         spread = cv2.remap(self.spread, at, None, cv2.INTER_LINEAR, borderValue=np.nan)
@@ -101,8 +106,15 @@ class GroundPicture:
         known = np.isfinite(difference)
         weight = cv2.boxFilter(known.astype(np.float32), -1, (3, 3))
         smooth = cv2.boxFilter(np.where(known, difference, 0).astype(np.float32), -1, (3, 3))
-        allowed = _FLOOR + _SPREADS * np.nan_to_num(spread)
-        return np.where(known, smooth / np.maximum(weight, 1e-6) / allowed, np.nan).astype(np.float32)
+        agrees = known & (smooth < np.maximum(weight, 1e-6) * (_FLOOR + _SPREADS * np.nan_to_num(spread)))
+        expected = np.where(known[..., None], np.nan_to_num(expected) / gain, view.pixels)
+        expected[agrees | ~outline] = view.pixels[agrees | ~outline]
+        behind = np.clip(expected, 0, 255).astype(np.uint8)
+        hidden = (outline & ~known & ~learned).astype(np.uint8)
+        if hidden.any() and not hidden.all():
+            behind = cv2.inpaint(behind, hidden, 3, cv2.INPAINT_TELEA)
+        behind[learned] = self._mean
+        return behind.astype(np.float32) / 255
 
 
 def _median(stack: Array) -> Array:

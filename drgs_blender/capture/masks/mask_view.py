@@ -1,13 +1,15 @@
-"""A small photograph with its camera: projection of points, rays of pixels, maps from the ground."""
+"""A small photograph with its camera: projection of points, rays of pixels, the picture without distortion."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from PIL import Image as Pillow
 
 from ...core.arrays import Array
+from ...core.frame import Camera
 from ...reconstruct.readers.layout import OPENCV_TO_BLENDER, invert
 from ...reconstruct.readers.lens import Lens, distort
 
@@ -56,8 +58,8 @@ class MaskView:
         x, y = local[:, 0] / safe, local[:, 1] / safe
         return np.stack(distort(self.lens, x, y), axis=1), depth
 
-    def rays(self) -> Array:
-        """(h, w, 3) directions of the pixels' centres, world, not of unit length."""
+    def _slopes(self) -> tuple[Array, Array]:
+        """(h, w) each: x and y at unit depth of the pixels' centres, without the lens's distortion."""
         height, width = self.shape
         lens = self.lens
         column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
@@ -65,8 +67,41 @@ class MaskView:
         for _ in range(_STEPS if lens.distorts else 0):
             moved = distort(lens, x, y)
             x, y = x + (column - moved[0]) / lens.fx, y + (row - moved[1]) / lens.fy
+        return x, y
+
+    def rays(self) -> Array:
+        """(h, w, 3) directions of the pixels' centres, world, not of unit length."""
+        x, y = self._slopes()
         local = np.stack([x, y, np.ones_like(x)], axis=-1)
         return local @ (self.matrix @ OPENCV_TO_BLENDER)[:3, :3].T
+
+    def pinhole(self, longest: int) -> Camera:
+        """A camera without distortion that sees the same, `longest` pixels on its longer side."""
+        height, width = self.shape
+        factor = longest / max(width, height)
+        w, h = max(1, round(width * factor)), max(1, round(height * factor))
+        lens = self.lens.scaled(w, h)
+        return Camera(self.matrix, w, h, lens.fx, lens.fy, lens.cx, lens.cy)
+
+    def straightened(self, cv2: Any, longest: int) -> MaskView:
+        """The picture as its `pinhole` camera sees it."""
+        camera = self.pinhole(longest)
+        x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+        y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+        at = [(c - 0.5).astype(np.float32) for c in distort(self.lens, *np.meshgrid(x, y))]
+        pixels, factor = self.pixels, self.shape[1] / camera.width
+        if factor > 1:
+            pixels = cv2.GaussianBlur(pixels, (0, 0), 0.4 * factor)
+        seen = cv2.remap(pixels, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        lens = Lens(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        return MaskView(self.name, seen, self.matrix, lens)
+
+    def distorted(self, cv2: Any, camera: Camera, values: Array) -> Array:
+        """(h, w) float32: values of the pixels of a `pinhole` camera at those of the picture."""
+        x, y = self._slopes()
+        at = [x * camera.fx + camera.cx - 0.5, y * camera.fy + camera.cy - 0.5]
+        at = [np.asarray(c, np.float32) for c in at]
+        return cv2.remap(values, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def cropped(self, window: tuple[int, int, int, int], longest: int) -> MaskView:
         """A part (left, top, right, bottom) of the picture, made `longest` pixels on its longer side."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import binary_dilation, label
@@ -10,11 +11,14 @@ from scipy.spatial import cKDTree
 
 from ...core.arrays import Array
 from ..world_alignment import look_at
+from .mask_view import MaskView
 
 #: Least height of a point above the ground, and cells of the clustering, in parts of the cameras' distance.
 _ABOVE, _CELL = 0.012, 0.03
 #: Radius around what the cameras look at, in parts of their distance: in it, points count as the object's.
 _REACH = 0.6
+#: Surroundings that a window shows beside the box, in parts of the box's size there.
+_SURROUNDINGS = 0.1
 #: Points that a cluster needs; margin of the box, in parts of its size; of the box without points, the half width and
 #: the height in parts of the cameras' distance.
 _FEWEST, _MARGIN, _GUESSED = 25, 0.15, (0.28, 0.5)
@@ -41,6 +45,28 @@ class ObjectBox:
         """(8, 3) corners."""
         grid = np.stack(np.meshgrid(*zip(self.low, self.high, strict=True), indexing="ij"), axis=-1)
         return grid.reshape(-1, 3)
+
+    def outline(self, cv2: Any, view: MaskView) -> Array:
+        """(h, w) bool: where the box is in a view."""
+        drawn = np.zeros(view.shape, np.uint8)
+        at, _ = view.project(self.corners)
+        if not np.isfinite(at).all():
+            return np.ones(view.shape, bool)  # the camera is within the box, or beside it
+        corners = cv2.convexHull(np.clip(at, -1e4, 1e4).astype(np.float32).reshape(-1, 1, 2))
+        cv2.fillConvexPoly(drawn, corners.round().astype(np.int32), 1)
+        return drawn > 0
+
+    def window(self, view: MaskView) -> tuple[int, int, int, int] | None:
+        """(left, top, right, bottom) of the box in a view with some surroundings; None where it is not in it."""
+        height, width = view.shape
+        at, _ = view.project(self.corners)
+        if not np.isfinite(at).all():
+            return 0, 0, width, height  # the camera is within the box, or beside it
+        low, high = at.min(axis=0), at.max(axis=0)
+        margin = 2 + _SURROUNDINGS * float((high - low).max())
+        low = np.maximum(np.floor(low - margin), 0).astype(int)
+        high = np.minimum(np.ceil(high + margin), [width, height]).astype(int)
+        return (*low.tolist(), *high.tolist()) if (high - low >= 8).all() else None
 
 
 def find_box(points: Array, matrices: Array) -> ObjectBox:

@@ -24,17 +24,15 @@ from .contact_sheet import draw_contact_sheet
 from .hull import Hull
 from .hull_check import Fit, check_masks
 from .mask_view import MaskView
-from .object_box import ObjectBox, find_box
-from .segmentation import find_masks, refine_box, window_of
+from .object_box import ObjectBox
 
 logger = logging.getLogger(__name__)
 
 #: given: masks that are there are used; auto: where no picture has one they are made; none: neither.
 MODES = ("given", "auto", "none")
-#: Pixels of the longer side: whole pictures while the object is sought, the part around it while it is cut out.
-_WHOLE, _PART = 560, 400
+#: Pixels of the longer side at which given masks are checked.
+_WHOLE = 560
 CONTACT_SHEET = "masks.png"
-_REMEDY = "Draw the masks by hand (white on the object, folder masks), or give --masks none"
 
 
 @dataclass(slots=True)
@@ -105,49 +103,26 @@ def _whole(view: MaskView) -> MaskView:
 
 def _make(cv2: Any, views: list[MaskView], files: list[str], by_file: dict[str, Picture], work: Path, sheet: Path,
           found: Registration, subject: str, tell: Tell, cancelled: Callable[[], bool]) -> Masked:  # fmt: skip
-    """Masks by GrabCut and hull; none, with a warning, where no object is found."""
-    tell("masks: the object", 0.0)
-    box: ObjectBox | None = find_box(found.points, np.stack([view.matrix for view in views]))
-    whole = [_whole(view) for view in views]
-    if box is not None and not len(box.points):
-        box = refine_box(cv2, whole, box)
-    windows = {} if box is None else {k: window_of(cv2, view, box) for k, view in enumerate(views)}
-    found_in = {k: window for k, window in windows.items() if window is not None}
-    if box is None or len(found_in) < 3:
-        logger.warning("%s: no object is found on the ground: no masks are made. %s", subject, _REMEDY)
-        return Masked(lines=["masks: none, no object is found on the ground"])
-    parts = [views[k].cropped(window, _PART) for k, window in found_in.items()]
-    masks, hull = find_masks(cv2, parts, box, tell, cancelled)
-    fits = check_masks(cv2, parts, masks, hull)
-    for index, fit in enumerate(fits):
-        if fit.wrong:  # the others know better
-            masks[index] = hull.seen_by(parts[index], hull.solid(without=index))
-    if not hull.solid().any():
-        logger.warning("%s: masks of the pictures do not fit together: none are made. %s", subject, _REMEDY)
-        return Masked(lines=["masks: none, they do not fit together"])
+    """Masks of the learned object; none, with a warning, where no object is found or they do not fit together."""
+    try:
+        libraries.load("torch")
+    except DeviceError as error:
+        logger.warning("%s: masks are not made: %s", subject, error)
+        return Masked()
+    from .making import make_masks  # with torch
+
+    made, fits = make_masks(cv2, views, found.points, sheet, subject, tell, cancelled)
+    if made is None:
+        return Masked(fits, ["masks: none, those that were made do not fit each other" if fits else
+                             "masks: none, no object is found on the ground"])  # fmt: skip
     work.mkdir(parents=True, exist_ok=True)
-    made = dict(zip(found_in, masks, strict=True))
-    for k, view in enumerate(views):
-        picture = by_file[files[k]]
-        width, height = picture.size
-        drawn = np.zeros((height, width), np.uint8)
-        if k in made:
-            old_height, old_width = view.shape
-            sizes = zip(found_in[k], (width, height) * 2, (old_width, old_height) * 2, strict=True)
-            left, top, right, bottom = (round(edge * new / old) for edge, new, old in sizes)
-            part = Pillow.fromarray(made[k].astype(np.uint8) * 255)
-            resized = np.asarray(part.resize((right - left, bottom - top), Pillow.Resampling.BILINEAR))
-            drawn[top:bottom, left:right] = resized
-        target = work / f"{files[k]}.png"
-        replace_by(target, partial(Pillow.fromarray(drawn).save, format="PNG"))
-        picture.mask = target
-    draw_contact_sheet(sheet, parts, masks, fits)
-    lines = [f"masks: made for {len(views)} pictures; look at {sheet.name}"]
-    replaced = [str(fit) for fit in fits if fit.wrong]
+    for k, (file, view) in enumerate(zip(files, views, strict=True)):
+        picture = by_file[file]
+        drawn = Pillow.fromarray(made.whole(k, view.shape, picture.size))
+        picture.mask = work / f"{file}.png"
+        replace_by(picture.mask, partial(drawn.save, format="PNG"))
     doubtful = [str(fit) for fit in fits if fit.doubtful and not fit.wrong]
-    if replaced:
-        logger.warning("%s: masks that do not fit the others are replaced by these' hull: %s", subject,
-                       first_of(replaced))  # fmt: skip
+    lines = [f"masks: made for {len(views)} pictures; look at {sheet.name}"]
     return Masked(fits, lines + _doubts(doubtful, subject, sheet))
 
 

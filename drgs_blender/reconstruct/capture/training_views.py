@@ -34,11 +34,14 @@ class Target:
         The photograph to be matched; on a device the colour alone, (h, w, 3).
     mask : (h, w) tensor or None
         Tensor in 0..1, or None where nothing is known of it.
+    background : (h, w, 3) tensor or None
+        What is behind the surfels, sRGB; None: the one colour of `background_of`.
     """
 
     camera: Camera
     photograph: Photograph | Tensor
     mask: Tensor | None
+    background: Tensor | None = None
 
     @property
     def colour(self) -> Tensor:

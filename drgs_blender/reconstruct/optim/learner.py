@@ -99,7 +99,8 @@ class Learner:
         statistics = self.statistics if part < schedule.densify[1] else None
         reflections = part >= schedule.reflections < 1
         bands = min(schedule.bands, int(part * 8))
-        return self.gaussians.render(target.camera, self._background, bands, statistics, rays, reflections), rays
+        behind = self._background if target.background is None else target.background
+        return self.gaussians.render(target.camera, behind, bands, statistics, rays, reflections), rays
 
     def _optimise(self, part: float) -> None:
         parameters = self.gaussians.parameters

@@ -1,0 +1,174 @@
+"""Masks of photographs of an object on a ground: the scene is learned, cut in space, and seen from each camera."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image as Pillow
+from scipy.ndimage import binary_fill_holes, label
+
+from ...compute.prepare import PHASE, prepare_kernels
+from ...core.arrays import Array
+from ...core.errors import first_of
+from ..features import Tell
+from .contact_sheet import draw_contact_sheet
+from .hull import Hull
+from .hull_check import Fit, check_masks
+from .learned_scene import Effort, learn_scene
+from .mask_view import MaskView
+from .object_box import find_box
+from .object_surfels import box_around, cut_object, share_of_object
+
+logger = logging.getLogger(__name__)
+
+#: First roughly, to find the box around the object; then that.
+EFFORTS = (Effort(160, 300, 16000, 45.0), Effort(256, 900, 20000, 180.0))
+#: Pixels of the longer side of masks, of the part around the object.
+PART = 640
+#: Surfels that an object has at least; views that show it.
+_FEWEST_SURFELS, _FEWEST_VIEWS = 30, 3
+#: Parts of a mask smaller than this part of the largest are dropped, holes smaller than this part of it are filled.
+_SMALL, _PINHOLE = 0.01, 1e-3
+#: Part of the masks that may be doubtful; with more none are used.
+_DOUBTED = 0.25
+REMEDY = "Draw the masks by hand (white on the object, folder masks), or give --masks none"
+
+
+@dataclass(slots=True)
+class Found:
+    """Masks that were made.
+
+    Attributes
+    ----------
+    windows : dict of int to tuple of int
+        View -> (left, top, right, bottom) of the part around the object; views without it are missing.
+    parts : list of MaskView
+        These parts.
+    masks : list of (h, w) bool arrays
+        Of the parts.
+    hull : Hull
+        Of the masks.
+    """
+
+    windows: dict[int, tuple[int, int, int, int]]
+    parts: list[MaskView]
+    masks: list[Array]
+    hull: Hull
+
+    def whole(self, view: int, shape: tuple[int, int], size: tuple[int, int]) -> Array:
+        """(h, w) uint8: the mask of a whole picture of `size` (w, h), whose view has the `shape` (h, w)."""
+        width, height = size
+        drawn = np.zeros((height, width), np.uint8)
+        if view in self.windows:
+            sizes = zip(self.windows[view], size * 2, shape[::-1] * 2, strict=True)
+            left, top, right, bottom = (round(edge * new / old) for edge, new, old in sizes)
+            mask = self.masks[list(self.windows).index(view)]
+            part = Pillow.fromarray(mask.astype(np.uint8) * 255)
+            resized = part.resize((right - left, bottom - top), Pillow.Resampling.BILINEAR)
+            drawn[top:bottom, left:right] = np.asarray(resized)
+        return drawn
+
+
+def make_masks(cv2: Any, views: Sequence[MaskView], points: Array, sheet: Path, subject: str, tell: Tell,
+               cancelled: Callable[[], bool]) -> tuple[Found | None, list[Fit]]:  # fmt: skip
+    """Masks of the object that fit each other, and their figures; none, with a warning, where there are none.
+
+    Parameters
+    ----------
+    cv2 : module
+        OpenCV.
+    views : sequence of MaskView
+        Z up, ground at 0.
+    points : (n, 3) float64 array
+        Sparse points; may be none.
+    sheet : Path
+        Contact sheet to write.
+    subject : str
+        For messages.
+    tell, cancelled : callable
+
+    Raises
+    ------
+    Cancelled
+        `cancelled` said so.
+    """
+    found = find_masks(cv2, views, points, tell, cancelled)
+    if found is None:
+        logger.warning("%s: no object is found on the ground: no masks are made. %s", subject, REMEDY)
+        return None, []
+    fits = check_masks(cv2, found.parts, found.masks, found.hull)
+    draw_contact_sheet(sheet, found.parts, found.masks, fits)
+    doubtful = [str(fit) for fit in fits if fit.doubtful]
+    if len(doubtful) > _DOUBTED * len(fits) or not found.hull.solid().any():
+        logger.warning(
+            "%s: of %d masks that were made %d do not fit the others (%s): none are used. They are drawn in %s. %s",
+            subject, len(fits), len(doubtful), first_of(doubtful), sheet.name, REMEDY,
+        )  # fmt: skip
+        return None, fits
+    replaced = []
+    for index, fit in enumerate(fits):
+        if fit.wrong:  # the others know better
+            found.masks[index] = found.hull.seen_by(found.parts[index], found.hull.solid(without=index))
+            replaced.append(str(fit))
+    if replaced:
+        logger.warning("%s: masks that do not fit the others are replaced by these' hull: %s", subject,
+                       first_of(replaced))  # fmt: skip
+    return found, fits
+
+
+def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
+               cancelled: Callable[[], bool]) -> Found | None:  # fmt: skip
+    """Masks of the object; None where nothing stands on the ground.
+
+    Parameters
+    ----------
+    cv2 : module
+        OpenCV.
+    views : sequence of MaskView
+        Z up, ground at 0.
+    points : (n, 3) float64 array
+        Sparse points; may be none.
+    tell, cancelled : callable
+
+    Raises
+    ------
+    Cancelled
+        `cancelled` said so.
+    """
+    prepare_kernels(("reconstruct",), lambda _, part: tell(PHASE, 0.2 * part), cancelled)
+    matrices = np.stack([view.matrix for view in views])
+    box, object_surfels = find_box(points, matrices), None
+    for step, effort in enumerate(EFFORTS):
+        windows = {k: window for k, view in enumerate(views) if (window := box.window(view)) is not None}
+        if len(windows) < _FEWEST_VIEWS:
+            return None
+        parts = [views[k].cropped(window, PART) for k, window in windows.items()]
+        told = lambda phase, part, step=step: tell(phase, 0.2 + 0.7 * (step + part) / len(EFFORTS))  # noqa: E731
+        scene = learn_scene(cv2, parts, box, effort, object_surfels, told, cancelled)
+        cut = cut_object(scene, box)
+        if cut.surfels.sum() < _FEWEST_SURFELS:
+            return None
+        box, object_surfels = box_around(scene, cut, box.points), scene.select(np.flatnonzero(cut.surfels))
+    masks = []
+    for part in parts:
+        camera = part.pinhole(PART)
+        share = part.distorted(cv2, camera, share_of_object(scene, cut, camera))
+        masks.append(without_specks(share > 0.5))
+    return Found(windows, parts, masks, Hull(cv2, parts, masks, box))
+
+
+def without_specks(mask: Array) -> Array:
+    """(h, w) bool: a mask without specks and pinholes."""
+    parts, count = label(mask)
+    if count > 1:
+        sizes = np.bincount(parts.ravel())
+        sizes[0] = 0
+        mask = (sizes >= max(_SMALL * sizes.max(), 9))[parts]
+    holes, count = label(binary_fill_holes(mask) & ~mask)
+    sizes = np.bincount(holes.ravel(), minlength=count + 1)
+    return mask | ((sizes < max(_PINHOLE * mask.sum(), 2))[holes] & (holes > 0))
