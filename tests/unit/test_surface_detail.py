@@ -247,6 +247,27 @@ def test_layers_follow_the_mesh_and_are_not_read_again():
     scene.close()
 
 
+def test_tangents_follow_faces_between_the_same_vertices():
+    """Of an edge that is rotated, with the coordinates of all faces alike."""
+    vertices = SQUARE + np.float32([[0, 0, 0], [0, 0, 0.5], [0, 0, 0], [0, 0, 0.7]])
+    uvs = np.repeat(UVS[:1], 2, axis=0)
+    ways = FACES, np.int32([[1, 2, 3], [1, 3, 0]])
+    for array in (vertices, uvs, *ways):
+        array.setflags(write=False)
+    image = Image("normals", np.random.default_rng(3).integers(90, 165, (8, 8, 4), dtype=np.uint8))
+    material = Material("m", details=[SurfaceDetail("tangent", Texture("normals"))])
+    states = [mesh_state(vertices, faces, np.eye(4), uvs=uvs, materials=[material]) for faces in ways]
+    origins = np.column_stack([np.random.default_rng(1).uniform(0.05, 1.95, (200, 2)), np.full(200, 3.0)])
+    rays = origins.astype(np.float32), np.tile(np.float32([0, 0, -1]), (200, 1))
+    lasting, fresh = TraceScene(), TraceScene()
+    for state in states:
+        lasting.update([], [state], [image])
+    fresh.update([], states[1:], [image])
+    np.testing.assert_array_equal(meet(lasting, *rays)[2], meet(fresh, *rays)[2])
+    lasting.close()
+    fresh.close()
+
+
 def test_broken_details_are_named_and_stop_nothing():
     bad = np.full((2, 3, 4), np.nan, np.float32)
     bad[0] = 0.25

@@ -154,7 +154,8 @@ class MeshLayers:
     def _made(self, mesh: MeshState, part: Part, name: str, tangents: bool, known: _Values | None) -> _Values:
         given = _given(mesh, name)
         assert given is not None
-        made_of = (given, mesh.vertices, mesh.corner_normals, mesh.vertex_normals) if tangents else (given,)
+        shape = (mesh.faces, mesh.vertices, mesh.corner_normals, mesh.vertex_normals) if tangents else ()
+        made_of = (given, *shape)
         if known is None or not known.fits(made_of):
             count = np.shape(given)[-1] if np.ndim(given) == 3 else 0
             subject = f'values "{name}" of {mesh.name}' if name else f"texture coordinates of {mesh.name}"
