@@ -20,7 +20,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core.errors import UsageError
+from ..core.errors import Cancelled, DeviceError, UsageError
 from ..core.file_types import CAMERAS
 from ..core.phases import is_preparing
 from ..formats.axes import UP_AXES
@@ -31,6 +31,7 @@ from .progress import WORK_SECONDS, FractionBar
 from .sampling import above_zero, int_range
 
 if TYPE_CHECKING:
+    from ..core.asset import Asset
     from ..reconstruct.capture.capture import Capture
     from ..reconstruct.pipeline import Progress
     from ..reconstruct.settings import Reading, Settings
@@ -153,16 +154,7 @@ def run(args: argparse.Namespace) -> int:
     check_suffix(args.out, (".drgs",))
     check_writable(args.out, (args.capture,))
 
-    from ..core.errors import Cancelled, DeviceError
-
-    try:
-        from ..reconstruct.pipeline import reconstruct
-    except ImportError as error:
-        if error.name != "torch":
-            raise
-        raise DeviceError(
-            "reconstruct", "needs PyTorch", f'Install it: "{sys.executable}" -m pip install "torch>=2.5"'
-        ) from error
+    reconstruct = reconstruction()
     from ..reconstruct.readers import read_capture
     from ..reconstruct.settings_table import as_tables
 
@@ -196,6 +188,19 @@ def run(args: argparse.Namespace) -> int:
         shown = report["decoupling"]["psnr"]
         print(f"  materials in the light that was found, pixels learned from: PSNR {shown:.2f} dB")
     return 0
+
+
+def reconstruction() -> Callable[..., Asset]:
+    """`pipeline.reconstruct`, which is imported when it is needed. Raises DeviceError where PyTorch is absent."""
+    try:
+        from ..reconstruct.pipeline import reconstruct
+    except ImportError as error:
+        if error.name != "torch":
+            raise
+        raise DeviceError(
+            "reconstruct", "needs PyTorch", f'Install it: "{sys.executable}" -m pip install "torch>=2.5"'
+        ) from error
+    return reconstruct
 
 
 def resolved_settings(config: Path | None, options: dict[str, Any], sets: list[str]) -> tuple[Settings, Reading]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from published_sets import Maker, light, object_asset, with_mesh
 from drgs_blender.cli import evaluate_protocol
 from drgs_blender.cli.main import main
 from drgs_blender.core.asset import Environment
-from drgs_blender.core.asset.container import read_asset, write_asset
+from drgs_blender.core.asset.container import inspect_asset, read_asset, write_asset
 from drgs_blender.core.color import linear_to_srgb
 from drgs_blender.core.errors import AssetError
 from drgs_blender.evaluate.protocols import PROTOCOLS, orb_metrics, stanford_orb, tensoir
@@ -288,6 +289,97 @@ def test_a_damaged_object_does_not_keep_the_others_from_being_scored(maker, sets
     assert "ball is not scored" in said.err and "ball" in report["missing"]
 
 
+def several(sets: dict[str, Path], root: Path, assets: Path, file: Path) -> list[str]:
+    """Words that score two objects of Shiny Blender, ball and toaster, with the asset `file`."""
+    assets.mkdir(exist_ok=True)
+    for name in ("ball", "toaster"):
+        shutil.copytree(sets["shiny-blender"] / "toaster", root / name)
+        shutil.copy(file, assets / f"{name}.drgs")
+    return ["--protocol", "shiny-blender", "--samples", "1", "--most-views", "1", "--json"]
+
+
+@pytest.mark.parametrize(("how", "said"), [("damaged", "ball.drgs"), ("no light", "no light of its own")])
+def test_an_asset_that_cannot_be_used_does_not_keep_the_others_from_being_scored(
+    how, said, maker, sets, tmp_path, capsys
+):
+    words = several(sets, tmp_path / "set", tmp_path / "assets", maker.file)
+    bad = tmp_path / "assets" / "ball.drgs"
+    if how == "damaged":
+        bad.write_bytes(bad.read_bytes()[:500])
+    else:
+        asset = read_asset(bad)
+        asset.environment = None
+        write_asset(bad, asset)
+    assert main(["evaluate", *words, str(tmp_path / "assets"), str(tmp_path / "set")]) == 65
+    report = json.loads(capsys.readouterr().out)
+    assert list(report["objects"]) == ["toaster"] and said in report["failed"]["ball"]
+
+
+def reconstructions(monkeypatch, file: Path) -> list:
+    """Puts the asset `file` in the place of what is reconstructed; the captures of which it is asked for."""
+    asked = []
+
+    def reconstruct(capture, *_):
+        asked.append(capture)
+        return read_asset(file)
+
+    monkeypatch.setattr("drgs_blender.reconstruct.pipeline.reconstruct", reconstruct)
+    return asked
+
+
+def test_photographs_that_cannot_be_learned_from_do_not_keep_the_others_from_being_scored(
+    maker, sets, tmp_path, capsys, monkeypatch
+):
+    words = several(sets, tmp_path / "set", tmp_path / "assets", maker.file)
+    bad = tmp_path / "set" / "ball" / "train" / "r_2.png"
+    bad.write_bytes(bad.read_bytes()[:200])
+    asked = reconstructions(monkeypatch, maker.file)
+    assert main(["evaluate", *words, str(tmp_path / "set"), "--out", str(tmp_path / "new")]) == 65
+    report = json.loads(capsys.readouterr().out)
+    assert [capture.source.name for capture in asked] == ["toaster"]
+    assert list(report["objects"]) == ["toaster"] and "r_2.png" in report["failed"]["ball"]
+
+
+def test_assets_of_a_try_are_told_when_they_are_used_again(maker, sets, tmp_path, capsys, monkeypatch):
+    asked = reconstructions(monkeypatch, maker.file)
+    words = ["--protocol", "shiny-blender", str(sets["shiny-blender"]), "--out", str(tmp_path), "--samples", "1"]
+    words += ["--json", "--most-views", "1"]
+    told = []
+    for more in (["--resolution", "32", "--set", "schedule.iterations=7"], [], ["--set", "schedule.iterations=7"]):
+        assert main(["evaluate", *words, *more]) == 0
+        said = capsys.readouterr()
+        told.append((said.err, "; ".join(json.loads(said.out)["notes"])))
+    assert len(asked) == 1 and max(view.camera.width for view in asked[0].views) == 32
+    assert not any("other settings" in text for text in told[0])
+    assert all("made with other settings (capture.resolution, schedule.iterations)" in text for text in told[1])
+    assert all("made with other settings (capture.resolution)" in text for text in told[2])
+    write_asset(tmp_path / "toaster.drgs", read_asset(maker.file))
+    assert main(["evaluate", *words]) == 0
+    assert "settings that it does not keep" in capsys.readouterr().err
+
+
+def test_the_asset_keeps_the_size_at_which_stanford_orb_is_read(maker, sets, tmp_path, capsys, monkeypatch):
+    reconstructions(monkeypatch, maker.file)
+    words = ["--protocol", "stanford-orb", str(sets["stanford-orb"]), "--objects", "teapot_scene001"]
+    assert main(["evaluate", *words, "--out", str(tmp_path), "--samples", "1", "--most-views", "1"]) == 0
+    kept = inspect_asset(tmp_path / "teapot_scene001.drgs")["provenance"]["settings"]
+    assert kept["capture"]["resolution"] == 512
+
+
+@pytest.mark.parametrize("given", ["axes=opencv", "up=y", "test_every=5"])
+def test_settings_of_reading_that_the_set_says_are_refused(given, sets, tmp_path, capsys):
+    words = ["--protocol", "shiny-blender", sets["shiny-blender"], "--out", tmp_path / "out"]
+    said = refused(capsys, 64, *words, "--set", f"capture.{given}")
+    assert f"capture.{given.split('=')[0]}: has no effect with --protocol" in said
+
+
+def test_without_pytorch_it_is_said_before_anything_else(sets, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, "drgs_blender.reconstruct.pipeline", raising=False)
+    said = refused(capsys, 69, "--protocol", "shiny-blender", sets["shiny-blender"], "--out", tmp_path / "out")
+    assert "reconstruct: needs PyTorch" in said
+
+
 def test_maps_that_a_set_lacks_are_told_and_the_rest_is_scored(maker, sets, tmp_path, capsys):
     root = tmp_path / "set"
     shutil.copytree(sets["stanford-orb"], root)
@@ -313,6 +405,11 @@ def test_what_cannot_be_scored_is_refused(maker, sets, tmp_path, capsys):
     assert "has no toaster.drgs" in refused(capsys, 65, *words, tmp_path / "empty", root)
     for option in (["--lights-from", tmp_path], ["--set", "variant=m"], ["--test-every", "3"], ["--axes", "opencv"]):
         assert f"{option[0]}: has no effect" in refused(capsys, 64, *words, maker.file, root, *option)
+    of_scenes = {"--lights": "x", "--small": None, "--size": 32, "--train": 4, "--test": 4, "--spp": 1}
+    for option, value in (of_scenes | {"--meshes": tmp_path, "--blender": "x"}).items():
+        given = [option] if value is None else [option, value]
+        assert f"{option}: has no effect" in refused(capsys, 64, maker.file, root, *words, *given)
+    assert "--most-views: is an option of --protocol" in refused(capsys, 64, maker.file, root, "--most-views", 0)
     assert "--most-views: is 0" in refused(capsys, 64, *words, maker.file, root, "--most-views", 0)
     assert "--most-views: is an option of --protocol" in refused(capsys, 64, maker.file, root, "--most-views", 2)
     assert "--out: is an option of --protocol" in refused(capsys, 64, "--make-scenes", tmp_path, "--out", tmp_path)

@@ -58,6 +58,8 @@ class Protocol:
         How many lights an object is rendered under, its own and others, or groups of them.
     lights : bool
         Its light files may lie in another folder.
+    side : int, optional
+        Pixels of the longer side that are read where none are asked for; None: all.
     about : str
         What is measured how, for the user; and what the published tables have that is left out.
     """
@@ -71,6 +73,7 @@ class Protocol:
     columns: tuple[Column, ...]
     parts: int
     lights: bool
+    side: int | None
     about: str
 
 
@@ -92,7 +95,7 @@ def _of(module: Any, columns: tuple[Column, ...], parts: int, lights: bool, abou
     """The protocol of a module, which is named as it is but for underscores."""
     name = module.__name__.rpartition(".")[2].replace("_", "-")
     functions = module.folder, module.read, module.check, module.measure
-    return Protocol(name, module.OBJECTS, *functions, columns, parts, lights, about)
+    return Protocol(name, module.OBJECTS, *functions, columns, parts, lights, getattr(module, "SIDE", None), about)
 
 
 #: The table, by name.
