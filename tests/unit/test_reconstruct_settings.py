@@ -119,6 +119,10 @@ def test_what_is_printed_can_be_given_again(tmp_path, capsys):
         ('fixed=["tint"]', '''is 'tint', not "offset" or "opacity"'''),
         ("schedule=5", "schedule: is no setting"),
         ("variant", "is not NAME=VALUE"),
+        (f"decoupling.rate=1{400 * '0'}", "not a number of at least 0"),
+        (f"schedule.iterations=0x{4000 * 'f'}", "is too long to be shown, not a whole number from 1"),
+        (f"schedule.densify=[0.5, 1{400 * '0'}]", "not a number from 0 to 1"),
+        (f"schedule.densify={3000 * '['}0{3000 * ']'}", "..., not a list of 2"),
     ],
 )
 def test_what_cannot_be_used_is_refused_with_what_may_be(capsys, given, said):
@@ -142,6 +146,9 @@ def test_contradictions_are_refused(capsys):
         (b"[schedul]\niterations = 5", "the nearest is schedule.iterations"),
         (b"[schedule.iterations]\nx = 5", "schedule.iterations.x: is no setting"),
         (b"[schedule]\niterations = 2024-01-01", "not a whole number"),
+        (b"schedule.iterations = 1" + 400 * b"0", "not a whole number from 1"),
+        (b"fixed = " + 3000 * b"[" + 3000 * b"]", "is not TOML"),
+        (3000 * b"a." + b"b = 1", "is not TOML"),
         (b"#" * ((1 << 20) + 1), "more than"),
     ],
 )
