@@ -24,7 +24,7 @@ from drgs_blender.core.asset.container import inspect_asset, read_asset, write_a
 from drgs_blender.core.color import linear_to_srgb
 from drgs_blender.core.errors import AssetError
 from drgs_blender.evaluate.protocols import PROTOCOLS, orb_metrics, stanford_orb, tensoir
-from drgs_blender.evaluate.protocols.bench import find_light
+from drgs_blender.evaluate.protocols.bench import Bench, find_light
 from drgs_blender.formats.latlong import directions
 from drgs_blender.reconstruct.readers import nero, read_capture
 
@@ -206,6 +206,41 @@ def test_relit_pictures_of_glossysynthetic_are_scaled(maker, sets, tmp_path, cap
     lights = scored(capsys, "glossysynthetic", maker.file, root)["objects"]["bell"]["lights"]
     # White, which is most of the frame, lets the factors come to little.
     assert lights["neon"]["raw_psnr"] + 0.1 < lights["neon"]["psnr"] < 40 < lights["golf"]["raw_psnr"]
+
+
+def test_lpips_of_glossysynthetic_is_of_pictures_that_are_not_shifted(maker, sets):
+    """LPIPS takes [0, 1] to [-1, 1]; what it is given comes out of that as the pictures were, in [0, 1]."""
+    shifted = []
+
+    def lpips(ours, true):
+        shifted.extend((2 * ours - 1, 2 * true - 1))
+        return 0.0
+
+    shown = []
+    bench = Bench(
+        read_asset(maker.file), lambda camera, radiance, _: maker.render(camera.matrix_world, radiance),
+        most_views=1, lpips=lpips, show=lambda part, number, ours, true: shown.append(true),
+    )  # fmt: skip
+    PROTOCOLS["glossysynthetic"].measure(bench, sets["glossysynthetic"], "bell", None)
+    np.testing.assert_allclose(shifted[1], shown[0], atol=0.51 / 255)
+    assert len(shifted) == 14 and all(picture.min() >= -1e-6 and picture.max() <= 1.5 for picture in shifted)
+
+
+@pytest.mark.parametrize("part", [0.5, 1.0])
+def test_normals_of_shiny_blender_count_where_the_asset_is(part, maker, sets):
+    """A hole in the asset changes the pictures alone; without anything there is no figure."""
+
+    def render(camera, radiance, factors):
+        passes = {name: values.copy() for name, values in maker.render(camera.matrix_world, radiance).items()}
+        for values in passes.values():
+            values[:, : int(part * values.shape[1])] = 0
+        return passes
+
+    report = PROTOCOLS["shiny-blender"].measure(
+        Bench(read_asset(maker.file), render, most_views=1), sets["shiny-blender"], "toaster", None
+    )
+    found = report["shape"]["normal_degrees"]
+    assert report["views"]["psnr"] < 25 and (found is None if part == 1 else found < 1.5)
 
 
 def test_what_is_missing_is_told_before_anything_is_reconstructed(sets, tmp_path, capsys):

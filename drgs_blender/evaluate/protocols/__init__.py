@@ -143,8 +143,8 @@ PROTOCOLS: dict[str, Protocol] = {
             (*_pictures("views", "Views"), Column("shape.normal_degrees", "Normals MAE")),
             1,
             False,
-            "Shiny Blender (Ref-NeRF): views over the whole frame on white, normals weighted by alpha. Relit pictures "
-            "are left out: the set has none, tables with them render their own",
+            "Shiny Blender (Ref-NeRF): views over the whole frame on white, normals weighted by coverage and alpha. "
+            "Relit pictures are left out: the set has none, tables with them render their own",
         ),
     )
 }

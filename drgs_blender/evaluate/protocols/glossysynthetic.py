@@ -20,7 +20,7 @@ from ...core.errors import AssetError
 from ...reconstruct.capture.capture import Capture
 from ...reconstruct.readers import nero, read_capture
 from ..metrics import fit_scale
-from .bench import Bench, eight_bits, existing, find_light, mean_of, read_light, shown_on_white
+from .bench import Bench, Distance, eight_bits, existing, find_light, mean_of, read_light, shown_on_white
 
 OBJECTS = ("angel", "bell", "cat", "horse", "luyu", "potion", "tbell", "teapot")
 LIGHTS = ("corridor", "golf", "neon")
@@ -59,6 +59,7 @@ def _base(root: Path) -> Path:
 def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[str, Any]:
     """Figures of views left out and of relit pictures."""
     files = check(root, name, lights)
+    bench = replace(bench, lpips=_unshifted(bench.lpips))
     layout = nero.read(folder(root, name))
     testing = [photograph for photograph in layout.photographs if photograph.test]
     bench.warn_of_known([photograph.name for photograph in testing], name)
@@ -74,6 +75,14 @@ def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[st
         source = _base(root) / "relight_gt" / f"{name}_{light}"
         report["lights"][light] = _relit(bench, source, light, read_light(file))
     return report | {"relit": mean_of(list(report["lights"].values()))}
+
+
+def _unshifted(lpips: Distance | None) -> Distance | None:
+    """LPIPS of encoded pictures in [0, 1] as if they were in [-1, 1].
+
+    GS-ROR's tables are made so: its `lpipsPyTorch` leaves the shift to the caller, who gives pictures in [0, 1].
+    """
+    return None if lpips is None else lambda ours, true: lpips((ours + 1) / 2, (true + 1) / 2)
 
 
 def _relit(bench: Bench, source: Path, light: str, radiance: np.ndarray) -> dict[str, float | None]:
