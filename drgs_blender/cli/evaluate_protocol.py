@@ -68,7 +68,7 @@ def run(args: argparse.Namespace, settings: RenderSettings) -> int:
     from ..evaluate.flip import find_flip
     from ..evaluate.lpips import Lpips
     from ..evaluate.protocols import PROTOCOLS, Bench
-    from ..evaluate.protocols.table import complete, table
+    from ..evaluate.protocols.table import complete, differences, strangers, table
 
     protocol = PROTOCOLS[args.protocol]
     root, assets = _places(args)
@@ -76,11 +76,15 @@ def run(args: argparse.Namespace, settings: RenderSettings) -> int:
     names = _objects(args, protocol, root, assets)
     for name in names:
         protocol.check(root, name, args.lights_from)  # before hours of work
+    counts = {name: protocol.counts(root, name) for name in names}
+    notes = strangers(names, protocol) + [text for name in names for text in differences(name, counts[name], protocol)]
+    for note in notes:
+        logger.warning("%s: %s: not the published set", root, note)
     lpips = Lpips(*args.lpips) if args.lpips else None
     if args.pictures is not None:
         check_writable(args.pictures / names[0] / "views-000.png")
     failed: dict[str, DrgsError] = {}
-    notes = [] if args.out is None else _reconstruct(args, protocol, root, names, failed)
+    notes += [] if args.out is None else _reconstruct(args, protocol, root, names, failed)
     flip = find_flip()
     report: dict[str, Any] = {"protocol": protocol.name, "samples": settings.samples, "objects": {}}
     with FractionBar(args, "rendering", every=WORK_SECONDS) as bar:
@@ -99,7 +103,8 @@ def run(args: argparse.Namespace, settings: RenderSettings) -> int:
                 file = assets if assets.is_file() else assets / f"{name}.drgs"
                 asset, render, digest = _loaded(file, settings)
                 bench = Bench(asset, render, args.resolution, args.most_views, flip, lpips, tell, _writer(args, name))
-                report["objects"][name] = {"asset": digest, **protocol.measure(bench, root, name, args.lights_from)}
+                figures = protocol.measure(bench, root, name, args.lights_from)
+                report["objects"][name] = {"asset": digest, "counts": counts[name], **figures}
     report["failed"] = {name: str(error) for name, error in failed.items()}
     network = lpips.network if lpips else ""
     report = complete(report, protocol, network, args.most_views, args.resolution, notes)

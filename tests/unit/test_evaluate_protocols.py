@@ -25,6 +25,7 @@ from drgs_blender.core.color import linear_to_srgb
 from drgs_blender.core.errors import AssetError
 from drgs_blender.evaluate.protocols import PROTOCOLS, orb_metrics, stanford_orb, tensoir
 from drgs_blender.evaluate.protocols.bench import Bench, find_light
+from drgs_blender.evaluate.protocols.table import differences, strangers
 from drgs_blender.formats.latlong import directions
 from drgs_blender.reconstruct.readers import nero, read_capture
 
@@ -243,12 +244,61 @@ def test_normals_of_shiny_blender_count_where_the_asset_is(part, maker, sets):
     assert report["views"]["psnr"] < 25 and (found is None if part == 1 else found < 1.5)
 
 
-def test_what_is_missing_is_told_before_anything_is_reconstructed(sets, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("protocol", "what", "said"),
+    [
+        ("tensoir", "env/high_res_envmaps_2k/night.exr", "light night"),
+        ("tensoir", "lego/test_000/rgba_sunset.png", "test_000/rgba_sunset.png"),
+        ("tensoir", "lego/train_001/rgba_sunset.png", "train_001/rgba_sunset.png"),
+        ("glossysynthetic", "GlossySynthetic/bell/3.png", "3.png"),
+        ("glossysynthetic", "glossy_relight/relight_gt/bell_golf/1.png", "1.png"),
+        (None, None, "shown"),
+    ],
+)
+def test_what_is_missing_is_told_before_anything_is_reconstructed(
+    protocol, what, said, maker, sets, tmp_path, capsys, monkeypatch
+):
     root = tmp_path / "set"
-    shutil.copytree(sets["tensoir"], root)
-    (root / "env" / "high_res_envmaps_2k" / "night.exr").unlink()
-    assert "light night" in refused(capsys, 65, "--protocol", "tensoir", root, "--out", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
+    shutil.copytree(sets[protocol or "shiny-blender"], root)
+    asked = reconstructions(monkeypatch, maker.file)
+    if what is None:  # a folder of pictures that cannot be written
+        (tmp_path / "shown").write_text("a file")
+        words = ["--protocol", "shiny-blender", root, "--out", tmp_path / "out", "--pictures", tmp_path / "shown"]
+    else:
+        (root / what).unlink()
+        words = ["--protocol", protocol, root, "--out", tmp_path / "out"]
+    assert said in refused(capsys, 73 if what is None else 65, *words)
+    assert not asked and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("protocol", OBJECTS)
+def test_a_set_that_is_not_the_published_one_is_told(protocol, maker, sets, capsys):
+    words = ["--protocol", protocol, str(maker.file), str(sets[protocol]), "--samples", "1", "--most-views", "1"]
+    assert main(["evaluate", *words, "--objects", OBJECTS[protocol], "--json"]) == 0
+    said = capsys.readouterr()
+    notes = json.loads(said.out)["notes"]
+    wrong = {
+        "glossysynthetic": "bell has 7 training views, not 96; 1 views left out, not 32; 2 views in corridor, not 16",
+        "tensoir": "lego has 6 training views, not 100; 2 views left out, not 200",
+        "stanford-orb": "teapot_scene001 has 1 other scenes, not 2",
+        "shiny-blender": "toaster has 8 training views, not 100; 3 views left out, not 200",
+    }[protocol]
+    assert any(note.startswith(wrong) for note in notes) and wrong in said.err
+
+
+def test_counts_that_are_as_published_and_objects_of_the_tables_are_not_told():
+    for protocol in PROTOCOLS.values():
+        assert not differences("one", dict(protocol.expected), protocol) and protocol.expected
+        assert not strangers(protocol.objects, protocol)
+
+
+def test_objects_that_the_tables_have_not_are_told(maker, sets, tmp_path, capsys):
+    shutil.copytree(sets["shiny-blender"] / "toaster", tmp_path / "chair")
+    words = ["--protocol", "shiny-blender", str(maker.file), str(tmp_path), "--objects", "chair", "--json"]
+    assert main(["evaluate", *words, "--samples", "1", "--most-views", "1"]) == 0
+    said = capsys.readouterr()
+    assert "published means are without chair" in said.err
+    assert "published means are without chair" in json.loads(said.out)["notes"]
 
 
 def test_the_capture_of_stanford_orb_is_one_that_is_read(sets):
@@ -267,7 +317,7 @@ DAMAGE = [
     ("glossysynthetic", "glossy_relight/relight_gt/bell_neon/1.png", "opaque", "1.png: has no alpha"),
     ("glossysynthetic", "glossy_relight/relight_gt/bell_neon/1.png", "other size", "1.png: is 20 x 70 pixels"),
     ("tensoir", "lego/test_001/rgba_city.png", None, "rgba_city.png"),
-    ("tensoir", "lego/test_001/albedo.png", None, "1 of 16 images that are not there: test_001/albedo.png"),
+    ("tensoir", "lego/test_001/albedo.png", None, "1 of 30 images that are not there: test_001/albedo.png"),
     ("tensoir", "lego/test_000/normal.png", "text", "normal.png: is no image"),
     ("tensoir", "lego/test_000/metadata.json", "text", "metadata.json: is not JSON"),
     ("tensoir", "env/high_res_envmaps_2k/night.exr", None, "light night: is not there"),

@@ -51,6 +51,10 @@ class Protocol:
     check : callable
         (folder of the set, object, folder of the lights or None): raises AssetError where a file that is measured by is
         not there, before hours of work.
+    counts : callable
+        (folder of the set, object) -> how many views there are of each kind.
+    expected : dict of str to int
+        How many the published set has.
     measure : callable
         (bench, folder of the set, object, folder of the lights or None) -> figures of the object, nested by name.
     columns : tuple of Column
@@ -69,6 +73,8 @@ class Protocol:
     folder: Callable[[Path, str], Path]
     read: Callable[[Path, str, int | None], Capture]
     check: Callable[[Path, str, Path | None], object]
+    counts: Callable[[Path, str], dict[str, int]]
+    expected: dict[str, int]
     measure: Callable[[Bench, Path, str, Path | None], dict[str, Any]]
     columns: tuple[Column, ...]
     parts: int
@@ -94,7 +100,7 @@ def _hdr_pictures(part: str, title: str) -> tuple[Column, ...]:
 def _of(module: Any, columns: tuple[Column, ...], parts: int, lights: bool, about: str) -> Protocol:
     """The protocol of a module, which is named as it is but for underscores."""
     name = module.__name__.rpartition(".")[2].replace("_", "-")
-    functions = module.folder, module.read, module.check, module.measure
+    functions = module.folder, module.read, module.check, module.counts, module.COUNTS, module.measure
     return Protocol(name, module.OBJECTS, *functions, columns, parts, lights, getattr(module, "SIDE", None), about)
 
 

@@ -20,9 +20,11 @@ from ...reconstruct.capture.capture import Capture, View
 from ...reconstruct.readers import read_capture, transforms
 from ...reconstruct.readers.layout import Layout, complain_of_missing
 from ...reconstruct.readers.photograph_loading import shrink
-from .bench import Array, Bench, existing, mean_of, shown_on_white
+from .bench import Array, Bench, existing, mean_of, shown_on_white, split_counts
 
 OBJECTS = ("ball", "car", "coffee", "helmet", "teapot", "toaster")
+#: Views of the published set.
+COUNTS = {"training views": 100, "views left out": 200}
 
 
 def folder(root: Path, name: str) -> Path:
@@ -45,6 +47,11 @@ def check(root: Path, name: str, lights: Path | None) -> Layout:
     missing = [file.name for photograph in testing if not (file := _normals(photograph.image)).is_file()]
     complain_of_missing(str(source), missing, len(testing))
     return layout
+
+
+def counts(root: Path, name: str) -> dict[str, int]:
+    """How many views there are."""
+    return split_counts(transforms.read(folder(root, name)))
 
 
 def _normals(image: Path) -> Path:

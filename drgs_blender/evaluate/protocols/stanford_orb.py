@@ -46,6 +46,8 @@ OBJECTS = tuple(
 )  # fmt: skip
 #: Pixels of a side at which the benchmark measures.
 SIDE = 512
+#: Each object is relit as in its two other scenes; how many views there are differs.
+COUNTS = {"other scenes": 2}
 _REMEDY = "Unpack blender_HDR and ground_truth of the set again"
 
 
@@ -127,6 +129,11 @@ def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[st
         if count < len(rows):
             logger.warning("%s: ground_truth has %d of %d files %s", name, count, len(rows), part)
     return report
+
+
+def counts(root: Path, name: str) -> dict[str, int]:
+    """How many scenes there are of which there are novel pictures."""
+    return {"other scenes": len({frame.truth for frame in frames(root, name, "novel")})}
 
 
 def frames(root: Path, name: str, split: str) -> list[Frame]:

@@ -57,6 +57,18 @@ def complete(
     }
 
 
+def differences(name: str, found: dict[str, int], protocol: Protocol) -> list[str]:
+    """What an object has more or less of than in the published set, as "bell has 8 training views, not 96"."""
+    wrong = [f"{found[kind]} {kind}, not {count}" for kind, count in protocol.expected.items() if found[kind] != count]
+    return [f"{name} has {'; '.join(wrong)}"] if wrong else []
+
+
+def strangers(names: Sequence[str], protocol: Protocol) -> list[str]:
+    """A note on objects that the published tables have not."""
+    found = [name for name in names if name not in protocol.objects]
+    return [f"published means are without {first_of(found)}"] if found else []
+
+
 def figure(row: dict[str, Any], path: str) -> float | None:
     """The figure at a path such as "relit.psnr"; None where there is none."""
     value: Any = row
