@@ -169,6 +169,51 @@ def test_metrics_of_stanford_orb():
     assert orb_metrics.depth_error([]) is None
 
 
+def test_lpips_of_stanford_orb_is_of_pictures_that_are_encoded_twice():
+    random = np.random.default_rng(4)
+    ours, true = random.uniform(0, 1, (2, 12, 12, 3))
+    mask = np.ones((12, 12), bool)
+    mask[:, 6:] = False
+    found = orb_metrics.picture_scores(ours, true, mask, False, None, lambda a, b: float(10 * a.sum() + b.sum()))
+    inside = orb_metrics.eroded(mask)
+    twice = [linear_to_srgb(linear_to_srgb(picture))[inside].sum() for picture in (ours, true)]
+    assert 0 < inside.sum() < mask.sum() and found.figures["lpips"] == pytest.approx(10 * twice[0] + twice[1], rel=1e-6)
+
+
+def test_ssim_of_stanford_orb_is_that_of_its_windows():
+    """A plain loop over the windows of three pixels, mirrored without the outermost pixel."""
+    random = np.random.default_rng(5)
+    ours, true = random.uniform(0, 1, (2, 9, 8, 3))
+    figures = orb_metrics.picture_scores(ours, true, np.ones((9, 8), bool), False, None, None).figures
+    weights = np.exp(-0.5 * (np.arange(-1, 2) / 1.5) ** 2)
+    weights = np.outer(weights, weights) / weights.sum() ** 2
+    a, b = (np.pad(linear_to_srgb(p), ((1, 1), (1, 1), (0, 0)), mode="reflect") for p in (ours, true))
+    values = []
+    for row, column, channel in np.ndindex(9, 8, 3):
+        x, y = (picture[row : row + 3, column : column + 3, channel] for picture in (a, b))
+        p, q = (weights * x).sum(), (weights * y).sum()
+        spread = (weights * (x - p) ** 2).sum() + (weights * (y - q) ** 2).sum()
+        covariance = (weights * (x - p) * (y - q)).sum()
+        values.append((2 * p * q + 1e-4) * (2 * covariance + 9e-4) / ((p * p + q * q + 1e-4) * (spread + 9e-4)))
+    assert figures["ssim"] == pytest.approx(np.mean(values), abs=1e-6) and figures["ssim"] < 0.5
+
+
+def test_normals_of_stanford_orb():
+    true = np.zeros((4, 4, 3))
+    true[..., 2] = 1
+    across, longer = np.roll(true, 1, axis=-1), 3 * true
+    inside = np.zeros((4, 4), bool)
+    inside[:2] = True
+    assert orb_metrics.normal_distance(longer, true, inside) == pytest.approx(0)
+    assert orb_metrics.normal_distance(across, true, inside) == pytest.approx(1)
+    assert orb_metrics.normal_distance(-true, true, inside) == pytest.approx(2)
+    assert orb_metrics.normal_distance(np.zeros_like(true), true, inside) == pytest.approx(1)
+    half = np.where(inside[..., None], true, across)
+    half[0] = 0  # without a normal
+    assert orb_metrics.normal_distance(half, true, inside) == pytest.approx(0.5)
+    assert np.isnan(orb_metrics.normal_distance(true, true, np.zeros((4, 4), bool)))
+
+
 def test_median_ratios_of_albedo_are_not_moved_by_a_few_pixels():
     true = np.random.default_rng(1).uniform(0.2, 0.8, (90, 3))
     found = true / [2, 1, 0.5]
@@ -333,6 +378,22 @@ DAMAGE = [
     ("stanford-orb", "blender_HDR/teapot_scene001/transforms_novel.json", "json", "does not describe cameras"),
     ("stanford-orb", "ground_truth/teapot_scene002/env_map/0000.exr", None, "env_map/0000.exr: is not there"),
     ("stanford-orb", "ground_truth/teapot_scene001/surface_normal/0000.npy", "text", "0000.npy: holds no map"),
+    ("stanford-orb", "ground_truth/teapot_scene001/surface_normal/0000.npy", "nothing", "0000.npy: holds no map"),
+    ("stanford-orb", "ground_truth/teapot_scene001/z_depth/0001.npy", "npz", "0001.npy: holds no map"),
+    ("stanford-orb", "ground_truth/teapot_scene001/z_depth/0000.npy", "cut", "0000.npy: holds no map"),
+    ("stanford-orb", "ground_truth/teapot_scene001/z_depth/0001.npy", (40, 40, 3), "an array of shape (40, 40, 3)"),
+    ("stanford-orb", "ground_truth/teapot_scene001/surface_normal/0001.npy", (4800,), "an array of shape (4800,)"),
+    ("stanford-orb", "ground_truth/teapot_scene001/surface_normal/0001.npy", (0, 0, 3), "0001.npy: holds no map"),
+    ("stanford-orb", "ground_truth/teapot_scene001/surface_normal/0001.npy", (40, 30, 3), "is 30 x 40 pixels, its"),
+    ("stanford-orb", "ground_truth/teapot_scene001/z_depth/0000.npy", (20, 20), "is 20 x 20 pixels, its picture 40"),
+    ("stanford-orb", "ground_truth/teapot_scene001/pseudo_gt_albedo/0000.png", "other size", "is 20 x 70 pixels, its"),
+    (
+        "stanford-orb",
+        "blender_HDR/teapot_scene001/test/0001.exr",
+        (40, 30, 3),
+        "0001.exr: is 30 x 40 pixels, not square",
+    ),
+    ("stanford-orb", "ground_truth/teapot_scene002/env_map/0000.exr", "text", "env_map/0000.exr: is damaged"),
     ("shiny-blender", "toaster/transforms_test.json", None, "transforms_test.json: is not there"),
     ("shiny-blender", "toaster/test/r_1.png", None, "r_1"),
     ("shiny-blender", "toaster/test/r_1_normal.png", None, "r_1_normal.png"),
@@ -345,9 +406,18 @@ def test_what_is_missing_or_damaged_is_named(protocol, what, how, said, maker, s
     shutil.copytree(sets[protocol], root)
     path = root / what
     opaque = Image.open(path).convert("RGB") if how == "opaque" else None
+    half = path.read_bytes()[: path.stat().st_size // 2] if how == "cut" else b""
     shutil.rmtree(path) if path.is_dir() else path.unlink()
     if how == "empty":
         path.mkdir()
+    elif how in ("cut", "nothing"):
+        path.write_bytes(half)
+    elif how == "npz":
+        with path.open("wb") as file:
+            np.savez(file, depth=np.ones((40, 40), np.float32))
+    elif isinstance(how, tuple):
+        values = np.ones(how, np.float32)
+        published_sets.exr(path, values) if path.suffix == ".exr" else np.save(path, values)
     elif how in ("text", "json"):
         path.write_text("{}" if how == "json" else "nothing")
     elif how == "opaque":
@@ -547,5 +617,17 @@ def test_assets_are_reconstructed_where_they_are_not_yet(sets, tmp_path, capsys)
     assert "made with other settings" in capsys.readouterr().err
 
 
-def test_own_light_is_the_training_light(maker):
-    assert isinstance(read_asset(maker.file).environment, Environment)
+def test_the_own_light_is_that_of_the_asset(maker, sets):
+    """Views left out are rendered under it, relit pictures under those of the set."""
+    asset, shown = read_asset(maker.file), []
+    asset.environment = Environment(light(77))
+
+    def render(camera, radiance, factors):
+        shown.append(radiance)
+        return maker.render(camera.matrix_world, radiance)
+
+    bench = Bench(asset, render, most_views=1)
+    assert bench.own_light() is asset.environment.radiance
+    PROTOCOLS["glossysynthetic"].measure(bench, sets["glossysynthetic"], "bell", None)
+    expected = [light(77), light(10), light(11), light(12)]  # corridor, golf, neon
+    assert len(shown) == 4 and all(np.allclose(one, other, rtol=2e-3) for one, other in zip(shown, expected))
