@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("torch")
 
 from capture_cases import balls, write
+from published_sets import light, object_asset
 
 from drgs_blender.cli.main import main
 from drgs_blender.core.asset.container import inspect_asset, read_asset
@@ -189,6 +190,32 @@ def test_the_asset_keeps_its_settings_and_a_run_can_be_repeated_from_it(tmp_path
 
     write_asset(second, asset)
     assert "holds no settings" in refused(capsys, "--config", str(second))
+
+
+def test_masks_are_a_setting_that_the_asset_keeps(tmp_path, capsys, monkeypatch):
+    photographs, modes = tmp_path / "balls", []
+    photographs.mkdir()
+    write(balls(8, 32), photographs)
+    asset = object_asset(light(1))
+    asset.provenance["report"] = {}
+    monkeypatch.setattr("drgs_blender.reconstruct.pipeline.reconstruct", lambda *_: asset)
+    monkeypatch.setattr("drgs_blender.capture.masks.of_capture.mask_capture", lambda _, mode, *__: modes.append(mode))
+    words = ["reconstruct", str(photographs), "--out", str(tmp_path / "a.drgs")]
+    assert main([*words, "--masks", "none"]) == 0
+    again = ["reconstruct", str(photographs), "--out", str(tmp_path / "b.drgs"), "--config", str(tmp_path / "a.drgs")]
+    assert main(again) == 0 and main([*again, "--masks", "auto"]) == 0 and main(words) == 0
+    assert modes == ["none", "none", "auto", "given"]
+    # Of photographs without cameras, too.
+    for file in photographs.glob("*.json"):
+        file.unlink()
+
+    def capture(_, __, settings, *rest):
+        modes.append(settings.masks)
+        raise UsageError("capture", "is not made")
+
+    monkeypatch.setattr("drgs_blender.capture.pipeline.make_capture", capture)
+    monkeypatch.setattr("drgs_blender.capture.pictures.has_pictures", lambda _: True)
+    assert main([*words, "--set", "capture.masks=auto"]) == 64 and modes[4:] == ["auto"]
 
 
 def test_settings_of_python_are_checked_too():
