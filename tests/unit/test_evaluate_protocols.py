@@ -214,6 +214,21 @@ def test_normals_of_stanford_orb():
     assert np.isnan(orb_metrics.normal_distance(true, true, np.zeros((4, 4), bool)))
 
 
+def test_the_own_light_of_tensoir_may_be_one_of_rotated_ones(sets, tmp_path):
+    root, protocol = tmp_path / "set", PROTOCOLS["tensoir"]
+    shutil.copytree(sets["tensoir"], root)
+    expected = protocol.read(root, "lego", None)
+    for file in list(root.glob("lego/*/rgba_sunset.png")):
+        file.rename(file.with_name("rgba_sunset_000.png"))
+    protocol.check(root, "lego", None)
+    assert protocol.counts(root, "lego") == {"training views": 6, "views left out": 2}
+    for one, other in zip(protocol.read(root, "lego", None).views, expected.views, strict=True):
+        np.testing.assert_array_equal(one.colour, other.colour)
+    (root / "lego" / "train_001" / "rgba_sunset_000.png").unlink()
+    with pytest.raises(AssetError, match=r"train_001/rgba_sunset_000\.png"):
+        protocol.check(root, "lego", None)
+
+
 def test_median_ratios_of_albedo_are_not_moved_by_a_few_pixels():
     true = np.random.default_rng(1).uniform(0.2, 0.8, (90, 3))
     found = true / [2, 1, 0.5]
