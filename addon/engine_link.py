@@ -122,7 +122,7 @@ def output_of(arguments: list[str]) -> str:
     if done.returncode:
         lines = done.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {done.returncode}"]
         raise UsageError("", lines[-1].removeprefix("drgs: ").rstrip("."), "")
-    return done.stdout.decode()
+    return done.stdout.decode().replace("\r\n", "\n")
 
 
 def lacks_reconstruction() -> bool:

@@ -27,23 +27,25 @@ _CAMERAS = (
 )
 
 
-#: Fields of the dialog, 0 where nothing is said -> the setting of each.
+#: Fields of the dialog -> (the setting of each, from which value on it is given, its least value). 0 says nothing; nor
+#: does every first photograph to hold out, which would leave none.
 _NUMBERS = {
-    "minutes": "minutes",
-    "resolution": "capture.resolution",
-    "test_every": "capture.test_every",
-    "surfels": "schedule.surfels",
-    "voxels": "mesh_resolution",
-    "iterations": "schedule.iterations",
-    "material_iterations": "decoupling.iterations",
+    "minutes": ("minutes", 1e-6, 0.001),
+    "resolution": ("capture.resolution", 1, 8),
+    "test_every": ("capture.test_every", 2, 2),
+    "surfels": ("schedule.surfels", 1, 10),
+    "voxels": ("mesh_resolution", 1, 16),
+    "iterations": ("schedule.iterations", 1, 1),
+    "material_iterations": ("decoupling.iterations", 1, 1),
 }
 
 
 def options_of(fields: bpy.types.OperatorProperties) -> list[str]:
     """Options of ``drgs reconstruct`` for the fields of the dialog."""
     arguments = ["--variant", fields.variant, "--axes", fields.axes]
-    for name, setting in _NUMBERS.items():
-        if value := getattr(fields, name):
+    for name, (setting, given_from, least) in _NUMBERS.items():
+        if (value := getattr(fields, name)) >= given_from:
+            value = max(value, least)
             arguments += ["--set", f"{setting}={value:.6g}" if isinstance(value, float) else f"{setting}={value}"]
     return arguments if fields.use_materials else [*arguments, "--no-materials"]
 

@@ -6,13 +6,15 @@ import argparse
 import json
 import logging
 import sys
-from dataclasses import replace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core.errors import EXIT_BAD_ASSET, AssetError, UsageError, first_of
+from ..core.errors import EXIT_BAD_ASSET, AssetError, DrgsError, UsageError, first_of
 from ..core.frame import Adjustment, Camera, Frame, ObjectState, RenderSettings, World
 from .interrupt import interruptible
 from .output import check_writable
@@ -22,12 +24,16 @@ if TYPE_CHECKING:
     from ..core.asset import Asset
     from ..evaluate.protocols import Protocol
     from ..evaluate.protocols.bench import Renderer
+    from ..reconstruct.pipeline import Progress
     from ..reconstruct.settings import Reading, Settings
 
 logger = logging.getLogger(__name__)
 
 #: Names of the table of protocols, which is not imported for a parser.
 NAMES = ("glossysynthetic", "tensoir", "stanford-orb", "shiny-blender")
+
+#: Options of --make-scenes alone.
+_OF_SCENES = ("small", "size", "train", "test", "spp", "lights", "meshes", "blender")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def refuse_options(args: argparse.Namespace) -> None:
     """Raise UsageError where options of protocols are given without one."""
     for name in ("out", "lights_from", "most_views", "config", "set"):
-        if getattr(args, name):
+        if getattr(args, name) not in (None, []):
             raise UsageError(f"--{name.replace('_', '-')}", "is an option of --protocol", "Leave it out")
 
 
@@ -62,7 +68,7 @@ def run(args: argparse.Namespace, settings: RenderSettings) -> int:
     from ..evaluate.flip import find_flip
     from ..evaluate.lpips import Lpips
     from ..evaluate.protocols import PROTOCOLS, Bench
-    from ..evaluate.protocols.table import complete, table
+    from ..evaluate.protocols.table import complete, differences, strangers, table
 
     protocol = PROTOCOLS[args.protocol]
     root, assets = _places(args)
@@ -70,17 +76,19 @@ def run(args: argparse.Namespace, settings: RenderSettings) -> int:
     names = _objects(args, protocol, root, assets)
     for name in names:
         protocol.check(root, name, args.lights_from)  # before hours of work
+    counts = {name: protocol.counts(root, name) for name in names}
+    notes = strangers(names, protocol) + [text for name in names for text in differences(name, counts[name], protocol)]
+    for note in notes:
+        logger.warning("%s: %s: not the published set", root, note)
     lpips = Lpips(*args.lpips) if args.lpips else None
-    if args.out is not None:
-        _reconstruct(args, protocol, root, names)
+    if args.pictures is not None:
+        check_writable(args.pictures / names[0] / "views-000.png")
+    failed: dict[str, DrgsError] = {}
+    notes += [] if args.out is None else _reconstruct(args, protocol, root, names, failed)
     flip = find_flip()
-    failed: dict[str, AssetError] = {}
     report: dict[str, Any] = {"protocol": protocol.name, "samples": settings.samples, "objects": {}}
     with FractionBar(args, "rendering", every=WORK_SECONDS) as bar:
         for k, name in enumerate(names):
-            file = assets if assets.is_file() else assets / f"{name}.drgs"
-            asset, render, digest = _loaded(file, settings)
-
             begun: list[str] = []  # parts of this object
 
             def tell(part: str, done: int, of: int, k: int = k, name: str = name, begun: list[str] = begun) -> None:
@@ -89,19 +97,31 @@ def run(args: argparse.Namespace, settings: RenderSettings) -> int:
                 done_here = (len(begun) - 1 + done / of) / protocol.parts
                 bar(f"{name}, {part}, {done} of {of}", (k + done_here) / len(names))
 
-            bench = Bench(asset, render, args.resolution, args.most_views, flip, lpips, tell, _writer(args, name))
-            try:
-                report["objects"][name] = {"asset": digest, **protocol.measure(bench, root, name, args.lights_from)}
-            except AssetError as error:  # the other objects are scored all the same
-                if len(names) == 1:
-                    raise
-                failed[name] = error
-                logger.error("%s is not scored: %s", name, error)
+            if name in failed:
+                continue
+            with _apart(name, names, failed):
+                file = assets if assets.is_file() else assets / f"{name}.drgs"
+                asset, render, digest = _loaded(file, settings)
+                bench = Bench(asset, render, args.resolution, args.most_views, flip, lpips, tell, _writer(args, name))
+                figures = protocol.measure(bench, root, name, args.lights_from)
+                report["objects"][name] = {"asset": digest, "counts": counts[name], **figures}
     report["failed"] = {name: str(error) for name, error in failed.items()}
     network = lpips.network if lpips else ""
-    report = complete(report, protocol, network, args.most_views, args.resolution)
+    report = complete(report, protocol, network, args.most_views, args.resolution, notes)
     print(json.dumps(report, indent=1, allow_nan=False) if args.json else "\n".join(table(report, protocol)))
     return EXIT_BAD_ASSET if failed else 0
+
+
+@contextmanager
+def _apart(name: str, names: list[str], failed: dict[str, DrgsError]) -> Iterator[None]:
+    """Keep what is wrong with one object of several from ending the run: it is told, and put into `failed`."""
+    try:
+        yield
+    except (AssetError, UsageError) as error:
+        if len(names) == 1:
+            raise
+        failed[name] = error
+        logger.error("%s is not scored: %s", name, error)
 
 
 def _places(args: argparse.Namespace) -> tuple[Path, Path]:
@@ -123,12 +143,13 @@ def _check(args: argparse.Namespace, protocol: Protocol) -> None:
     """Raise UsageError on options that have no meaning here."""
     idle = {
         "--relit": args.relit, "--test-every": args.test_every, "--up": args.up, "--axes": args.axes != "opengl",
-        "--lights-from": args.lights_from and not protocol.lights, "--config": args.config and not args.out,
-        "--set": args.set and not args.out,
-    }  # fmt: skip
-    if wrong := [name for name, given in idle.items() if given]:
-        problem = f"has no effect with --protocol {protocol.name}" + ("" if args.out else " without --out")
-        raise UsageError(first_of(wrong), problem, "Leave it out")
+        "--lights-from": args.lights_from and not protocol.lights,
+    } | {f"--{name}": getattr(args, name) for name in _OF_SCENES}  # fmt: skip
+    of_out = {"--config": args.config and not args.out, "--set": args.set and not args.out}
+    for options, where in ((idle, ""), (of_out, " without --out")):
+        if wrong := [name for name, given in options.items() if given]:
+            problem = f"has no effect with --protocol {protocol.name}{where}"
+            raise UsageError(first_of(wrong), problem, "Leave it out")
     if args.most_views is not None and args.most_views < 1:
         raise UsageError("--most-views", f"is {args.most_views}", "Choose at least 1")
 
@@ -162,26 +183,53 @@ def _objects(args: argparse.Namespace, protocol: Protocol, root: Path, assets: P
     return found
 
 
-def _reconstruct(args: argparse.Namespace, protocol: Protocol, root: Path, names: list[str]) -> None:
-    """Make the assets that are not there yet."""
-    from ..reconstruct.settings_table import as_tables
-    from .reconstruct import resolved_settings
-
-    settings, reading = resolved_settings(args.config, {}, args.set)
-    if args.resolution is not None and reading.resolution is None:
-        reading = replace(reading, resolution=args.resolution)
+def _reconstruct(
+    args: argparse.Namespace, protocol: Protocol, root: Path, names: list[str], failed: dict[str, DrgsError]
+) -> list[str]:
+    """Make the assets that are not there yet; notes on those that are there, made otherwise."""
+    settings, reading = _settings(args, protocol)
+    notes = []
     for name in names:
         file = args.out / f"{name}.drgs"
-        if not file.exists():
-            _make(args, protocol, root, name, file, settings, reading)
-            continue
-        from ..core.asset.container import inspect_asset
+        with _apart(name, names, failed):
+            if not file.exists():
+                _make(args, protocol, root, name, file, settings, reading)
+            elif note := _made_otherwise(file, settings, reading):
+                notes.append(f"{name} {note}")
+                logger.warning("%s: %s; it is scored as it is. Remove it to make it again", file, note)
+    return notes
 
-        kept = inspect_asset(file, verify=False)["provenance"].get("settings")
-        if (args.config or args.set) and kept != as_tables(settings, reading):
-            logger.warning(
-                "%s: is there, made with other settings; it is scored as it is. Remove it to make it again", file
-            )
+
+def _settings(args: argparse.Namespace, protocol: Protocol) -> tuple[Settings, Reading]:
+    """Settings of --out. Raises UsageError on those of reading that the set gives itself."""
+    from ..reconstruct.settings import Reading
+    from .reconstruct import reconstruction, resolved_settings
+
+    reconstruction()  # its absence is told at once
+    settings, reading = resolved_settings(args.config, {}, args.set)
+    for field in fields(Reading):
+        if field.name != "resolution" and getattr(reading, field.name) != field.default:
+            problem = f"has no effect with --protocol {protocol.name}: the set says it"
+            raise UsageError(f"capture.{field.name}", problem, "Leave it out of --set and --config")
+    if reading.resolution is None:
+        reading = replace(reading, resolution=args.resolution or protocol.side)
+    return settings, reading
+
+
+def _made_otherwise(file: Path, settings: Settings, reading: Reading) -> str:
+    """How the settings of an asset differ, "" where they do not."""
+    from ..core.asset.container import inspect_asset
+    from ..reconstruct.settings import Reading, Settings
+    from ..reconstruct.settings_file import flat
+    from ..reconstruct.settings_table import as_tables
+
+    kept = inspect_asset(file, verify=False)["provenance"].get("settings")
+    if not isinstance(kept, dict):
+        return "was made with settings that it does not keep"
+    wanted, usual = flat(as_tables(settings, reading)), flat(as_tables(Settings(), Reading()))
+    made = usual | flat(kept)  # settings that are newer than the asset had their defaults
+    other = [name for name in made if name not in wanted or made[name] != wanted[name]]
+    return f"was made with other settings ({first_of(other)})" if other else ""
 
 
 def _make(
@@ -194,10 +242,10 @@ def _make(
     reading: Reading,
 ) -> None:
     from ..core.asset.container import write_asset
-    from ..reconstruct.pipeline import Progress, reconstruct
     from ..reconstruct.settings_table import as_tables
-    from .reconstruct import clear
+    from .reconstruct import clear, reconstruction
 
+    reconstruct = reconstruction()
     check_writable(file)
     work = file.with_name(f"{name}.reconstruct")
     with interruptible() as cancelled, FractionBar(args, "reconstructing", every=WORK_SECONDS) as bar:

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core.errors import UsageError
+from ..core.errors import Cancelled, DeviceError, UsageError
 from ..core.file_types import CAMERAS
 from ..core.phases import is_preparing
 from ..formats.axes import UP_AXES
@@ -31,6 +31,7 @@ from .progress import WORK_SECONDS, FractionBar
 from .sampling import above_zero, int_range
 
 if TYPE_CHECKING:
+    from ..core.asset import Asset
     from ..reconstruct.capture.capture import Capture
     from ..reconstruct.pipeline import Progress
     from ..reconstruct.settings import Reading, Settings
@@ -58,6 +59,7 @@ OPTIONS = {
     "device": "device",
     "axes": "capture.axes",
     "up": "capture.up",
+    "masks": "capture.masks",
 }
 
 #: Seconds between two lines of progress on stdout.
@@ -110,7 +112,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--masks",
         choices=("given", "auto", "none"),
-        default="given",
         help="given: use masks that are there (default); auto: make them where there are none, of an object on a "
         "ground that shows texture; none: use none, the surroundings are learned, too",
     )
@@ -153,22 +154,13 @@ def run(args: argparse.Namespace) -> int:
     check_suffix(args.out, (".drgs",))
     check_writable(args.out, (args.capture,))
 
-    from ..core.errors import Cancelled, DeviceError
-
-    try:
-        from ..reconstruct.pipeline import reconstruct
-    except ImportError as error:
-        if error.name != "torch":
-            raise
-        raise DeviceError(
-            "reconstruct", "needs PyTorch", f'Install it: "{sys.executable}" -m pip install "torch>=2.5"'
-        ) from error
+    reconstruct = reconstruction()
     from ..reconstruct.readers import read_capture
     from ..reconstruct.settings_table import as_tables
 
-    source = _with_cameras(args)
+    source = _with_cameras(args, reading.masks)
     capture = read_capture(source, reading.resolution, reading.test_every, reading.axes, reading.up)
-    _mask(args, capture)
+    _mask(args, capture, reading.masks)
     logger.info("%d views to learn from, %d left out", len(capture.training), len(capture.testing))
     work = args.out.with_name(f"{args.out.stem}.reconstruct")
 
@@ -196,6 +188,19 @@ def run(args: argparse.Namespace) -> int:
         shown = report["decoupling"]["psnr"]
         print(f"  materials in the light that was found, pixels learned from: PSNR {shown:.2f} dB")
     return 0
+
+
+def reconstruction() -> Callable[..., Asset]:
+    """`pipeline.reconstruct`, which is imported when it is needed. Raises DeviceError where PyTorch is absent."""
+    try:
+        from ..reconstruct.pipeline import reconstruct
+    except ImportError as error:
+        if error.name != "torch":
+            raise
+        raise DeviceError(
+            "reconstruct", "needs PyTorch", f'Install it: "{sys.executable}" -m pip install "torch>=2.5"'
+        ) from error
+    return reconstruct
 
 
 def resolved_settings(config: Path | None, options: dict[str, Any], sets: list[str]) -> tuple[Settings, Reading]:
@@ -238,7 +243,7 @@ def resolved_settings(config: Path | None, options: dict[str, Any], sets: list[s
     return settings, reading
 
 
-def _with_cameras(args: argparse.Namespace) -> Path:
+def _with_cameras(args: argparse.Namespace, masks: str) -> Path:
     """The capture, or one made of photographs without cameras, beside the output."""
     from ..reconstruct.readers import has_cameras
 
@@ -254,7 +259,7 @@ def _with_cameras(args: argparse.Namespace) -> Path:
     if not args.quiet:
         emit(f"drgs: {args.capture} has no cameras: they are found first, in {folder}\n", sys.stderr)
     with interruptible() as cancelled, FractionBar(args, "capturing", every=WORK_SECONDS) as bar:
-        made = make_capture(args.capture, folder, Settings(masks=args.masks), _telling(args, bar), cancelled)
+        made = make_capture(args.capture, folder, Settings(masks=masks), _telling(args, bar), cancelled)
     for line in made.lines if not args.quiet else ():
         emit(f"drgs: {line}\n", sys.stderr)
     return folder
@@ -274,13 +279,13 @@ def _telling(args: argparse.Namespace, bar: FractionBar) -> Callable[[str, float
     return tell
 
 
-def _mask(args: argparse.Namespace, capture: Capture) -> None:
-    """Make masks of a capture that has none, or leave them out, as `--masks` says."""
+def _mask(args: argparse.Namespace, capture: Capture, masks: str) -> None:
+    """Make masks of a capture that has none, or leave them out, as `capture.masks` says."""
     from ..capture.masks.of_capture import mask_capture
 
     with interruptible() as cancelled, FractionBar(args, "finding the object", every=WORK_SECONDS) as bar:
         sheet = args.out.with_name(f"{args.out.stem}.masks.png")
-        mask_capture(capture, args.masks, sheet, _telling(args, bar), cancelled)
+        mask_capture(capture, masks, sheet, _telling(args, bar), cancelled)
 
 
 def clear(folder: Path) -> None:

@@ -54,8 +54,8 @@ def psnr(picture: Array, reference: Array, mask: Array | None = None) -> float:
 def ssim(picture: Array, reference: Array, border: bool = False) -> float:
     """Structural similarity of (h, w, 3) pictures in [0, 1]: Wang et al. 2004, Gaussian of 1.5, mean of channels.
 
-    Pixels whose window the picture does not hold whole are left out, unless `border`: then all count, as in the tables
-    of methods that follow 3DGS.
+    Pixels whose window the picture does not hold whole are left out, unless `border`: then all count, as for methods
+    that follow 3DGS. Those pad with zeros; here the picture is reflected.
     """
     from skimage.metrics import structural_similarity
 

@@ -23,10 +23,16 @@ _DAMAGED = "Render or download the file again"
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 
 
-def read_exr(path: Path) -> tuple[Array, bool, list[str]]:
+def read_exr(path: Path, alpha: bool = False) -> tuple[Array, bool, list[str]]:
     """((h, w, 3) float32 linear Rec.709, whether it is a cube map, notes).
 
     The unnamed layer is preferred, then "Combined", then the first that has R, G and B.
+
+    Parameters
+    ----------
+    path : Path
+    alpha : bool
+        (h, w, 4) where the layer has an A, by which the colours are multiplied (associated alpha).
 
     Raises
     ------
@@ -53,7 +59,7 @@ def read_exr(path: Path) -> tuple[Array, bool, list[str]]:
         raise AssetError(subject, f"is damaged ({str(error).replace(subject, 'it')})", _DAMAGED) from error
     if not whole:
         raise AssetError(subject, "is damaged: its pixels cannot be decoded", _DAMAGED)
-    header, pixels = _choose(parts, subject, notes)
+    header, pixels = _choose(parts, subject, alpha, notes)
     if not np.isfinite(pixels).any():
         raise AssetError(subject, "has only values that are NaN or infinite", _DAMAGED)
     if not np.isfinite(pixels).all():
@@ -61,7 +67,7 @@ def read_exr(path: Path) -> tuple[Array, bool, list[str]]:
         pixels = np.nan_to_num(pixels, nan=0.0, posinf=0.0, neginf=0.0)
     if matrix := _to_rec709(header):
         notes.append("converted from the chromaticities of the file to Rec.709")
-        pixels = pixels @ np.array(matrix, np.float32).T
+        pixels[..., :3] = pixels[..., :3] @ np.array(matrix, np.float32).T
     cube = getattr(header.get("envmap"), "name", "") == "ENVMAP_CUBE" or pixels.shape[0] == 6 * pixels.shape[1]
     return np.ascontiguousarray(pixels), cube, notes
 
@@ -88,9 +94,9 @@ def _check_size(header: dict[str, Any], path: Path) -> None:
 
 
 def _choose(
-    parts: list[tuple[dict[str, Any], dict[str, Array]]], subject: str, notes: list[str]
+    parts: list[tuple[dict[str, Any], dict[str, Array]]], subject: str, alpha: bool, notes: list[str]
 ) -> tuple[dict[str, Any], Array]:
-    """(header, (h, w, 3) float32) of the best layer."""
+    """(header, (h, w, 3) float32) of the best layer; (h, w, 4) where it has an A for which `alpha` asks."""
     found: list[tuple[int, str, dict[str, Any], list[Array]]] = []
     for header, channels in parts:
         for name in channels:
@@ -101,6 +107,8 @@ def _choose(
                 planes = [w for w in wanted if w is not None]
                 if len(planes) == 3:
                     rank = {"": 0, "Combined": 1}.get(layer.split(".")[-1], 2) + 10 * (channel == "Y")
+                    if alpha and prefix + "A" in channels:
+                        planes.append(channels[prefix + "A"])
                     found.append((rank, name, header, planes))
     if not found:
         raise AssetError(subject, "has neither R, G, B nor Y", "Choose an environment picture")

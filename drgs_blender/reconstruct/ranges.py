@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+import sys
 import types
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from ..core.errors import UsageError
+
+#: Characters of a value in a message, at most.
+_LONGEST = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +40,7 @@ class Range:
 
     def __contains__(self, value: float) -> bool:
         """Whether the setting may be `value`."""
-        if not (math.isfinite(value) and self.low <= value <= self.high):
+        if not (_is_finite(value) and self.low <= value <= self.high):
             return False
         whole = int(value)
         return {"": True, "even": whole % 2 == 0, "power of two": whole & (whole - 1) == 0}[self.kind]
@@ -46,6 +50,20 @@ class Range:
         kind = {"": "", "even": ", even", "power of two": ", a power of two"}[self.kind]
         limits = f"of at least {self.low:g}" if self.high == math.inf else f"from {self.low:g} to {self.high:.10g}"
         return limits + kind
+
+
+def _is_finite(value: float) -> bool:
+    """Whether a number is one of floating point; whole ones may be larger, and are no `float` then."""
+    return abs(value) <= sys.float_info.max
+
+
+def _shown(value: Any) -> str:
+    """A value for a message, shortened."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # Python writes no number of more than 4300 digits
+        return "too long to be shown"
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 #: A part of the steps, a share, a weight.
@@ -83,15 +101,16 @@ class Allowed:
             return ""
         if self.items is not None:
             if not isinstance(value, list | tuple) or self.items not in (-1, len(value)):
-                return f"is {value!r}, not {self}"
+                return f"is {_shown(value)}, not {self}"
             return next((text for item in value if (text := self._problem_of_one(item))), "")
         return self._problem_of_one(value)
 
     def _problem_of_one(self, value: Any) -> str:
         whole = isinstance(value, int) and not isinstance(value, bool)
         right = whole or isinstance(value, float) if self.type is float else type(value) is self.type
+        right = right and (self.type is not float or _is_finite(value))
         right = right and (not self.choices or value in self.choices) and (self.range is None or value in self.range)
-        return "" if right else f"is {value!r}, not {self._of_one}"
+        return "" if right else f"is {_shown(value)}, not {self._of_one}"
 
     @property
     def _of_one(self) -> str:

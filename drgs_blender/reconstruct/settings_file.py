@@ -57,7 +57,10 @@ def _of_asset(path: Path) -> dict[str, Any]:
     if not isinstance(settings, dict):
         problem = "holds no settings: it was not reconstructed, or by an earlier version"
         raise UsageError(str(path), problem, "Give a TOML file of settings")
-    return flat(settings)
+    try:
+        return flat(settings)
+    except RecursionError as error:
+        raise AssetError(str(path), "holds settings inside of too many tables", "Choose another asset") from error
 
 
 def flat(tables: Mapping[str, Any]) -> dict[str, Any]:
@@ -87,7 +90,7 @@ def parse_setting(text: str) -> tuple[str, Any]:
         raise UsageError(f"--set {text}", "is not NAME=VALUE", "As in --set schedule.iterations=5000")
     try:
         parsed = tomllib.loads(f"value = {value}")
-    except ValueError:
+    except (ValueError, RecursionError):
         parsed = {}
     return name, parsed["value"] if parsed.keys() == {"value"} else value
 

@@ -81,6 +81,36 @@ def test_without_a_window_the_terminal_shows_how_far_it_is(scene, photographs, m
     assert "surfels on" in said.split(lines[-1])[1] and "DRGS_" not in said
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "given"),
+    [
+        ("resolution", 0, None),
+        ("resolution", 5, "capture.resolution=8"),
+        ("resolution", 9, "capture.resolution=9"),
+        ("test_every", 1, None),
+        ("test_every", 2, "capture.test_every=2"),
+        ("surfels", 1, "schedule.surfels=10"),
+        ("voxels", 15, "mesh_resolution=16"),
+        ("voxels", 17, "mesh_resolution=17"),
+        ("iterations", 1, "schedule.iterations=1"),
+        ("minutes", 0.0001, "minutes=0.001"),
+        ("minutes", 2.5, "minutes=2.5"),
+    ],
+)
+def test_small_numbers_of_the_dialog_are_the_least_there_are(name, value, given):
+    fields = dict.fromkeys(operator._NUMBERS, 0) | {"variant": "p", "axes": "opengl", "use_materials": True}
+    options = operator.options_of(SimpleNamespace(**fields | {name: value}))
+    assert options[4:] == ([] if given is None else ["--set", given])
+
+
+def test_lines_end_alike_on_all_systems(monkeypatch):
+    link = part("addon.engine_link")
+    monkeypatch.setattr(link, "drgs_command", lambda: ["drgs"])
+    done = SimpleNamespace(returncode=0, stdout=b"[capture]\r\nup = 1\r\n")
+    monkeypatch.setattr(link.subprocess, "run", lambda *_, **__: done)
+    assert link.output_of(["reconstruct"]) == "[capture]\nup = 1\n"
+
+
 def test_progress_is_what_the_program_says(tmp_path):
     state = reconstruction.Reconstruction(tmp_path / "a.drgs")
     state.follow("drgs: a note\n")

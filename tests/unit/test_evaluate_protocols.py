@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +20,12 @@ from published_sets import Maker, light, object_asset, with_mesh
 from drgs_blender.cli import evaluate_protocol
 from drgs_blender.cli.main import main
 from drgs_blender.core.asset import Environment
-from drgs_blender.core.asset.container import read_asset, write_asset
+from drgs_blender.core.asset.container import inspect_asset, read_asset, write_asset
 from drgs_blender.core.color import linear_to_srgb
 from drgs_blender.core.errors import AssetError
 from drgs_blender.evaluate.protocols import PROTOCOLS, orb_metrics, stanford_orb, tensoir
-from drgs_blender.evaluate.protocols.bench import find_light
+from drgs_blender.evaluate.protocols.bench import Bench, find_light
+from drgs_blender.evaluate.protocols.table import differences, strangers
 from drgs_blender.formats.latlong import directions
 from drgs_blender.reconstruct.readers import nero, read_capture
 
@@ -167,6 +169,66 @@ def test_metrics_of_stanford_orb():
     assert orb_metrics.depth_error([]) is None
 
 
+def test_lpips_of_stanford_orb_is_of_pictures_that_are_encoded_twice():
+    random = np.random.default_rng(4)
+    ours, true = random.uniform(0, 1, (2, 12, 12, 3))
+    mask = np.ones((12, 12), bool)
+    mask[:, 6:] = False
+    found = orb_metrics.picture_scores(ours, true, mask, False, None, lambda a, b: float(10 * a.sum() + b.sum()))
+    inside = orb_metrics.eroded(mask)
+    twice = [linear_to_srgb(linear_to_srgb(picture))[inside].sum() for picture in (ours, true)]
+    assert 0 < inside.sum() < mask.sum() and found.figures["lpips"] == pytest.approx(10 * twice[0] + twice[1], rel=1e-6)
+
+
+def test_ssim_of_stanford_orb_is_that_of_its_windows():
+    """A plain loop over the windows of three pixels, mirrored without the outermost pixel."""
+    random = np.random.default_rng(5)
+    ours, true = random.uniform(0, 1, (2, 9, 8, 3))
+    figures = orb_metrics.picture_scores(ours, true, np.ones((9, 8), bool), False, None, None).figures
+    weights = np.exp(-0.5 * (np.arange(-1, 2) / 1.5) ** 2)
+    weights = np.outer(weights, weights) / weights.sum() ** 2
+    a, b = (np.pad(linear_to_srgb(p), ((1, 1), (1, 1), (0, 0)), mode="reflect") for p in (ours, true))
+    values = []
+    for row, column, channel in np.ndindex(9, 8, 3):
+        x, y = (picture[row : row + 3, column : column + 3, channel] for picture in (a, b))
+        p, q = (weights * x).sum(), (weights * y).sum()
+        spread = (weights * (x - p) ** 2).sum() + (weights * (y - q) ** 2).sum()
+        covariance = (weights * (x - p) * (y - q)).sum()
+        values.append((2 * p * q + 1e-4) * (2 * covariance + 9e-4) / ((p * p + q * q + 1e-4) * (spread + 9e-4)))
+    assert figures["ssim"] == pytest.approx(np.mean(values), abs=1e-6) and figures["ssim"] < 0.5
+
+
+def test_normals_of_stanford_orb():
+    true = np.zeros((4, 4, 3))
+    true[..., 2] = 1
+    across, longer = np.roll(true, 1, axis=-1), 3 * true
+    inside = np.zeros((4, 4), bool)
+    inside[:2] = True
+    assert orb_metrics.normal_distance(longer, true, inside) == pytest.approx(0)
+    assert orb_metrics.normal_distance(across, true, inside) == pytest.approx(1)
+    assert orb_metrics.normal_distance(-true, true, inside) == pytest.approx(2)
+    assert orb_metrics.normal_distance(np.zeros_like(true), true, inside) == pytest.approx(1)
+    half = np.where(inside[..., None], true, across)
+    half[0] = 0  # without a normal
+    assert orb_metrics.normal_distance(half, true, inside) == pytest.approx(0.5)
+    assert np.isnan(orb_metrics.normal_distance(true, true, np.zeros((4, 4), bool)))
+
+
+def test_the_own_light_of_tensoir_may_be_one_of_rotated_ones(sets, tmp_path):
+    root, protocol = tmp_path / "set", PROTOCOLS["tensoir"]
+    shutil.copytree(sets["tensoir"], root)
+    expected = protocol.read(root, "lego", None)
+    for file in list(root.glob("lego/*/rgba_sunset.png")):
+        file.rename(file.with_name("rgba_sunset_000.png"))
+    protocol.check(root, "lego", None)
+    assert protocol.counts(root, "lego") == {"training views": 6, "views left out": 2}
+    for one, other in zip(protocol.read(root, "lego", None).views, expected.views, strict=True):
+        np.testing.assert_array_equal(one.colour, other.colour)
+    (root / "lego" / "train_001" / "rgba_sunset_000.png").unlink()
+    with pytest.raises(AssetError, match=r"train_001/rgba_sunset_000\.png"):
+        protocol.check(root, "lego", None)
+
+
 def test_median_ratios_of_albedo_are_not_moved_by_a_few_pixels():
     true = np.random.default_rng(1).uniform(0.2, 0.8, (90, 3))
     found = true / [2, 1, 0.5]
@@ -207,12 +269,96 @@ def test_relit_pictures_of_glossysynthetic_are_scaled(maker, sets, tmp_path, cap
     assert lights["neon"]["raw_psnr"] + 0.1 < lights["neon"]["psnr"] < 40 < lights["golf"]["raw_psnr"]
 
 
-def test_what_is_missing_is_told_before_anything_is_reconstructed(sets, tmp_path, capsys):
+def test_lpips_of_glossysynthetic_is_of_pictures_that_are_not_shifted(maker, sets):
+    """LPIPS takes [0, 1] to [-1, 1]; what it is given comes out of that as the pictures were, in [0, 1]."""
+    shifted = []
+
+    def lpips(ours, true):
+        shifted.extend((2 * ours - 1, 2 * true - 1))
+        return 0.0
+
+    shown = []
+    bench = Bench(
+        read_asset(maker.file), lambda camera, radiance, _: maker.render(camera.matrix_world, radiance),
+        most_views=1, lpips=lpips, show=lambda part, number, ours, true: shown.append(true),
+    )  # fmt: skip
+    PROTOCOLS["glossysynthetic"].measure(bench, sets["glossysynthetic"], "bell", None)
+    np.testing.assert_allclose(shifted[1], shown[0], atol=0.51 / 255)
+    assert len(shifted) == 14 and all(picture.min() >= -1e-6 and picture.max() <= 1.5 for picture in shifted)
+
+
+@pytest.mark.parametrize("part", [0.5, 1.0])
+def test_normals_of_shiny_blender_count_where_the_asset_is(part, maker, sets):
+    """A hole in the asset changes the pictures alone; without anything there is no figure."""
+
+    def render(camera, radiance, factors):
+        passes = {name: values.copy() for name, values in maker.render(camera.matrix_world, radiance).items()}
+        for values in passes.values():
+            values[:, : int(part * values.shape[1])] = 0
+        return passes
+
+    report = PROTOCOLS["shiny-blender"].measure(
+        Bench(read_asset(maker.file), render, most_views=1), sets["shiny-blender"], "toaster", None
+    )
+    found = report["shape"]["normal_degrees"]
+    assert report["views"]["psnr"] < 25 and (found is None if part == 1 else found < 1.5)
+
+
+@pytest.mark.parametrize(
+    ("protocol", "what", "said"),
+    [
+        ("tensoir", "env/high_res_envmaps_2k/night.exr", "light night"),
+        ("tensoir", "lego/test_000/rgba_sunset.png", "test_000/rgba_sunset.png"),
+        ("tensoir", "lego/train_001/rgba_sunset.png", "train_001/rgba_sunset.png"),
+        ("glossysynthetic", "GlossySynthetic/bell/3.png", "3.png"),
+        ("glossysynthetic", "glossy_relight/relight_gt/bell_golf/1.png", "1.png"),
+        (None, None, "shown"),
+    ],
+)
+def test_what_is_missing_is_told_before_anything_is_reconstructed(
+    protocol, what, said, maker, sets, tmp_path, capsys, monkeypatch
+):
     root = tmp_path / "set"
-    shutil.copytree(sets["tensoir"], root)
-    (root / "env" / "high_res_envmaps_2k" / "night.exr").unlink()
-    assert "light night" in refused(capsys, 65, "--protocol", "tensoir", root, "--out", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
+    shutil.copytree(sets[protocol or "shiny-blender"], root)
+    asked = reconstructions(monkeypatch, maker.file)
+    if what is None:  # a folder of pictures that cannot be written
+        (tmp_path / "shown").write_text("a file")
+        words = ["--protocol", "shiny-blender", root, "--out", tmp_path / "out", "--pictures", tmp_path / "shown"]
+    else:
+        (root / what).unlink()
+        words = ["--protocol", protocol, root, "--out", tmp_path / "out"]
+    assert said in refused(capsys, 73 if what is None else 65, *words)
+    assert not asked and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("protocol", OBJECTS)
+def test_a_set_that_is_not_the_published_one_is_told(protocol, maker, sets, capsys):
+    words = ["--protocol", protocol, str(maker.file), str(sets[protocol]), "--samples", "1", "--most-views", "1"]
+    assert main(["evaluate", *words, "--objects", OBJECTS[protocol], "--json"]) == 0
+    said = capsys.readouterr()
+    notes = json.loads(said.out)["notes"]
+    wrong = {
+        "glossysynthetic": "bell has 7 training views, not 96; 1 views left out, not 32; 2 views in corridor, not 16",
+        "tensoir": "lego has 6 training views, not 100; 2 views left out, not 200",
+        "stanford-orb": "teapot_scene001 has 1 other scenes, not 2",
+        "shiny-blender": "toaster has 8 training views, not 100; 3 views left out, not 200",
+    }[protocol]
+    assert any(note.startswith(wrong) for note in notes) and wrong in said.err
+
+
+def test_counts_that_are_as_published_and_objects_of_the_tables_are_not_told():
+    for protocol in PROTOCOLS.values():
+        assert not differences("one", dict(protocol.expected), protocol) and protocol.expected
+        assert not strangers(protocol.objects, protocol)
+
+
+def test_objects_that_the_tables_have_not_are_told(maker, sets, tmp_path, capsys):
+    shutil.copytree(sets["shiny-blender"] / "toaster", tmp_path / "chair")
+    words = ["--protocol", "shiny-blender", str(maker.file), str(tmp_path), "--objects", "chair", "--json"]
+    assert main(["evaluate", *words, "--samples", "1", "--most-views", "1"]) == 0
+    said = capsys.readouterr()
+    assert "published means are without chair" in said.err
+    assert "published means are without chair" in json.loads(said.out)["notes"]
 
 
 def test_the_capture_of_stanford_orb_is_one_that_is_read(sets):
@@ -231,7 +377,7 @@ DAMAGE = [
     ("glossysynthetic", "glossy_relight/relight_gt/bell_neon/1.png", "opaque", "1.png: has no alpha"),
     ("glossysynthetic", "glossy_relight/relight_gt/bell_neon/1.png", "other size", "1.png: is 20 x 70 pixels"),
     ("tensoir", "lego/test_001/rgba_city.png", None, "rgba_city.png"),
-    ("tensoir", "lego/test_001/albedo.png", None, "1 of 16 images that are not there: test_001/albedo.png"),
+    ("tensoir", "lego/test_001/albedo.png", None, "1 of 30 images that are not there: test_001/albedo.png"),
     ("tensoir", "lego/test_000/normal.png", "text", "normal.png: is no image"),
     ("tensoir", "lego/test_000/metadata.json", "text", "metadata.json: is not JSON"),
     ("tensoir", "env/high_res_envmaps_2k/night.exr", None, "light night: is not there"),
@@ -247,6 +393,22 @@ DAMAGE = [
     ("stanford-orb", "blender_HDR/teapot_scene001/transforms_novel.json", "json", "does not describe cameras"),
     ("stanford-orb", "ground_truth/teapot_scene002/env_map/0000.exr", None, "env_map/0000.exr: is not there"),
     ("stanford-orb", "ground_truth/teapot_scene001/surface_normal/0000.npy", "text", "0000.npy: holds no map"),
+    ("stanford-orb", "ground_truth/teapot_scene001/surface_normal/0000.npy", "nothing", "0000.npy: holds no map"),
+    ("stanford-orb", "ground_truth/teapot_scene001/z_depth/0001.npy", "npz", "0001.npy: holds no map"),
+    ("stanford-orb", "ground_truth/teapot_scene001/z_depth/0000.npy", "cut", "0000.npy: holds no map"),
+    ("stanford-orb", "ground_truth/teapot_scene001/z_depth/0001.npy", (40, 40, 3), "an array of shape (40, 40, 3)"),
+    ("stanford-orb", "ground_truth/teapot_scene001/surface_normal/0001.npy", (4800,), "an array of shape (4800,)"),
+    ("stanford-orb", "ground_truth/teapot_scene001/surface_normal/0001.npy", (0, 0, 3), "0001.npy: holds no map"),
+    ("stanford-orb", "ground_truth/teapot_scene001/surface_normal/0001.npy", (40, 30, 3), "is 30 x 40 pixels, its"),
+    ("stanford-orb", "ground_truth/teapot_scene001/z_depth/0000.npy", (20, 20), "is 20 x 20 pixels, its picture 40"),
+    ("stanford-orb", "ground_truth/teapot_scene001/pseudo_gt_albedo/0000.png", "other size", "is 20 x 70 pixels, its"),
+    (
+        "stanford-orb",
+        "blender_HDR/teapot_scene001/test/0001.exr",
+        (40, 30, 3),
+        "0001.exr: is 30 x 40 pixels, not square",
+    ),
+    ("stanford-orb", "ground_truth/teapot_scene002/env_map/0000.exr", "text", "env_map/0000.exr: is damaged"),
     ("shiny-blender", "toaster/transforms_test.json", None, "transforms_test.json: is not there"),
     ("shiny-blender", "toaster/test/r_1.png", None, "r_1"),
     ("shiny-blender", "toaster/test/r_1_normal.png", None, "r_1_normal.png"),
@@ -259,9 +421,18 @@ def test_what_is_missing_or_damaged_is_named(protocol, what, how, said, maker, s
     shutil.copytree(sets[protocol], root)
     path = root / what
     opaque = Image.open(path).convert("RGB") if how == "opaque" else None
+    half = path.read_bytes()[: path.stat().st_size // 2] if how == "cut" else b""
     shutil.rmtree(path) if path.is_dir() else path.unlink()
     if how == "empty":
         path.mkdir()
+    elif how in ("cut", "nothing"):
+        path.write_bytes(half)
+    elif how == "npz":
+        with path.open("wb") as file:
+            np.savez(file, depth=np.ones((40, 40), np.float32))
+    elif isinstance(how, tuple):
+        values = np.ones(how, np.float32)
+        published_sets.exr(path, values) if path.suffix == ".exr" else np.save(path, values)
     elif how in ("text", "json"):
         path.write_text("{}" if how == "json" else "nothing")
     elif how == "opaque":
@@ -286,6 +457,97 @@ def test_a_damaged_object_does_not_keep_the_others_from_being_scored(maker, sets
     report = json.loads(said.out)
     assert list(report["objects"]) == ["toaster"] and "r_1.png" in report["failed"]["ball"]
     assert "ball is not scored" in said.err and "ball" in report["missing"]
+
+
+def several(sets: dict[str, Path], root: Path, assets: Path, file: Path) -> list[str]:
+    """Words that score two objects of Shiny Blender, ball and toaster, with the asset `file`."""
+    assets.mkdir(exist_ok=True)
+    for name in ("ball", "toaster"):
+        shutil.copytree(sets["shiny-blender"] / "toaster", root / name)
+        shutil.copy(file, assets / f"{name}.drgs")
+    return ["--protocol", "shiny-blender", "--samples", "1", "--most-views", "1", "--json"]
+
+
+@pytest.mark.parametrize(("how", "said"), [("damaged", "ball.drgs"), ("no light", "no light of its own")])
+def test_an_asset_that_cannot_be_used_does_not_keep_the_others_from_being_scored(
+    how, said, maker, sets, tmp_path, capsys
+):
+    words = several(sets, tmp_path / "set", tmp_path / "assets", maker.file)
+    bad = tmp_path / "assets" / "ball.drgs"
+    if how == "damaged":
+        bad.write_bytes(bad.read_bytes()[:500])
+    else:
+        asset = read_asset(bad)
+        asset.environment = None
+        write_asset(bad, asset)
+    assert main(["evaluate", *words, str(tmp_path / "assets"), str(tmp_path / "set")]) == 65
+    report = json.loads(capsys.readouterr().out)
+    assert list(report["objects"]) == ["toaster"] and said in report["failed"]["ball"]
+
+
+def reconstructions(monkeypatch, file: Path) -> list:
+    """Puts the asset `file` in the place of what is reconstructed; the captures of which it is asked for."""
+    asked = []
+
+    def reconstruct(capture, *_):
+        asked.append(capture)
+        return read_asset(file)
+
+    monkeypatch.setattr("drgs_blender.reconstruct.pipeline.reconstruct", reconstruct)
+    return asked
+
+
+def test_photographs_that_cannot_be_learned_from_do_not_keep_the_others_from_being_scored(
+    maker, sets, tmp_path, capsys, monkeypatch
+):
+    words = several(sets, tmp_path / "set", tmp_path / "assets", maker.file)
+    bad = tmp_path / "set" / "ball" / "train" / "r_2.png"
+    bad.write_bytes(bad.read_bytes()[:200])
+    asked = reconstructions(monkeypatch, maker.file)
+    assert main(["evaluate", *words, str(tmp_path / "set"), "--out", str(tmp_path / "new")]) == 65
+    report = json.loads(capsys.readouterr().out)
+    assert [capture.source.name for capture in asked] == ["toaster"]
+    assert list(report["objects"]) == ["toaster"] and "r_2.png" in report["failed"]["ball"]
+
+
+def test_assets_of_a_try_are_told_when_they_are_used_again(maker, sets, tmp_path, capsys, monkeypatch):
+    asked = reconstructions(monkeypatch, maker.file)
+    words = ["--protocol", "shiny-blender", str(sets["shiny-blender"]), "--out", str(tmp_path), "--samples", "1"]
+    words += ["--json", "--most-views", "1"]
+    told = []
+    for more in (["--resolution", "32", "--set", "schedule.iterations=7"], [], ["--set", "schedule.iterations=7"]):
+        assert main(["evaluate", *words, *more]) == 0
+        said = capsys.readouterr()
+        told.append((said.err, "; ".join(json.loads(said.out)["notes"])))
+    assert len(asked) == 1 and max(view.camera.width for view in asked[0].views) == 32
+    assert not any("other settings" in text for text in told[0])
+    assert all("made with other settings (capture.resolution, schedule.iterations)" in text for text in told[1])
+    assert all("made with other settings (capture.resolution)" in text for text in told[2])
+    write_asset(tmp_path / "toaster.drgs", read_asset(maker.file))
+    assert main(["evaluate", *words]) == 0
+    assert "settings that it does not keep" in capsys.readouterr().err
+
+
+def test_the_asset_keeps_the_size_at_which_stanford_orb_is_read(maker, sets, tmp_path, capsys, monkeypatch):
+    reconstructions(monkeypatch, maker.file)
+    words = ["--protocol", "stanford-orb", str(sets["stanford-orb"]), "--objects", "teapot_scene001"]
+    assert main(["evaluate", *words, "--out", str(tmp_path), "--samples", "1", "--most-views", "1"]) == 0
+    kept = inspect_asset(tmp_path / "teapot_scene001.drgs")["provenance"]["settings"]
+    assert kept["capture"]["resolution"] == 512
+
+
+@pytest.mark.parametrize("given", ["axes=opencv", "up=y", "test_every=5"])
+def test_settings_of_reading_that_the_set_says_are_refused(given, sets, tmp_path, capsys):
+    words = ["--protocol", "shiny-blender", sets["shiny-blender"], "--out", tmp_path / "out"]
+    said = refused(capsys, 64, *words, "--set", f"capture.{given}")
+    assert f"capture.{given.split('=')[0]}: has no effect with --protocol" in said
+
+
+def test_without_pytorch_it_is_said_before_anything_else(sets, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, "drgs_blender.reconstruct.pipeline", raising=False)
+    said = refused(capsys, 69, "--protocol", "shiny-blender", sets["shiny-blender"], "--out", tmp_path / "out")
+    assert "reconstruct: needs PyTorch" in said
 
 
 def test_maps_that_a_set_lacks_are_told_and_the_rest_is_scored(maker, sets, tmp_path, capsys):
@@ -313,6 +575,11 @@ def test_what_cannot_be_scored_is_refused(maker, sets, tmp_path, capsys):
     assert "has no toaster.drgs" in refused(capsys, 65, *words, tmp_path / "empty", root)
     for option in (["--lights-from", tmp_path], ["--set", "variant=m"], ["--test-every", "3"], ["--axes", "opencv"]):
         assert f"{option[0]}: has no effect" in refused(capsys, 64, *words, maker.file, root, *option)
+    of_scenes = {"--lights": "x", "--small": None, "--size": 32, "--train": 4, "--test": 4, "--spp": 1}
+    for option, value in (of_scenes | {"--meshes": tmp_path, "--blender": "x"}).items():
+        given = [option] if value is None else [option, value]
+        assert f"{option}: has no effect" in refused(capsys, 64, maker.file, root, *words, *given)
+    assert "--most-views: is an option of --protocol" in refused(capsys, 64, maker.file, root, "--most-views", 0)
     assert "--most-views: is 0" in refused(capsys, 64, *words, maker.file, root, "--most-views", 0)
     assert "--most-views: is an option of --protocol" in refused(capsys, 64, maker.file, root, "--most-views", 2)
     assert "--out: is an option of --protocol" in refused(capsys, 64, "--make-scenes", tmp_path, "--out", tmp_path)
@@ -365,5 +632,17 @@ def test_assets_are_reconstructed_where_they_are_not_yet(sets, tmp_path, capsys)
     assert "made with other settings" in capsys.readouterr().err
 
 
-def test_own_light_is_the_training_light(maker):
-    assert isinstance(read_asset(maker.file).environment, Environment)
+def test_the_own_light_is_that_of_the_asset(maker, sets):
+    """Views left out are rendered under it, relit pictures under those of the set."""
+    asset, shown = read_asset(maker.file), []
+    asset.environment = Environment(light(77))
+
+    def render(camera, radiance, factors):
+        shown.append(radiance)
+        return maker.render(camera.matrix_world, radiance)
+
+    bench = Bench(asset, render, most_views=1)
+    assert bench.own_light() is asset.environment.radiance
+    PROTOCOLS["glossysynthetic"].measure(bench, sets["glossysynthetic"], "bell", None)
+    expected = [light(77), light(10), light(11), light(12)]  # corridor, golf, neon
+    assert len(shown) == 4 and all(np.allclose(one, other, rtol=2e-3) for one, other in zip(shown, expected))

@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("torch")
 
 from capture_cases import balls, write
+from published_sets import light, object_asset
 
 from drgs_blender.cli.main import main
 from drgs_blender.core.asset.container import inspect_asset, read_asset
@@ -119,6 +120,10 @@ def test_what_is_printed_can_be_given_again(tmp_path, capsys):
         ('fixed=["tint"]', '''is 'tint', not "offset" or "opacity"'''),
         ("schedule=5", "schedule: is no setting"),
         ("variant", "is not NAME=VALUE"),
+        (f"decoupling.rate=1{400 * '0'}", "not a number of at least 0"),
+        (f"schedule.iterations=0x{4000 * 'f'}", "is too long to be shown, not a whole number from 1"),
+        (f"schedule.densify=[0.5, 1{400 * '0'}]", "not a number from 0 to 1"),
+        (f"schedule.densify={3000 * '['}0{3000 * ']'}", "..., not a list of 2"),
     ],
 )
 def test_what_cannot_be_used_is_refused_with_what_may_be(capsys, given, said):
@@ -142,6 +147,9 @@ def test_contradictions_are_refused(capsys):
         (b"[schedul]\niterations = 5", "the nearest is schedule.iterations"),
         (b"[schedule.iterations]\nx = 5", "schedule.iterations.x: is no setting"),
         (b"[schedule]\niterations = 2024-01-01", "not a whole number"),
+        (b"schedule.iterations = 1" + 400 * b"0", "not a whole number from 1"),
+        (b"fixed = " + 3000 * b"[" + 3000 * b"]", "is not TOML"),
+        (3000 * b"a." + b"b = 1", "is not TOML"),
         (b"#" * ((1 << 20) + 1), "more than"),
     ],
 )
@@ -182,6 +190,32 @@ def test_the_asset_keeps_its_settings_and_a_run_can_be_repeated_from_it(tmp_path
 
     write_asset(second, asset)
     assert "holds no settings" in refused(capsys, "--config", str(second))
+
+
+def test_masks_are_a_setting_that_the_asset_keeps(tmp_path, capsys, monkeypatch):
+    photographs, modes = tmp_path / "balls", []
+    photographs.mkdir()
+    write(balls(8, 32), photographs)
+    asset = object_asset(light(1))
+    asset.provenance["report"] = {}
+    monkeypatch.setattr("drgs_blender.reconstruct.pipeline.reconstruct", lambda *_: asset)
+    monkeypatch.setattr("drgs_blender.capture.masks.of_capture.mask_capture", lambda _, mode, *__: modes.append(mode))
+    words = ["reconstruct", str(photographs), "--out", str(tmp_path / "a.drgs")]
+    assert main([*words, "--masks", "none"]) == 0
+    again = ["reconstruct", str(photographs), "--out", str(tmp_path / "b.drgs"), "--config", str(tmp_path / "a.drgs")]
+    assert main(again) == 0 and main([*again, "--masks", "auto"]) == 0 and main(words) == 0
+    assert modes == ["none", "none", "auto", "given"]
+    # Of photographs without cameras, too.
+    for file in photographs.glob("*.json"):
+        file.unlink()
+
+    def capture(_, __, settings, *rest):
+        modes.append(settings.masks)
+        raise UsageError("capture", "is not made")
+
+    monkeypatch.setattr("drgs_blender.capture.pipeline.make_capture", capture)
+    monkeypatch.setattr("drgs_blender.capture.pictures.has_pictures", lambda _: True)
+    assert main([*words, "--set", "capture.masks=auto"]) == 64 and modes[4:] == ["auto"]
 
 
 def test_settings_of_python_are_checked_too():

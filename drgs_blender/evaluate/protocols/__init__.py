@@ -51,6 +51,10 @@ class Protocol:
     check : callable
         (folder of the set, object, folder of the lights or None): raises AssetError where a file that is measured by is
         not there, before hours of work.
+    counts : callable
+        (folder of the set, object) -> how many views there are of each kind.
+    expected : dict of str to int
+        How many the published set has.
     measure : callable
         (bench, folder of the set, object, folder of the lights or None) -> figures of the object, nested by name.
     columns : tuple of Column
@@ -58,6 +62,8 @@ class Protocol:
         How many lights an object is rendered under, its own and others, or groups of them.
     lights : bool
         Its light files may lie in another folder.
+    side : int, optional
+        Pixels of the longer side that are read where none are asked for; None: all.
     about : str
         What is measured how, for the user; and what the published tables have that is left out.
     """
@@ -67,10 +73,13 @@ class Protocol:
     folder: Callable[[Path, str], Path]
     read: Callable[[Path, str, int | None], Capture]
     check: Callable[[Path, str, Path | None], object]
+    counts: Callable[[Path, str], dict[str, int]]
+    expected: dict[str, int]
     measure: Callable[[Bench, Path, str, Path | None], dict[str, Any]]
     columns: tuple[Column, ...]
     parts: int
     lights: bool
+    side: int | None
     about: str
 
 
@@ -91,8 +100,8 @@ def _hdr_pictures(part: str, title: str) -> tuple[Column, ...]:
 def _of(module: Any, columns: tuple[Column, ...], parts: int, lights: bool, about: str) -> Protocol:
     """The protocol of a module, which is named as it is but for underscores."""
     name = module.__name__.rpartition(".")[2].replace("_", "-")
-    functions = module.folder, module.read, module.check, module.measure
-    return Protocol(name, module.OBJECTS, *functions, columns, parts, lights, about)
+    functions = module.folder, module.read, module.check, module.counts, module.COUNTS, module.measure
+    return Protocol(name, module.OBJECTS, *functions, columns, parts, lights, getattr(module, "SIDE", None), about)
 
 
 #: The table, by name.
@@ -140,8 +149,8 @@ PROTOCOLS: dict[str, Protocol] = {
             (*_pictures("views", "Views"), Column("shape.normal_degrees", "Normals MAE")),
             1,
             False,
-            "Shiny Blender (Ref-NeRF): views over the whole frame on white, normals weighted by alpha. Relit pictures "
-            "are left out: the set has none, tables with them render their own",
+            "Shiny Blender (Ref-NeRF): views over the whole frame on white, normals weighted by coverage and alpha. "
+            "Relit pictures are left out: the set has none, tables with them render their own",
         ),
     )
 }

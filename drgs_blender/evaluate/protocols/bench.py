@@ -132,6 +132,12 @@ def eight_bits(picture: Array) -> Array:
     return np.round(np.clip(picture, 0, 1) * 255) / 255
 
 
+def split_counts(layout: Layout) -> dict[str, int]:
+    """How many views of a capture are for training, and how many are left out."""
+    left_out = sum(photograph.test for photograph in layout.photographs)
+    return {"training views": len(layout.photographs) - left_out, "views left out": left_out}
+
+
 def mean_of(rows: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
     """Mean of each figure over the rows; None where one has none."""
     found: dict[str, float | None] = {}

@@ -20,9 +20,11 @@ from ...reconstruct.capture.capture import Capture, View
 from ...reconstruct.readers import read_capture, transforms
 from ...reconstruct.readers.layout import Layout, complain_of_missing
 from ...reconstruct.readers.photograph_loading import shrink
-from .bench import Array, Bench, existing, mean_of, shown_on_white
+from .bench import Array, Bench, existing, mean_of, shown_on_white, split_counts
 
 OBJECTS = ("ball", "car", "coffee", "helmet", "teapot", "toaster")
+#: Views of the published set.
+COUNTS = {"training views": 100, "views left out": 200}
 
 
 def folder(root: Path, name: str) -> Path:
@@ -47,6 +49,11 @@ def check(root: Path, name: str, lights: Path | None) -> Layout:
     return layout
 
 
+def counts(root: Path, name: str) -> dict[str, int]:
+    """How many views there are."""
+    return split_counts(transforms.read(folder(root, name)))
+
+
 def _normals(image: Path) -> Path:
     return image.with_name(f"{image.stem}_normal.png")
 
@@ -63,17 +70,19 @@ def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[st
         ours = shown_on_white(passes)
         bench.show("views", number, ours, view.colour)
         rows.append(bench.scores(ours, view.colour))
-        angles.append({"normal_degrees": _normal_error(passes["Normal"], images[view.name], view)})
+        angles.append({"normal_degrees": _normal_error(passes, images[view.name], view)})
     return {"views": mean_of(rows), "shape": mean_of(angles)}
 
 
-def _normal_error(normals: Array, image: Path, view: View) -> float:
-    """Mean angle in degrees, weighted by alpha; where there is no normal of ours, 90."""
+def _normal_error(passes: dict[str, Array], image: Path, view: View) -> float:
+    """Mean angle in degrees, weighted by the coverage of ours times the true alpha; NaN where all of that is zero."""
     true = 2 * shrink(to_unit(load_image(_normals(image)))[..., :3], view.camera.width, view.camera.height) - 1
     if view.mask is None:
         raise AssetError(str(image), "has no alpha", "Use the set's own files")
-    ours = np.nan_to_num(normals)
+    ours = np.nan_to_num(passes["Normal"])
     lengths = np.linalg.norm(ours, axis=-1) * np.linalg.norm(true, axis=-1)
     cosine = (ours * true).sum(axis=-1) / np.maximum(lengths, 1e-8)
     angles = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    return float((angles * view.mask).sum() / max(view.mask.sum(), 1e-8))
+    weights = np.clip(passes["Coverage"][..., 0], 0, 1) * view.mask
+    total = float(weights.sum(dtype=np.float64))
+    return float((angles * weights).sum(dtype=np.float64) / total) if total > 0 else float("nan")

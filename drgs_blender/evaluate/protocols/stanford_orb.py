@@ -46,6 +46,8 @@ OBJECTS = tuple(
 )  # fmt: skip
 #: Pixels of a side at which the benchmark measures.
 SIDE = 512
+#: Each object is relit as in its two other scenes; how many views there are differs.
+COUNTS = {"other scenes": 2}
 _REMEDY = "Unpack blender_HDR and ground_truth of the set again"
 
 
@@ -129,6 +131,11 @@ def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[st
     return report
 
 
+def counts(root: Path, name: str) -> dict[str, int]:
+    """How many scenes there are of which there are novel pictures."""
+    return {"other scenes": len({frame.truth for frame in frames(root, name, "novel")})}
+
+
 def frames(root: Path, name: str, split: str) -> list[Frame]:
     """The pictures of transforms_SPLIT.json of a capture, in the order of the file.
 
@@ -185,6 +192,9 @@ def _pictures(bench: Bench, part: str, found: list[Frame]) -> Iterator[tuple[int
         bench.progress(part, number, len(chosen))
         side = bench.resolution or SIDE
         picture = _shrunk(_exr(frame.image), side)
+        if picture.shape[0] != picture.shape[1]:
+            problem = f"is {picture.shape[1]} x {picture.shape[0]} pixels, not square"
+            raise AssetError(str(frame.image), problem, _REMEDY)
         mask = _shrunk(_grey(load_image(frame.mask)), side)[..., 0]
         if mask.shape != picture.shape[:2]:
             problem = (
@@ -232,11 +242,14 @@ def _array(path: Path, side: int, channels: int) -> Array | None:
     if not path.is_file():
         return None
     try:
-        values = np.load(path, allow_pickle=False)
-        shaped = np.asarray(values, np.float32).reshape(*values.shape[:2], channels)
-    except (OSError, ValueError) as error:
+        values = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped, the file must be as long as it says
+    except Exception as error:  # damaged files raise almost anything
         raise AssetError(str(path), f"holds no map ({error})", _REMEDY) from error
-    return _shrunk(shaped, side)
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu":
+        raise AssetError(str(path), "holds no map (no array of numbers)", _REMEDY)
+    if values.ndim not in (2, 3) or not values.size or values[0, 0].size != channels:
+        raise AssetError(str(path), f"holds no map (an array of shape {values.shape})", _REMEDY)
+    return _fitting(np.array(values, np.float32).reshape(*values.shape[:2], channels), path, side)
 
 
 def _albedo(path: Path, side: int) -> Array | None:
@@ -244,4 +257,12 @@ def _albedo(path: Path, side: int) -> Array | None:
     if not path.is_file():
         return None
     image = load_image(path)
-    return _shrunk(image[..., :3].astype(np.float32) / np.float32(np.iinfo(image.dtype).max), side)
+    return _fitting(image[..., :3].astype(np.float32) / np.float32(np.iinfo(image.dtype).max), path, side)
+
+
+def _fitting(image: Array, path: Path, side: int) -> Array:
+    """The map in the size of its picture, (n, n, c). Raises AssetError where it is not of its shape, or smaller."""
+    if (small := _shrunk(image, side)).shape[:2] != (side, side):
+        problem = f"is {image.shape[1]} x {image.shape[0]} pixels, its picture {side} x {side}"
+        raise AssetError(str(path), problem, _REMEDY)
+    return small

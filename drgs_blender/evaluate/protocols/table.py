@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,12 @@ from . import Protocol
 
 
 def complete(
-    report: dict[str, Any], protocol: Protocol, network: str, most_views: int | None, resolution: int | None
+    report: dict[str, Any],
+    protocol: Protocol,
+    network: str,
+    most_views: int | None,
+    resolution: int | None,
+    notes: Sequence[str] = (),
 ) -> dict[str, Any]:
     """The report with the means over the objects and notes on how it differs from published tables.
 
@@ -24,6 +30,8 @@ def complete(
         Of LPIPS, "" where it is not computed.
     most_views, resolution : int, optional
         As given by the user.
+    notes : sequence of str
+        Others.
     """
     report = _without_nan(report)
     rows = list(report["objects"].values())
@@ -33,7 +41,7 @@ def complete(
         numbers = [value for value in values if value is not None]
         _put(means, column.path, float(np.mean(numbers)) if numbers and len(numbers) == len(values) else None)
     missing = [name for name in protocol.objects if name not in report["objects"]]
-    notes = []
+    notes = list(notes)
     if missing:
         notes.append(f"the mean is of {len(rows)} objects; published ones have {first_of(missing)}, too")
     if most_views is not None:
@@ -47,6 +55,18 @@ def complete(
         "about": protocol.about,
         "notes": notes,
     }
+
+
+def differences(name: str, found: dict[str, int], protocol: Protocol) -> list[str]:
+    """What an object has more or less of than in the published set, as "bell has 8 training views, not 96"."""
+    wrong = [f"{found[kind]} {kind}, not {count}" for kind, count in protocol.expected.items() if found[kind] != count]
+    return [f"{name} has {'; '.join(wrong)}"] if wrong else []
+
+
+def strangers(names: Sequence[str], protocol: Protocol) -> list[str]:
+    """A note on objects that the published tables have not."""
+    found = [name for name in names if name not in protocol.objects]
+    return [f"published means are without {first_of(found)}"] if found else []
 
 
 def figure(row: dict[str, Any], path: str) -> float | None:

@@ -23,12 +23,16 @@ from ...reconstruct.readers import read_capture, tensoir
 from ...reconstruct.readers.layout import complain_of_missing
 from ...reconstruct.readers.photograph_loading import shrink
 from ..metrics import psnr
-from .bench import Array, Bench, existing, find_light, mean_of, read_light, shown_on_white
+from .bench import Array, Bench, existing, find_light, mean_of, read_light, shown_on_white, split_counts
 
 OBJECTS = ("armadillo", "ficus", "hotdog", "lego")
 LIGHTS = ("bridge", "city", "fireplace", "forest", "night")
 #: Views whose albedo gives the factors.
 ALBEDO_VIEWS = 20
+#: The light of the pictures to learn from; with rotated lights, that which is not rotated.
+OWN = ("sunset", "sunset_000")
+#: Views of the published set.
+COUNTS = {"training views": 100, "views left out": 200}
 _PLACES = ("env", "Environment_Maps", "environment_maps", ".")
 _SIZES = ("high_res_envmaps_2k", "high_res_envmaps_1k", ".")
 
@@ -41,26 +45,39 @@ def folder(root: Path, name: str) -> Path:
 
 def read(root: Path, name: str, resolution: int | None) -> Capture:
     """The capture to learn from: the training views under the training light."""
-    return read_capture(folder(root, name), resolution)
+    return read_capture(folder(root, name), resolution, light=_own(folder(root, name)))
 
 
 def check(root: Path, name: str, lights: Path | None) -> dict[str, Path]:
-    """File of each light. Raises AssetError where one, or a file of a test view, is not there."""
+    """File of each light. Raises AssetError where one, or a file of a view, is not there."""
     source = existing(folder(root, name), f"photographs of {name}")
     views = sorted(path.name for path in source.glob("test_*") if path.is_dir())
     if not views:
         raise AssetError(str(source), "has no test_000, test_001, ...", "Unpack the set again")
-    names = ("metadata.json", "albedo.png", "normal.png", *(f"rgba_{light}.png" for light in LIGHTS))
+    own = ("metadata.json", f"rgba_{_own(source)}.png")
+    names = (*own, "albedo.png", "normal.png", *(f"rgba_{light}.png" for light in LIGHTS))
     files = [f"{view}/{file}" for view in views for file in names]
+    files += [f"{path.name}/{file}" for path in sorted(source.glob("train_*")) if path.is_dir() for file in own]
     complain_of_missing(str(source), [file for file in files if not (source / file).is_file()], len(files))
     places = [lights] if lights else [root / place / size for place in _PLACES for size in _SIZES]
     return {light: find_light(places, light) for light in LIGHTS}
 
 
+def _own(source: Path) -> str:
+    """The one of `OWN` that the views have."""
+    return next((light for light in OWN if any(source.glob(f"*/rgba_{light}.png"))), OWN[0])
+
+
+def counts(root: Path, name: str) -> dict[str, int]:
+    """How many views there are."""
+    source = folder(root, name)
+    return split_counts(tensoir.read(source, _own(source)))
+
+
 def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[str, Any]:
     """Figures of an object."""
     files, source = check(root, name, lights), folder(root, name)
-    layout = tensoir.read(source)
+    layout = tensoir.read(source, _own(source))
     testing = [photograph for photograph in layout.photographs if photograph.test]
     bench.warn_of_known([photograph.name for photograph in testing], name)
     rows, angles, albedos, pixels = [], [], [], 0

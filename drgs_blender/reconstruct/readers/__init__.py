@@ -109,6 +109,7 @@ def read_capture(
     _check_memory(layout, resolution, path)
     known: dict[Lens, tuple[Lens, np.ndarray]] = {}
     views = usable([(p, load_photograph(p, layout, resolution, known)) for p in photographs], str(path))
+    _tell_notes(layout, path)
     if all(view.mask is None for view in views) and cut_out(views):
         logger.warning(
             "%s: has no masks; what differs from the colour of the pictures' borders is taken for the object. "
@@ -127,6 +128,13 @@ def read_capture(
         check_overlap(learned, str(path))
     points = None if layout.points is None else (layout.points @ turn[:3, :3].T).astype(np.float32)
     return Capture(path, views, find_background(views), points)
+
+
+def _tell_notes(layout: Layout, path: Path) -> None:
+    """Warn once of photographs that are used otherwise than they are stored."""
+    if layout.notes:
+        (image, note), count = layout.notes[0], len({image for image, _ in layout.notes})
+        logger.warning("%s: of %d pictures not all is used as stored, as of %s: %s", path, count, image.name, note)
 
 
 def find_layout(path: Path) -> Reader:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -83,12 +83,15 @@ class Layout:
         Sparse points in the capture's world.
     decode_mask : callable
         Reads a mask file to (h, w) float32 in 0..1.
+    notes : list of (Path, str)
+        What was changed of photographs when they were read, filled as they are.
     """
 
     photographs: list[Photograph]
     upright: bool
     points: Array | None = None
     decode_mask: Callable[[Path], Array] = decode_mask
+    notes: list[tuple[Path, str]] = field(default_factory=list)
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -165,9 +168,18 @@ def find_picture(stem: Path) -> Path | None:
     return next((found for end in ends if os.path.isfile(found := stem.with_name(stem.name + end))), None)
 
 
-def load_picture(path: Path) -> Array:
-    """(h, w, c) pixels of a photograph: whole numbers are sRGB-encoded, floats linear. Raises AssetError."""
-    return read_exr(path)[0] if path.suffix.lower() == EXR else load_image(path)
+def load_picture(path: Path) -> tuple[Array, list[str]]:
+    """((h, w, c) pixels of a photograph, notes): whole numbers are sRGB-encoded, floats linear. Raises AssetError.
+
+    Alpha is straight, as in PNG.
+    """
+    if path.suffix.lower() != EXR:
+        return load_image(path), []
+    pixels, _, notes = read_exr(path, alpha=True)
+    if pixels.shape[2] == 4:
+        cover = np.clip(pixels[..., 3:], 0, 1)
+        pixels = np.concatenate([pixels[..., :3] / np.where(cover > 0, cover, 1), cover], axis=2)
+    return pixels, notes
 
 
 def picture_size(path: Path) -> tuple[int, int]:

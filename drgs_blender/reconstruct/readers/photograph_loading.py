@@ -51,7 +51,9 @@ def load_photograph(
         The file cannot be decoded; photograph, mask and calibration have different shapes; too few pixels.
     """
     subject = str(photograph.image)
-    pixels = _shown(load_picture(photograph.image))
+    stored, notes = load_picture(photograph.image)
+    layout.notes += [(photograph.image, note) for note in notes]
+    pixels = _shown(stored)
     height, width = pixels.shape[:2]
     lens = _fitting(photograph.lens, width, height, subject)
     mask = _mask(photograph, layout, pixels)
