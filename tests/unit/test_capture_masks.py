@@ -32,7 +32,7 @@ def cv2(monkeypatch):
     from drgs_blender.capture.masks.learned_scene import Effort
 
     # small, for speed
-    monkeypatch.setattr(making, "EFFORTS", (Effort(64, 150, 5000, 60.0), Effort(96, 400, 6000, 120.0)))
+    monkeypatch.setattr(making, "EFFORTS", (Effort(64, 150, 5000), Effort(96, 400, 6000)))
     monkeypatch.setattr(making, "PART", 150)
     monkeypatch.setattr(stage, "_WHOLE", 160)
     return module
@@ -128,6 +128,9 @@ def test_masks_of_a_ball_on_a_pattern(cv2, tmp_path, points):
     assert not any(fit.doubtful for fit in masked.fits) and (tmp_path / "sheet.png").is_file()
     scores = [iou(np.asarray(Image.open(pictures[v.name].mask)) > 127, mask) for v, mask in zip(views, true)]
     assert np.mean(scores) > 0.92 and min(scores) > 0.85
+    first = {name: picture.mask.read_bytes() for name, picture in pictures.items()}
+    run(tmp_path, "auto", found, pictures)
+    assert first == {name: picture.mask.read_bytes() for name, picture in pictures.items()}
 
 
 def test_straightening_and_distorting_are_inverse():
@@ -198,6 +201,45 @@ def test_a_scene_without_surfels_of_its_own_has_no_object_and_a_flat_object_has_
     assert -0.051 < found.low[2] < -0.049 and found.high[2] > 0
     scene.parameters["opacity"].data.fill_(-10.0)
     assert not cut_object(scene, found).surfels.any()
+
+
+def test_learning_begins_with_a_limited_number_of_surfels():
+    pytest.importorskip("torch")
+    from drgs_blender.capture.masks.learned_scene import first_surfels
+    from drgs_blender.reconstruct.capture.capture import View
+
+    views = [View(view.name, view.pinhole(160), view.pixels / np.float32(255)) for view in scene(5)[0]]
+    many = strewn([-0.1, -0.1, 0], [0.1, 0.1, 0.2], 50000)
+    small = ObjectBox(MIDDLE - 0.16, MIDDLE + 0.16, many)
+    begun = first_surfels(views, small)
+    without = first_surfels(views, ObjectBox(small.low, small.high, np.zeros((0, 3))))
+    assert len(without) + 3000 == len(begun)
+    again = first_surfels(views, small)
+    np.testing.assert_array_equal(begun.centres().detach().numpy(), again.centres().detach().numpy())
+    # those that are known of the object take the place of sparse points
+    assert len(first_surfels(views, small, begun)) == len(without) + len(begun)
+    assert len(first_surfels(views, ObjectBox(small.low - 3, small.high + 3, np.zeros((0, 3))))) < 24000
+
+
+def test_what_is_behind_a_view_counts_in_its_error_and_moves_with_it():
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("warp")
+    from drgs_blender.reconstruct.backend import CPU
+    from drgs_blender.reconstruct.capture.training_views import Target
+    from drgs_blender.reconstruct.gpu.warp_backend import WarpLearningBackend
+    from drgs_blender.reconstruct.model.gaussians import Gaussians
+    from drgs_blender.reconstruct.optim.learner import Learner
+    from drgs_blender.reconstruct.optim.schedule import Schedule
+
+    view = photograph(0, 4)[0]
+    shown = torch.from_numpy(view.pixels / np.float32(255))
+    target = Target(view.pinhole(160), shown, None, shown)
+    backend = WarpLearningBackend.__new__(WarpLearningBackend)
+    backend.device = torch.device("meta")
+    assert backend.bring(target).background.device.type == "meta"
+    out_of_sight = Gaussians.on_surface(np.array([[0, 0, 9.0]]), np.eye(3)[2:], np.ones((1, 3)), 0.01, 0)
+    learner = Learner(out_of_sight, Schedule(reflections=1.0), 1.0, torch.zeros(3), CPU)
+    assert learner.error_of([target]) == 0
 
 
 def test_thin_parts_of_pictures_are_no_windows():

@@ -28,7 +28,7 @@ from .object_surfels import Cut, box_around, cut_object, share_of_object
 logger = logging.getLogger(__name__)
 
 #: First roughly, to find the box around the object; then that.
-EFFORTS = (Effort(160, 300, 16000, 45.0), Effort(256, 900, 20000, 180.0))
+EFFORTS = (Effort(160, 300, 16000), Effort(256, 900, 20000))
 #: Pixels of the longer side of masks, of the part around the object.
 PART = 640
 #: Surfels that an object has at least; views that show it (three
