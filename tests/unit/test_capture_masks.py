@@ -289,6 +289,24 @@ def test_replaced_masks_are_drawn_as_they_are_used(cv2, tmp_path, monkeypatch):
     assert len(drawn) == 1 and np.array_equal(drawn[0][4], made.masks[4])
 
 
+def test_a_view_that_was_not_learned_from_sees_the_object(cv2):
+    from drgs_blender.capture.masks.making import Found
+    from drgs_blender.capture.masks.object_surfels import Cut
+    from drgs_blender.reconstruct.model.gaussians import Gaussians
+
+    normals = ball_points(2000)[:2000] - MIDDLE
+    normals /= RADIUS
+    ball = Gaussians.on_surface(MIDDLE + RADIUS * normals, normals, np.ones_like(normals), 0.006, 0)
+    ball.parameters["opacity"].data.fill_(4.0)
+    box = ObjectBox(MIDDLE - 0.16, MIDDLE + 0.16, np.zeros((0, 3)))
+    found = Found({}, [], [], None, ball, Cut(np.ones(len(normals), bool), 0.0), box)
+    view, true = photograph(3, 12)
+    seen = found.seen_by(cv2, view)
+    assert seen.dtype == np.uint8 and iou(seen > 127, true) > 0.9
+    view.matrix[:3, :3] = view.matrix[:3, :3] @ np.diag([-1.0, 1, -1])  # it looks away
+    assert not found.seen_by(cv2, view).any()
+
+
 def test_specks_and_pinholes_are_no_part_of_a_mask():
     pytest.importorskip("torch")
     from drgs_blender.capture.masks.making import without_specks
