@@ -57,6 +57,14 @@ def complete(folder: Path, digest: str) -> bool:
         return False
 
 
+def known_ground(folder: Path) -> str | None:
+    """What the ground of a capture of ours rests on, as its report says; None of other folders."""
+    try:
+        return str(json.loads((folder / REPORT).read_text(encoding="utf-8"))["ground"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
 def write_capture(
     folder: Path, pictures: dict[str, Picture], found: Registration, said: list[str], more: dict[str, Any]
 ) -> None:

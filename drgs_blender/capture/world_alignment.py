@@ -18,6 +18,8 @@ _LEVEL = 0.766
 _TRIALS, _THICKNESS = 2000, 0.012
 #: Part of the points within a camera's distance that the ground must have; part that may lie below it.
 _GROUND, _BELOW = 0.12, 0.06
+#: What the ground rests on: points on it; nothing but the cameras.
+PLANE, GUESSED = "plane under the object", "what the cameras look at"
 
 
 @dataclass(slots=True)
@@ -116,12 +118,12 @@ def align_to_ground(found: Registration, distance: float | None = None) -> Align
     plane = ground_plane(near, centres, up, away)
     if plane is not None:
         normal, offset = plane
-        up_from = ground_from = "plane under the object"
+        up_from = ground_from = PLANE
     else:
         normal, up_from = up, "how the cameras were held"
         heights = near @ normal
         offset = float(np.quantile(heights, 0.01)) if len(near) >= 20 else float(centre @ normal)
-        ground_from = "lowest points" if len(near) >= 20 else "what the cameras look at"
+        ground_from = "lowest points" if len(near) >= 20 else GUESSED
     scale = (distance or UNKNOWN_DISTANCE) / max(away, 1e-12)
     rotation = _turn_to_z(normal)
     foot = centre - (centre @ normal - offset) * normal

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
@@ -31,7 +32,7 @@ def cv2(monkeypatch):
     from drgs_blender.capture.masks.learned_scene import Effort
 
     # small, for speed
-    monkeypatch.setattr(making, "EFFORTS", (Effort(64, 150, 5000, 60.0), Effort(96, 400, 6000, 120.0)))
+    monkeypatch.setattr(making, "EFFORTS", (Effort(64, 150, 5000), Effort(96, 400, 6000)))
     monkeypatch.setattr(making, "PART", 150)
     monkeypatch.setattr(stage, "_WHOLE", 160)
     return module
@@ -127,6 +128,9 @@ def test_masks_of_a_ball_on_a_pattern(cv2, tmp_path, points):
     assert not any(fit.doubtful for fit in masked.fits) and (tmp_path / "sheet.png").is_file()
     scores = [iou(np.asarray(Image.open(pictures[v.name].mask)) > 127, mask) for v, mask in zip(views, true)]
     assert np.mean(scores) > 0.92 and min(scores) > 0.85
+    first = {name: picture.mask.read_bytes() for name, picture in pictures.items()}
+    run(tmp_path, "auto", found, pictures)
+    assert first == {name: picture.mask.read_bytes() for name, picture in pictures.items()}
 
 
 def test_straightening_and_distorting_are_inverse():
@@ -181,7 +185,126 @@ def test_the_object_is_what_stands_on_the_ground_and_is_connected():
     beside = (tilted[:, 0] < -0.12) | (tilted[:, 0] > 0.22) | (np.abs(tilted[:, 1]) > 0.12)
     assert not ground[beside].any() and rest[:1800].mean() > 0.98 and not rest[1800:].any() and 0 < cut.noise < 2e-3
     found = box_around(scene, cut, box.points)
-    assert found.low[2] == 0 and (found.high >= [0.2, 0.1, 0.4]).all() and (found.high < [0.26, 0.16, 0.47]).all()
+    assert (
+        -0.01 < found.low[2] <= 0 and (found.high >= [0.2, 0.1, 0.4]).all() and (found.high < [0.26, 0.16, 0.47]).all()
+    )
+
+
+def test_a_scene_without_surfels_of_its_own_has_no_object_and_a_flat_object_has_a_box():
+    pytest.importorskip("torch")
+    from drgs_blender.capture.masks.object_surfels import Cut, box_around, cut_object
+    from drgs_blender.reconstruct.model.gaussians import Gaussians
+
+    places = strewn([-0.1, -0.1, -0.05], [0.1, 0.1, -0.049], 50)
+    scene = Gaussians.on_surface(places, np.tile([0.0, 0, 1], (50, 1)), np.full_like(places, 0.5), 0.006, 0)
+    found = box_around(scene, Cut(np.ones(50, bool), 0.0), places)
+    assert -0.051 < found.low[2] < -0.049 and found.high[2] > 0
+    scene.parameters["opacity"].data.fill_(-10.0)
+    assert not cut_object(scene, found).surfels.any()
+
+
+def test_learning_begins_with_a_limited_number_of_surfels():
+    pytest.importorskip("torch")
+    from drgs_blender.capture.masks.learned_scene import first_surfels
+    from drgs_blender.reconstruct.capture.capture import View
+
+    views = [View(view.name, view.pinhole(160), view.pixels / np.float32(255)) for view in scene(5)[0]]
+    many = strewn([-0.1, -0.1, 0], [0.1, 0.1, 0.2], 50000)
+    small = ObjectBox(MIDDLE - 0.16, MIDDLE + 0.16, many)
+    begun = first_surfels(views, small)
+    without = first_surfels(views, ObjectBox(small.low, small.high, np.zeros((0, 3))))
+    assert len(without) + 3000 == len(begun)
+    again = first_surfels(views, small)
+    np.testing.assert_array_equal(begun.centres().detach().numpy(), again.centres().detach().numpy())
+    # those that are known of the object take the place of sparse points
+    assert len(first_surfels(views, small, begun)) == len(without) + len(begun)
+    assert len(first_surfels(views, ObjectBox(small.low - 3, small.high + 3, np.zeros((0, 3))))) < 24000
+
+
+def test_what_is_behind_a_view_counts_in_its_error_and_moves_with_it():
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("warp")
+    from drgs_blender.reconstruct.backend import CPU
+    from drgs_blender.reconstruct.capture.training_views import Target
+    from drgs_blender.reconstruct.gpu.warp_backend import WarpLearningBackend
+    from drgs_blender.reconstruct.model.gaussians import Gaussians
+    from drgs_blender.reconstruct.optim.learner import Learner
+    from drgs_blender.reconstruct.optim.schedule import Schedule
+
+    view = photograph(0, 4)[0]
+    shown = torch.from_numpy(view.pixels / np.float32(255))
+    target = Target(view.pinhole(160), shown, None, shown)
+    backend = WarpLearningBackend.__new__(WarpLearningBackend)
+    backend.device = torch.device("meta")
+    assert backend.bring(target).background.device.type == "meta"
+    out_of_sight = Gaussians.on_surface(np.array([[0, 0, 9.0]]), np.eye(3)[2:], np.ones((1, 3)), 0.01, 0)
+    learner = Learner(out_of_sight, Schedule(reflections=1.0), 1.0, torch.zeros(3), CPU)
+    assert learner.error_of([target]) == 0
+
+
+def test_thin_parts_of_pictures_are_no_windows():
+    view, _ = photograph(0, 4)
+    view.lens = Lens(1600, 1200, 1900.0, 1900.0, 800.0, 600.0)
+    view.pixels = np.zeros((1200, 1600, 3), np.uint8)
+    box = ObjectBox(MIDDLE - 0.16, MIDDLE + 0.16, np.zeros((0, 3)))
+    left, top, right, _ = box.window(view)
+    view.pixels = view.pixels[: top + 12]  # the picture ends within the box
+    assert right - left > 500 and box.window(view) is None
+    view.pixels = np.zeros((top + 100, 1600, 3), np.uint8)
+    part = view.cropped(box.window(view), 64)
+    assert min(part.shape) >= 4
+
+
+@pytest.mark.parametrize(
+    ("views", "surfels", "said"),
+    [(3, 400, "3 photographs show the object, masks need 4"), (5, 3, "no object is found on the ground"),
+     (5, 400, "covers half of no pixel")],
+)  # fmt: skip
+def test_it_is_said_why_no_masks_are_made(cv2, tmp_path, monkeypatch, caplog, views, surfels, said):
+    from drgs_blender.capture.masks import making
+    from drgs_blender.reconstruct.model.gaussians import Gaussians
+
+    places = ball_points()[:surfels]
+    faint = Gaussians.on_surface(places, np.tile([0.0, 0, 1], (len(places), 1)), np.ones_like(places), 0.01, 0)
+    monkeypatch.setattr(making, "prepare_kernels", lambda *_: None)
+    monkeypatch.setattr(making, "learn_scene", lambda *_: faint)
+    monkeypatch.setattr(making, "share_of_object", lambda *_: np.zeros((113, 150), np.float32))
+    found, pictures = written(tmp_path, scene(views)[0], ball_points())
+    masked = run(tmp_path, "auto", found, pictures)
+    assert masked.lines == ["masks: none could be made"] and said in caplog.text and len(caplog.messages) == 1
+
+
+def test_replaced_masks_are_drawn_as_they_are_used(cv2, tmp_path, monkeypatch):
+    from drgs_blender.capture.masks import making
+
+    views, true = scene()
+    masks = [half(mask) if k == 4 else mask for k, mask in enumerate(true)]
+    box = ObjectBox(MIDDLE - 0.16, MIDDLE + 0.16, np.zeros((0, 3)))
+    found = making.Found(dict.fromkeys(range(10)), views, masks, Hull(cv2, views, masks, box, 48), None, None, box)
+    monkeypatch.setattr(making, "find_masks", lambda *_: found)
+    drawn = []
+    monkeypatch.setattr(making, "draw_contact_sheet", lambda path, views, masks, fits: drawn.append(list(masks)))
+    made, fits = making.make_masks(cv2, views, np.zeros((0, 3)), tmp_path, "set", lambda *_: None, lambda: False)
+    assert made is found and fits[4].wrong and iou(made.masks[4], true[4]) > 0.75
+    assert len(drawn) == 1 and np.array_equal(drawn[0][4], made.masks[4])
+
+
+def test_a_view_that_was_not_learned_from_sees_the_object(cv2):
+    from drgs_blender.capture.masks.making import Found
+    from drgs_blender.capture.masks.object_surfels import Cut
+    from drgs_blender.reconstruct.model.gaussians import Gaussians
+
+    normals = ball_points(2000)[:2000] - MIDDLE
+    normals /= RADIUS
+    ball = Gaussians.on_surface(MIDDLE + RADIUS * normals, normals, np.ones_like(normals), 0.006, 0)
+    ball.parameters["opacity"].data.fill_(4.0)
+    box = ObjectBox(MIDDLE - 0.16, MIDDLE + 0.16, np.zeros((0, 3)))
+    found = Found({}, [], [], None, ball, Cut(np.ones(len(normals), bool), 0.0), box)
+    view, true = photograph(3, 12)
+    seen = found.seen_by(cv2, view)
+    assert seen.dtype == np.uint8 and iou(seen > 127, true) > 0.9
+    view.matrix[:3, :3] = view.matrix[:3, :3] @ np.diag([-1.0, 1, -1])  # it looks away
+    assert not found.seen_by(cv2, view).any()
 
 
 def test_specks_and_pinholes_are_no_part_of_a_mask():
@@ -196,46 +319,110 @@ def test_specks_and_pinholes_are_no_part_of_a_mask():
     assert np.array_equal(without_specks(torn), mask) and not without_specks(mask & False).any()
 
 
-def test_masks_of_a_capture_are_made_only_where_it_has_none(tmp_path, monkeypatch):
-    pytest.importorskip("cv2")
-    pytest.importorskip("torch")
-    from drgs_blender.capture.masks import of_capture
-    from drgs_blender.core.frame import Camera
-    from drgs_blender.reconstruct.capture.capture import Capture, View
+class Captures:
+    """Captures of the ball in a world whose Z is not up, and stand-ins of what makes their masks."""
 
-    class Made:
-        def whole(self, view, shape, size):
-            return np.full(shape, 51 * (view % 2), np.uint8)
+    turned = np.array([[0, 0, 1.0, 0], [1, 0, 0, 0], [0, 1, 0, 3], [0, 0, 0, 1]])
 
-    asked = []
-    monkeypatch.setattr(of_capture, "make_masks", lambda cv2, views, *_: (asked.append(views), (Made(), []))[1])
-    views, masks = scene(6)
-    turned = np.array([[0, 0, 1.0, 0], [1, 0, 0, 0], [0, 1, 0, 3], [0, 0, 0, 1]])  # Z is not up
+    def __init__(self, folder, monkeypatch):
+        pytest.importorskip("cv2")
+        pytest.importorskip("torch")
+        from drgs_blender.capture.masks import of_capture
 
-    def capture() -> Capture:
+        self.folder, self.sheet, self.of_capture = folder, folder / "sheet.png", of_capture
+        self.views, self.masks = scene(6)
+        self.asked: list[list[MaskView]] = []
+        monkeypatch.setattr(of_capture, "make_masks", self._make)
+
+    def _make(self, cv2, views, *_):
+        self.asked.append(views)
+        return self, []
+
+    @staticmethod
+    def whole(view, shape, size):
+        return np.full(shape, 51 * (view % 2), np.uint8)
+
+    @staticmethod
+    def seen_by(cv2, view):
+        return np.full(view.shape, 204, np.uint8)
+
+    def make(self, points=None, turned=turned):
+        from drgs_blender.core.frame import Camera
+        from drgs_blender.reconstruct.capture.capture import Capture, View
+
         shown = []
-        for view in views:
+        for view in self.views:
             camera = Camera(turned @ view.matrix, 160, 120, 190.0, 190.0, 80.0, 60.0)
             shown.append(View(view.name, camera, view.pixels / np.float32(255)))
-        points = ball_points() @ turned[:3, :3].T + turned[:3, 3]
-        return Capture(tmp_path, shown, None, points.astype(np.float32))
+        points = (ball_points() if points is None else points) @ turned[:3, :3].T + turned[:3, 3]
+        return Capture(self.folder, shown, None, points.astype(np.float32))
 
-    def mask(capture: Capture, mode: str) -> list[np.ndarray | None]:
-        of_capture.mask_capture(capture, mode, tmp_path / "sheet.png", lambda *_: None, lambda: False)
+    def mask(self, capture, mode):
+        """Masks of the views of a capture afterwards."""
+        self.of_capture.mask_capture(capture, mode, self.sheet, lambda *_: None, lambda: False)
         return [view.mask for view in capture.views]
 
-    assert mask(capture(), "given") == [None] * 6 and not asked
-    given = capture()
-    for view, true in zip(given.views, masks, strict=True):
+
+@pytest.fixture
+def captures(tmp_path, monkeypatch):
+    return Captures(tmp_path, monkeypatch)
+
+
+def test_masks_of_a_capture_are_made_only_where_it_has_none(captures, caplog):
+    assert captures.mask(captures.make(), "given") == [None] * 6 and not captures.asked
+    given = captures.make()
+    for view, true in zip(given.views, captures.masks, strict=True):
         view.mask = true.astype(np.float32)
-    assert mask(given, "auto")[0] is given.views[0].mask and not asked
-    assert mask(given, "none") == [None] * 6 and not asked
-    made = mask(capture(), "auto")
-    assert np.allclose(made[1], 0.2) and not made[0].any() and len(asked) == 1
+    assert captures.mask(given, "auto")[0] is given.views[0].mask and not captures.asked and not caplog.messages
+    for view in given.views[2:]:
+        view.mask = None
+    assert captures.mask(given, "auto")[2:] == [None] * 4 and not captures.asked
+    assert "2 of 6 pictures have masks: no others are made" in caplog.text
+    captures.sheet.touch()
+    made = captures.mask(captures.make(), "auto")
+    assert np.allclose(made[1], 0.2) and not made[0].any() and len(captures.asked) == 1
+    assert not captures.sheet.exists()  # of another run
     # upright, on the ground
-    level = np.stack([view.matrix for view in asked[0]])
-    np.testing.assert_allclose(level[:, 2, 2], [view.matrix[2, 2] for view in views], atol=1e-2)
+    level = np.stack([view.matrix for view in captures.asked[0]])
+    np.testing.assert_allclose(level[:, 2, 2], [view.matrix[2, 2] for view in captures.views], atol=1e-2)
     assert (level[:, 2, 3] > 0.2).all()
+
+
+def test_masks_and_a_background_of_one_colour_are_left_out_when_asked(captures):
+    from drgs_blender.reconstruct.meshing.visual_hull import have_silhouettes
+
+    given = captures.make()
+    given.background = (1.0, 1.0, 1.0)
+    for view, true in zip(given.views, captures.masks, strict=True):
+        view.mask = true.astype(np.float32)
+    assert have_silhouettes(given)
+    assert captures.mask(given, "none") == [None] * 6 and not captures.asked and not have_silhouettes(given)
+
+
+def test_masks_need_to_know_the_ground(captures, caplog):
+    nothing, ground = np.zeros((0, 3)), {"ground": "marker sheet (A4)"}
+    report = captures.folder / "capture.json"
+    assert captures.mask(captures.make(nothing), "auto") == [None] * 6 and not captures.asked
+    assert "plane on which the object stands is not known" in caplog.text and "--masks none" in caplog.text
+    caplog.clear()
+    # a marker sheet gives it, unless the world has been turned since
+    report.write_text(json.dumps(ground))
+    on_its_side = captures.turned.copy()
+    on_its_side[:3, 3] = 0
+    captures.mask(captures.make(nothing, on_its_side), "auto")
+    assert not captures.asked and caplog.messages
+    caplog.clear()
+    captures.mask(captures.make(nothing, np.eye(4)), "auto")
+    assert not caplog.messages
+    np.testing.assert_array_equal(captures.asked[0][3].matrix, captures.views[3].matrix)
+
+
+def test_masks_are_not_learned_from_views_left_out(captures):
+    capture = captures.make()
+    capture.views[1].test = capture.views[4].test = True
+    made = captures.mask(capture, "auto")
+    assert [view.name for view in captures.asked[0]] == [f"photo_{k}.png" for k in (0, 2, 3, 5)]
+    assert [round(float(mask.max()), 2) for mask in made] == [0, 0.8, 0.2, 0, 0.8, 0.2]
 
 
 def test_a_wrong_mask_is_found_among_right_ones(cv2):

@@ -9,7 +9,6 @@ object, so that nothing is gained by surfels that stand before it.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +32,9 @@ from .object_box import ObjectBox
 
 #: Margin of the ground around the box, in parts of the box's largest side; pixels between surfels on it.
 _GROUND, _PIXELS = 0.15, 2.0
-#: Surfels strewn in the box, and how opaque they begin; opacity of the others.
+#: Surfels on the ground at most.
+_PAVED = 20000
+#: Surfels strewn in the box, also sparse points at most, and how opaque they begin; opacity of the others.
 _STREWN, _FAINT, _OPAQUE = 3000, 0.1, 0.7
 #: Deviation of surfels in parts of their distance.
 _WIDE = 0.5
@@ -49,16 +50,14 @@ class Effort:
     ----------
     size : int
         Pixels of a window's longer side.
-    steps, surfels : int
-        At most.
-    seconds : float
-        Of the processor, about, after which learning ends.
+    steps : int
+    surfels : int
+        At most, after those that learning begins with.
     """
 
     size: int
     steps: int
     surfels: int
-    seconds: float
 
 
 def learn_scene(cv2: Any, views: Sequence[MaskView], box: ObjectBox, effort: Effort,
@@ -88,10 +87,8 @@ def learn_scene(cv2: Any, views: Sequence[MaskView], box: ObjectBox, effort: Eff
     none = np.zeros((0, 3), np.float32)
     region = Region((box.low + box.high) / 2, size, box.low, box.high, none, none, size)
     schedule = Schedule(effort.steps, effort.surfels, coarse=0.4, rounds=8, reflections=1.0, bands=_BANDS)
-    training = Training(
-        Capture(Path("photographs"), shown), region, schedule, first_surfels(shown, box, earlier), effort.seconds,
-        now=time.process_time,
-    )  # fmt: skip
+    # by steps alone: the time they take would make masks differ from run to run
+    training = Training(Capture(Path("photographs"), shown), region, schedule, first_surfels(shown, box, earlier))
     ground = GroundPicture(cv2, straight, box)
     for view, full, half in zip(straight, *training.targets, strict=True):
         behind = ground.without_object(view, box.outline(cv2, view), near_ground(box))
@@ -118,12 +115,13 @@ def first_surfels(views: list[View], box: ObjectBox, earlier: Gaussians | None =
     views : list of View
     box : ObjectBox
     earlier : Gaussians, optional
-        Further ones.
+        Those of the object as far as they are known, instead of sparse points.
     """
     size, middle = float((box.high - box.low).max()), (box.low + box.high) / 2
     parts = [] if earlier is None else [earlier]
     away = [np.linalg.norm(np.asarray(view.camera.matrix_world)[:3, 3] - middle) / view.camera.fx for view in views]
-    step = _PIXELS * float(np.median(away))
+    paved = float(np.prod(np.subtract(*near_ground(box)[::-1])))
+    step = max(_PIXELS * float(np.median(away)), (paved / _PAVED) ** 0.5)
     axes = [np.arange(a, b, step) for a, b in zip(*near_ground(box), strict=True)]
     flat = np.stack([*np.meshgrid(*axes), np.zeros((len(axes[1]), len(axes[0])))], axis=-1).reshape(-1, 3)
     parts.append(_surfels(flat, np.tile([0.0, 0.0, 1.0], (len(flat), 1)), views, _WIDE * step, _OPAQUE))
@@ -133,10 +131,11 @@ def first_surfels(views: list[View], box: ObjectBox, earlier: Gaussians | None =
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     step = float(np.prod(box.high - box.low) / _STREWN) ** (1 / 3)
     parts.append(_surfels(strewn, normals, views, _WIDE * step, _FAINT))
-    if len(box.points):
-        facing = box.points - middle * [1.0, 1.0, 0.0]
+    if len(box.points) and earlier is None:
+        kept = np.sort(random.permutation(len(box.points))[:_STREWN])
+        facing = box.points[kept] - middle * [1.0, 1.0, 0.0]
         facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
-        parts.append(_surfels(box.points, facing, views, 0.01 * size, _OPAQUE))
+        parts.append(_surfels(box.points[kept], facing, views, 0.01 * size, _OPAQUE))
     names = parts[0].parameters
     return Gaussians({name: torch.cat([part.parameters[name].detach() for part in parts]) for name in names})
 

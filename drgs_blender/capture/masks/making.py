@@ -15,23 +15,25 @@ from scipy.ndimage import binary_fill_holes, label
 from ...compute.prepare import PHASE, prepare_kernels
 from ...core.arrays import Array
 from ...core.errors import first_of
+from ...reconstruct.model.gaussians import Gaussians
 from ..features import Tell
 from .contact_sheet import draw_contact_sheet
 from .hull import Hull
 from .hull_check import Fit, check_masks
 from .learned_scene import Effort, learn_scene
 from .mask_view import MaskView
-from .object_box import find_box
-from .object_surfels import box_around, cut_object, share_of_object
+from .object_box import ObjectBox, find_box
+from .object_surfels import Cut, box_around, cut_object, share_of_object
 
 logger = logging.getLogger(__name__)
 
 #: First roughly, to find the box around the object; then that.
-EFFORTS = (Effort(160, 300, 16000, 45.0), Effort(256, 900, 20000, 180.0))
+EFFORTS = (Effort(160, 300, 16000), Effort(256, 900, 20000))
 #: Pixels of the longer side of masks, of the part around the object.
 PART = 640
-#: Surfels that an object has at least; views that show it.
-_FEWEST_SURFELS, _FEWEST_VIEWS = 30, 3
+#: Surfels that an object has at least; views that show it (three
+#: make a hull, which a fourth is held against).
+_FEWEST_SURFELS, _FEWEST_VIEWS = 30, 4
 #: Parts of a mask smaller than this part of the largest are dropped, holes smaller than this part of it are filled.
 _SMALL, _PINHOLE = 0.01, 1e-3
 #: Part of the masks that may be doubtful; with more none are used.
@@ -53,25 +55,51 @@ class Found:
         Of the parts.
     hull : Hull
         Of the masks.
+    scene, cut, box : Gaussians, Cut, ObjectBox
+        What is learned, what of it is the object, and where that is.
     """
 
     windows: dict[int, tuple[int, int, int, int]]
     parts: list[MaskView]
     masks: list[Array]
     hull: Hull
+    scene: Gaussians
+    cut: Cut
+    box: ObjectBox
 
     def whole(self, view: int, shape: tuple[int, int], size: tuple[int, int]) -> Array:
         """(h, w) uint8: the mask of a whole picture of `size` (w, h), whose view has the `shape` (h, w)."""
-        width, height = size
-        drawn = np.zeros((height, width), np.uint8)
-        if view in self.windows:
-            sizes = zip(self.windows[view], size * 2, shape[::-1] * 2, strict=True)
-            left, top, right, bottom = (round(edge * new / old) for edge, new, old in sizes)
-            mask = self.masks[list(self.windows).index(view)]
-            part = Pillow.fromarray(mask.astype(np.uint8) * 255)
-            resized = part.resize((right - left, bottom - top), Pillow.Resampling.BILINEAR)
-            drawn[top:bottom, left:right] = np.asarray(resized)
-        return drawn
+        if view not in self.windows:
+            return np.zeros(size[::-1], np.uint8)
+        return _drawn(self.masks[list(self.windows).index(view)], self.windows[view], shape, size)
+
+    def seen_by(self, cv2: Any, view: MaskView) -> Array:
+        """(h, w) uint8: the mask of a view that was not learned from."""
+        window, shape = self.box.window(view), view.shape
+        if window is None:
+            return np.zeros(shape, np.uint8)
+        return _drawn(_mask_of(cv2, view.cropped(window, PART), self.scene, self.cut), window, shape, shape[::-1])
+
+
+def _drawn(mask: Array, window: tuple[int, int, int, int], shape: tuple[int, int], size: tuple[int, int]) -> Array:
+    """(h, w) uint8: a picture of `size` (w, h) with the mask of a window of a view of the `shape` (h, w)."""
+    drawn = np.zeros(size[::-1], np.uint8)
+    sizes = zip(window, size * 2, shape[::-1] * 2, strict=True)
+    left, top, right, bottom = (round(edge * new / old) for edge, new, old in sizes)
+    part = Pillow.fromarray(mask.astype(np.uint8) * 255)
+    resized = part.resize((right - left, bottom - top), Pillow.Resampling.BILINEAR)
+    drawn[top:bottom, left:right] = np.asarray(resized)
+    return drawn
+
+
+def _mask_of(cv2: Any, part: MaskView, scene: Gaussians, cut: Cut) -> Array:
+    """(h, w) bool: the pixels of a part of a photograph of which the object covers more than half."""
+    camera = part.pinhole(PART)
+    return without_specks(part.distorted(cv2, camera, share_of_object(scene, cut, camera)) > 0.5)
+
+
+class NoMasks(Exception):
+    """Why there are none."""
 
 
 def make_masks(cv2: Any, views: Sequence[MaskView], points: Array, sheet: Path, subject: str, tell: Tell,
@@ -97,14 +125,15 @@ def make_masks(cv2: Any, views: Sequence[MaskView], points: Array, sheet: Path, 
     Cancelled
         `cancelled` said so.
     """
-    found = find_masks(cv2, views, points, tell, cancelled)
-    if found is None:
-        logger.warning("%s: no object is found on the ground: no masks are made. %s", subject, REMEDY)
+    try:
+        found = find_masks(cv2, views, points, tell, cancelled)
+    except NoMasks as why:
+        logger.warning("%s: %s: no masks are made. %s", subject, why, REMEDY)
         return None, []
     fits = check_masks(cv2, found.parts, found.masks, found.hull)
-    draw_contact_sheet(sheet, found.parts, found.masks, fits)
     doubtful = [str(fit) for fit in fits if fit.doubtful]
     if len(doubtful) > _DOUBTED * len(fits) or not found.hull.solid().any():
+        draw_contact_sheet(sheet, found.parts, found.masks, fits)
         logger.warning(
             "%s: of %d masks that were made %d do not fit the others (%s): none are used. They are drawn in %s. %s",
             subject, len(fits), len(doubtful), first_of(doubtful), sheet.name, REMEDY,
@@ -115,6 +144,7 @@ def make_masks(cv2: Any, views: Sequence[MaskView], points: Array, sheet: Path, 
         if fit.wrong:  # the others know better
             found.masks[index] = found.hull.seen_by(found.parts[index], found.hull.solid(without=index))
             replaced.append(str(fit))
+    draw_contact_sheet(sheet, found.parts, found.masks, fits)
     if replaced:
         logger.warning("%s: masks that do not fit the others are replaced by these' hull: %s", subject,
                        first_of(replaced))  # fmt: skip
@@ -122,8 +152,8 @@ def make_masks(cv2: Any, views: Sequence[MaskView], points: Array, sheet: Path, 
 
 
 def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
-               cancelled: Callable[[], bool]) -> Found | None:  # fmt: skip
-    """Masks of the object; None where nothing stands on the ground.
+               cancelled: Callable[[], bool]) -> Found:  # fmt: skip
+    """Masks of the object.
 
     Parameters
     ----------
@@ -137,6 +167,8 @@ def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
 
     Raises
     ------
+    NoMasks
+        Too few views show the object, nothing stands on the ground, or too little of it is learned.
     Cancelled
         `cancelled` said so.
     """
@@ -146,20 +178,18 @@ def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
     for step, effort in enumerate(EFFORTS):
         windows = {k: window for k, view in enumerate(views) if (window := box.window(view)) is not None}
         if len(windows) < _FEWEST_VIEWS:
-            return None
+            raise NoMasks(f"{len(windows)} photographs show the object, masks need {_FEWEST_VIEWS}")
         parts = [views[k].cropped(window, PART) for k, window in windows.items()]
         told = lambda phase, part, step=step: tell(phase, 0.2 + 0.7 * (step + part) / len(EFFORTS))  # noqa: E731
         scene = learn_scene(cv2, parts, box, effort, object_surfels, told, cancelled)
         cut = cut_object(scene, box)
         if cut.surfels.sum() < _FEWEST_SURFELS:
-            return None
+            raise NoMasks("no object is found on the ground")
         box, object_surfels = box_around(scene, cut, box.points), scene.select(np.flatnonzero(cut.surfels))
-    masks = []
-    for part in parts:
-        camera = part.pinhole(PART)
-        share = part.distorted(cv2, camera, share_of_object(scene, cut, camera))
-        masks.append(without_specks(share > 0.5))
-    return Found(windows, parts, masks, Hull(cv2, parts, masks, box))
+    masks = [_mask_of(cv2, part, scene, cut) for part in parts]
+    if not any(mask.any() for mask in masks):
+        raise NoMasks("what is learned of the object covers half of no pixel")
+    return Found(windows, parts, masks, Hull(cv2, parts, masks, box), scene, cut, box)
 
 
 def without_specks(mask: Array) -> Array:

@@ -19,6 +19,8 @@ _ABOVE, _CELL = 0.012, 0.03
 _REACH = 0.6
 #: Surroundings that a window shows beside the box, in parts of the box's size there.
 _SURROUNDINGS = 0.1
+#: Pixels that a window has at least on each side, and as a part of its longer side.
+_NARROW, _THIN = 8, 1 / 16
 #: Points that a cluster needs; margin of the box, in parts of its size; of the box without points, the half width and
 #: the height in parts of the cameras' distance.
 _FEWEST, _MARGIN, _GUESSED = 25, 0.15, (0.28, 0.5)
@@ -31,7 +33,7 @@ class ObjectBox:
     Attributes
     ----------
     low, high : (3,) float64 array
-        Corners; the lower one is on the ground.
+        Corners; the lower one is on the ground, or below.
     points : (n, 3) float64 array
         On the object, without strays; may be empty.
     """
@@ -66,7 +68,9 @@ class ObjectBox:
         margin = 2 + _SURROUNDINGS * float((high - low).max())
         low = np.maximum(np.floor(low - margin), 0).astype(int)
         high = np.minimum(np.ceil(high + margin), [width, height]).astype(int)
-        return (*low.tolist(), *high.tolist()) if (high - low >= 8).all() else None
+        return (
+            (*low.tolist(), *high.tolist()) if (high - low >= max(_NARROW, _THIN * (high - low).max())).all() else None
+        )
 
 
 def find_box(points: Array, matrices: Array) -> ObjectBox:

@@ -61,6 +61,8 @@ def cut_object(scene: Gaussians, box: ObjectBox) -> Cut:
     size, middle = float((box.high - box.low).max()), (box.low + box.high) / 2
     flat = np.linalg.norm((centre - middle)[:, :2], axis=1)
     seen = (opacity > _FAINT) & (deviations.max(axis=1) < _LARGEST * size) & (flat < 2 * _AROUND * size)
+    if not seen.any():
+        return Cut(seen, 0.0)
     weight = opacity * deviations.prod(axis=1)
     height = np.full(len(centre), -np.inf)
     height[seen], noise = _heights(centre[seen], weight[seen], middle, size)
@@ -111,7 +113,7 @@ def _connected(places: Array, weight: Array, cell: float) -> Array:
 
 
 def box_around(scene: Gaussians, cut: Cut, points: Array) -> ObjectBox:
-    """The box of the object's surfels with a margin, down to the ground.
+    """The box of the object's surfels with a margin, down to the ground at least.
 
     Parameters
     ----------
@@ -124,8 +126,8 @@ def box_around(scene: Gaussians, cut: Cut, points: Array) -> ObjectBox:
     places = scene.centres().detach().numpy()[cut.surfels].astype(np.float64)
     low, high = np.quantile(places, [_STRAYS, 1 - _STRAYS], axis=0)
     margin = _MARGIN * float((high - low).max())
-    low, high = low - margin, high + margin
-    low[2] = 0.0
+    low[:2], high[:2] = low[:2] - margin, high[:2] + margin
+    low[2], high[2] = min(0.0, low[2]), max(high[2], 0.0) + margin  # flat ones may lie below 0
     return ObjectBox(low, high, points)
 
 

@@ -14,17 +14,21 @@ from ...reconstruct.capture.capture import Capture, View
 from ...reconstruct.meshing.visual_hull import have_silhouettes
 from ...reconstruct.readers.lens import Lens
 from .. import libraries
+from ..capture_folder import known_ground
 from ..features import Tell
 from ..registration import Registration
-from ..world_alignment import align_to_ground
-from .making import make_masks
+from ..world_alignment import GUESSED, PLANE, align_to_ground
+from .making import REMEDY, make_masks
 from .mask_view import MaskView
+from .stage import ONLY_SOME
 
 logger = logging.getLogger(__name__)
 
 
 def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled: Callable[[], bool]) -> None:
     """Give the views masks where none has one ("auto"), or take theirs away ("none"), in place.
+
+    Masks are learned from training views alone; views left out get those of what is learned, as they see it.
 
     Parameters
     ----------
@@ -40,13 +44,18 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
     Cancelled
         `cancelled` said so.
     """
+    sheet.unlink(missing_ok=True)  # of another run
     if mode == "none":
         for view in capture.views:
             view.mask = None
+        capture.background = None
         return
-    if mode != "auto" or have_silhouettes(capture) or any(view.mask is not None for view in capture.views):
+    if mode != "auto" or have_silhouettes(capture):
         return
     subject = str(capture.source)
+    if masked := sum(view.mask is not None for view in capture.training):
+        logger.warning(ONLY_SOME, subject, masked, len(capture.training))
+        return
     try:
         cv2: Any = libraries.load("opencv")
     except DeviceError as error:
@@ -55,13 +64,36 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
     points = np.zeros((0, 3)) if capture.points is None else np.asarray(capture.points, np.float64)
     matrices = {view.name: np.asarray(view.camera.matrix_world, np.float64) for view in capture.views}
     found = Registration(matrices, {}, {}, {}, points, np.zeros((len(points), 3), np.uint8), "")
-    align_to_ground(found).apply(found)
-    views = [_mask_view(view, found.matrices[view.name]) for view in capture.views]
+    if not _on_ground(found, capture.source):
+        logger.warning(
+            "%s: the plane on which the object stands is not known (no sparse points on it, nor a marker sheet): "
+            "no masks are made. %s", subject, REMEDY,
+        )  # fmt: skip
+        return
+    views = [_mask_view(view, found.matrices[view.name]) for view in capture.training]
     made, _ = make_masks(cv2, views, found.points, sheet, subject, tell, cancelled)
-    for k, view in enumerate(capture.views if made is not None else ()):
+    if made is None:
+        return
+    for k, view in enumerate(capture.training):
         height, width = view.colour.shape[:2]
-        assert made is not None
         view.mask = made.whole(k, (height, width), (width, height)).astype(np.float32) / 255
+    for view in capture.testing:
+        if view.mask is None:
+            view.mask = made.seen_by(cv2, _mask_view(view, found.matrices[view.name])).astype(np.float32) / 255
+
+
+def _on_ground(found: Registration, source: Path) -> bool:
+    """Bring cameras and points onto the ground; False where it is not known.
+
+    Captures that `drgs capture` made say what their ground rests on, and are on it.
+    """
+    folder = source if source.is_dir() else source.parent
+    above = all(matrix[2, 3] > 0 for matrix in found.matrices.values())  # not where the world has been turned
+    if above and known_ground(folder) not in (None, GUESSED):
+        return True
+    aligned = align_to_ground(found)
+    aligned.apply(found)
+    return aligned.ground_from == PLANE
 
 
 def _mask_view(view: View, matrix: np.ndarray) -> MaskView:

@@ -33,6 +33,7 @@ MODES = ("given", "auto", "none")
 #: Pixels of the longer side at which given masks are checked.
 _WHOLE = 560
 CONTACT_SHEET = "masks.png"
+ONLY_SOME = "%s: %d of %d pictures have masks: no others are made. Draw all, or remove these"
 
 
 @dataclass(slots=True)
@@ -85,6 +86,9 @@ def make_or_check(mode: str, found: Registration, by_file: dict[str, Picture], c
     files = sorted(found.matrices)
     views = [_view(file, by_file[file], found, copies) for file in files]
     if given is not None:
+        there = sum((given / f"{file}.png").is_file() for file in files)
+        if mode == "auto" and there < len(files):
+            logger.warning(ONLY_SOME, subject, there, len(files))
         return _check_given(cv2, views, files, given, sheet, subject)
     return _make(cv2, views, files, by_file, work, sheet, found, subject, tell, cancelled)
 
@@ -114,7 +118,7 @@ def _make(cv2: Any, views: list[MaskView], files: list[str], by_file: dict[str, 
     made, fits = make_masks(cv2, views, found.points, sheet, subject, tell, cancelled)
     if made is None:
         return Masked(fits, ["masks: none, those that were made do not fit each other" if fits else
-                             "masks: none, no object is found on the ground"])  # fmt: skip
+                             "masks: none could be made"])  # fmt: skip
     work.mkdir(parents=True, exist_ok=True)
     for k, (file, view) in enumerate(zip(files, views, strict=True)):
         picture = by_file[file]

@@ -33,6 +33,7 @@ def neighbours(views: list[View], centre: Array) -> list[list[int]]:
         names = ", ".join(alone[:3]) + (", ..." if len(alone) > 3 else "")
         log.warning(
             "%d of %d photographs (%s) have no other within %g to %g degrees around the object: their patches are not "
-            "compared. Take photographs closer to each other", len(alone), len(views), names, LEAST, MOST,
+            "compared. Take them %g to %g degrees apart around the object",
+            len(alone), len(views), names, LEAST, MOST, LEAST, MOST,
         )  # fmt: skip
     return near

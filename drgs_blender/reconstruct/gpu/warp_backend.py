@@ -59,8 +59,8 @@ class WarpLearningBackend(LearningBackend):
         self.device = self.launcher.place
 
     def bring(self, target: Target) -> Target:
-        mask = None if target.mask is None else target.mask.to(self.device)
-        return replace(target, photograph=target.colour.to(self.device), mask=mask)
+        mask, behind = (None if one is None else one.to(self.device) for one in (target.mask, target.background))
+        return replace(target, photograph=target.colour.to(self.device), mask=mask, background=behind)
 
     def attributes(
         self, parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, reflections: bool

@@ -114,7 +114,10 @@ class Gaussians:
         rays: Tensor | None = None,
         reflections: bool = True,
     ) -> RenderedView:
-        """Render a view over `background` (3,); `rays` are `training_views.pixel_rays` where they are at hand."""
+        """Render a view over `background`, (3,) or (h, w, 3).
+
+        `rays` are `training_views.pixel_rays` where they are at hand.
+        """
         reflections = reflections and self.light is not None
         centre, eye = self.centres(), np.asarray(camera.matrix_world)[:3, 3]
         u, v, opacity, features = self.backend.attributes(self.parameters, centre, eye, bands, reflections)

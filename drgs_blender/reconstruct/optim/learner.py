@@ -99,8 +99,12 @@ class Learner:
         statistics = self.statistics if part < schedule.densify[1] else None
         reflections = part >= schedule.reflections < 1
         bands = min(schedule.bands, int(part * 8))
-        behind = self._background if target.background is None else target.background
+        behind = self._behind(target)
         return self.gaussians.render(target.camera, behind, bands, statistics, rays, reflections), rays
+
+    def _behind(self, target: Target) -> Tensor:
+        """What is behind the surfels: (3,), or (h, w, 3)."""
+        return self._background if target.background is None else target.background
 
     def _optimise(self, part: float) -> None:
         parameters = self.gaussians.parameters
@@ -149,7 +153,7 @@ class Learner:
         errors = []
         for target in views:
             with torch.no_grad():
-                errors.append(_squared_error(self.gaussians.render(target.camera, self._background), target))
+                errors.append(_squared_error(self.gaussians.render(target.camera, self._behind(target)), target))
         return float(np.mean(errors))
 
     def arrays(self) -> dict[str, Array]:
