@@ -43,10 +43,20 @@ def maker(tmp_path_factory) -> Maker:
     return Maker(tmp_path_factory.mktemp("true"), object_asset(light(1)))
 
 
+class Sets(dict):
+    """Protocol -> folder of its miniature, made when it is first asked for."""
+
+    def __init__(self, maker: Maker, folder: Path) -> None:
+        self.maker, self.folder = maker, folder
+
+    def __missing__(self, name: str) -> Path:
+        self[name] = getattr(self.maker, name.replace("-", "_"))(self.folder / name)
+        return self[name]
+
+
 @pytest.fixture(scope="module")
-def sets(maker, tmp_path_factory) -> dict[str, Path]:
-    folder = tmp_path_factory.mktemp("sets")
-    return {name: getattr(maker, name.replace("-", "_"))(folder / name) for name in OBJECTS}
+def sets(maker, tmp_path_factory) -> Sets:
+    return Sets(maker, tmp_path_factory.mktemp("sets"))
 
 
 def scored(capsys, protocol: str, asset: Path, root: Path, *words: str) -> dict:
