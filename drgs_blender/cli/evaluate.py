@@ -199,19 +199,25 @@ def session_renderer(
     session: Session, key: str, settings: RenderSettings, visibility: Visibility | None = None
 ) -> Renderer:
     """Renders the loaded asset `key` for `evaluate.compare`, with `settings` on a transparent film."""
-    from ..evaluate.compare import COMPARED_PASSES
-
-    settings = replace(settings, film_transparent=True)
 
     def render(camera: Camera, radiance: np.ndarray, vertices: np.ndarray | None) -> dict[str, np.ndarray]:
         state = ObjectState(Path(key).stem, key, vertices=vertices, visibility=visibility or Visibility())
-        world = World(radiance)
-        frame = Frame(
-            noise_index=1, camera=camera, objects=[state], world=world, settings=settings, passes=COMPARED_PASSES
-        )
-        return dict(session.render(frame))
+        return compared_passes(session, state, camera, radiance, settings)
 
     return render
+
+
+def compared_passes(
+    session: Session, state: ObjectState, camera: Camera, radiance: np.ndarray, settings: RenderSettings
+) -> dict[str, np.ndarray]:
+    """Passes of one object under a light (h, w, 3), with `settings` on a transparent film."""
+    from ..evaluate.compare import COMPARED_PASSES
+
+    settings = replace(settings, film_transparent=True)
+    frame = Frame(
+        noise_index=1, camera=camera, objects=[state], world=World(radiance), settings=settings, passes=COMPARED_PASSES
+    )
+    return dict(session.render(frame))
 
 
 def writer(folder: Path) -> Any:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core.errors import EXIT_BAD_ASSET, AssetError, DrgsError, UsageError, first_of
-from ..core.frame import Adjustment, Camera, Frame, ObjectState, RenderSettings, World
+from ..core.frame import Adjustment, Camera, ObjectState, RenderSettings
 from .interrupt import interruptible
 from .output import check_writable
 from .progress import WORK_SECONDS, FractionBar
@@ -266,20 +266,15 @@ def _loaded(file: Path, settings: RenderSettings) -> tuple[Asset, Renderer, str]
     """(asset, what renders it, its digest)."""
     from ..core.asset.container import digest_asset
     from ..engine.session import Session
-    from ..evaluate.compare import COMPARED_PASSES
+    from .evaluate import compared_passes
 
     session = Session()
     key = session.load_asset(file)
-    settings = replace(settings, film_transparent=True)
 
     def render(camera: Camera, radiance: np.ndarray, factors: tuple[float, float, float]) -> dict[str, np.ndarray]:
         adjustment = None if factors == (1.0, 1.0, 1.0) else Adjustment(tint=factors)
         state = ObjectState(file.stem, key, adjustment=adjustment)
-        frame = Frame(
-            noise_index=1, camera=camera, objects=[state], world=World(radiance), settings=settings,
-            passes=COMPARED_PASSES,
-        )  # fmt: skip
-        return dict(session.render(frame))
+        return compared_passes(session, state, camera, radiance, settings)
 
     return session.asset(key), render, digest_asset(key)
 

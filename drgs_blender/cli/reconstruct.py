@@ -267,14 +267,11 @@ def _with_cameras(args: argparse.Namespace, masks: str) -> Path:
 
 def _telling(args: argparse.Namespace, bar: FractionBar) -> Callable[[str, float], None]:
     """Called as (phase, part done): the bar, and lines on stdout that programs may read."""
-    said = 0.0
+    lines = _Lines(args)
 
     def tell(phase: str, part: float) -> None:
-        nonlocal said
         bar(phase, part)
-        if not args.quiet and not sys.stdout.isatty() and time.monotonic() >= said + _REPORT_EVERY:
-            said = time.monotonic()
-            print(f'DRGS_PROGRESS part={part:.3f} surfels=0 phase="{phase}"', flush=True)
+        lines(phase, part)
 
     return tell
 
@@ -302,12 +299,25 @@ def _remove_if_empty(folder: Path) -> None:
         folder.rmdir()
 
 
+class _Lines:
+    """Lines on stdout that programs may read, one in a while; none on a terminal, where they would break the bar."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self._wanted, self._next = not args.quiet and not sys.stdout.isatty(), 0.0
+
+    def __call__(self, phase: str, part: float, surfels: int = 0, psnr: float | None = None) -> None:
+        now = time.monotonic()
+        if self._wanted and now >= self._next:
+            self._next = now + _REPORT_EVERY
+            known = "" if psnr is None else f"psnr={psnr:.2f} "
+            print(f'DRGS_PROGRESS part={part:.3f} surfels={surfels} {known}phase="{phase}"', flush=True)
+
+
 class _Teller:
     """Shows progress: a bar, lines on stdout that programs may read, the preview."""
 
     def __init__(self, args: argparse.Namespace, bar: FractionBar) -> None:
-        self._bar, self._next = bar, 0.0
-        self._lines = not args.quiet and not sys.stdout.isatty()  # they are for programs, and would break the bar
+        self._bar, self._lines = bar, _Lines(args)
         self._preview = args.out.with_name(f"{args.out.stem}.preview.png")
 
     def __call__(self, progress: Progress) -> None:
@@ -315,14 +325,7 @@ class _Teller:
         surfels = f", {progress.surfels} surfels" if progress.surfels else ""
         about = "" if is_preparing(progress.phase) else f"{surfels}{f', {progress.psnr:.1f} dB' if known else ''}"
         self._bar(f"{progress.phase}{about}", progress.part)
-        now = time.monotonic()
-        if self._lines and now >= self._next:
-            self._next = now + _REPORT_EVERY
-            psnr = f"psnr={progress.psnr:.2f} " if known else ""
-            print(
-                f'DRGS_PROGRESS part={progress.part:.3f} surfels={progress.surfels} {psnr}phase="{progress.phase}"',
-                flush=True,
-            )
+        self._lines(progress.phase, progress.part, progress.surfels, progress.psnr)
         if progress.picture is not None:
             from ..formats.images import write_png
 

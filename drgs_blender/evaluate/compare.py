@@ -107,7 +107,7 @@ def compare(
                 report["posed_geometry" if item.posed else "geometry"] = _geometry(item, pictures)
                 if not item.posed:
                     report["materials"] = _materials(item, pictures)
-    return _without_nan(report)
+    return without_nan(report)
 
 
 def _warn_of_known(asset: Asset, capture: Capture) -> None:
@@ -241,12 +241,12 @@ def _materials(item: TruthSet, pictures: list[dict[str, Array]]) -> dict[str, ob
     return material_scores(stack(pictures), stack(item.maps), _inside(item) & seen)
 
 
-def _without_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
     """None in place of what is not a number, so that the report is JSON."""
     if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
+        return {key: without_nan(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_without_nan(item) for item in value]
+        return [without_nan(item) for item in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 

@@ -47,7 +47,11 @@ def psnr(picture: Array, reference: Array, mask: Array | None = None) -> float:
     squared = (np.asarray(picture, np.float64) - reference) ** 2
     if mask is not None:
         squared = squared[mask]
-    error = squared.mean() if squared.size else np.nan
+    return decibels(float(squared.mean()) if squared.size else float("nan"))
+
+
+def decibels(error: float) -> float:
+    """PSNR in dB of a mean squared error of values in [0, 1], at most `MOST_PSNR`; of NaN, NaN."""
     return float(np.minimum(MOST_PSNR, -10 * np.log10(np.maximum(error, 1e-30))))  # unlike Python's, these keep NaN
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion, correlate1d
 
 from ...core.color import srgb_to_linear
-from ..metrics import MOST_PSNR
+from ..metrics import decibels
 
 Array = np.ndarray
 Distance = Callable[[Array, Array], float]
@@ -90,7 +90,7 @@ def _psnr(
     if encode:
         ours, true = encoded(ours), encoded(true)
     error, of_grey = float(((ours - true) ** 2).mean()), float(((0.5 * inside - true) ** 2).mean())
-    return float(min(MOST_PSNR, -10 * np.log10(max(min(error, of_grey), 1e-30)))), ours, true
+    return decibels(min(error, of_grey)), ours, true
 
 
 def _ssim(ours: Array, true: Array) -> float:

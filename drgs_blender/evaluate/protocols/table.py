@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import first_of
+from ..compare import without_nan
 from . import Protocol
 
 
@@ -33,7 +34,7 @@ def complete(
     notes : sequence of str
         Others.
     """
-    report = _without_nan(report)
+    report = without_nan(report)
     rows = list(report["objects"].values())
     means: dict[str, Any] = {}
     for column in protocol.columns:
@@ -100,12 +101,3 @@ def table(report: dict[str, Any], protocol: Protocol) -> list[str]:
     if report["notes"]:
         lines.append(f"Not to be compared with published tables: {'; '.join(report['notes'])}.")
     return lines
-
-
-def _without_nan(value: Any) -> Any:
-    """None in place of what is not a number, so that the report is JSON."""
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value

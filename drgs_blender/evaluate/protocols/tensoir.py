@@ -22,7 +22,7 @@ from ...reconstruct.capture.capture import Capture, View
 from ...reconstruct.readers import read_capture, tensoir
 from ...reconstruct.readers.layout import complain_of_missing
 from ...reconstruct.readers.photograph_loading import shrink
-from ..metrics import psnr
+from ..metrics import decibels
 from .bench import Array, Bench, existing, find_light, mean_of, read_light, shown_on_white, split_counts
 
 OBJECTS = ("armadillo", "ficus", "hotdog", "lego")
@@ -120,7 +120,7 @@ def _albedo_psnr(albedos: list[tuple[Array, Array]], factors: tuple[float, float
     for found, true in albedos:
         aligned = np.clip(found * np.asarray(factors), 0, 1)
         total += float(np.sum((aligned ** (1 / 2.2) - np.clip(true, 0, 1) ** (1 / 2.2)) ** 2, dtype=np.float64))
-    return psnr(np.full((1, 1, 1), np.sqrt(total / (3 * pixels))), np.zeros((1, 1, 1)))
+    return decibels(total / (3 * pixels))
 
 
 def _maps(source: Path, view: View) -> tuple[Array, Array, Array]:
