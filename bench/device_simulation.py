@@ -52,8 +52,8 @@ def timed(solver: Solver, frames: int) -> tuple[float, float]:
     return seconds[0], statistics.median(seconds[1:])
 
 
-def matter(particles: int, frames: int) -> str:
-    """The section's part: a table and what it is of."""
+def matter(particles: int, frames: int, pair: bool = False) -> str:
+    """The section's part: a table and what it is of; of a `pair`, the CPU and the card alone."""
     cards = cuda_devices()
     rows, reference, body = [], None, None
     for name, device, threads in (
@@ -61,6 +61,8 @@ def matter(particles: int, frames: int) -> str:
         ("Warp on the processor, 1 thread", "cpu", 1),
         ("Warp on CUDA", cards[0] if cards else None, 0),
     ):
+        if device == "cpu" and pair:
+            continue
         if device is None:
             rows.append([name, *[NOT_MEASURED] * 4])
             continue

@@ -39,8 +39,8 @@ def photographs(path: Path, size: int) -> Capture:
     return Capture(path, views, (0.0, 0.0, 0.0))
 
 
-def learning(path: Path, size: int, steps: int, surfels: int, missing: str) -> str:
-    """Table of the same steps everywhere; `missing` stands for what cannot be measured."""
+def learning(path: Path, size: int, steps: int, surfels: int, missing: str, pair: bool = False) -> str:
+    """Table of the same steps everywhere, of a `pair` by the CPU and a card; `missing`: what cannot be measured."""
     capture = photographs(path, size)
     region, schedule = find_region(capture), Schedule(iterations=steps, surfels=surfels)
 
@@ -61,8 +61,10 @@ def learning(path: Path, size: int, steps: int, surfels: int, missing: str) -> s
         rate = f"{steps / training.time_budget.spent:.1f}"
         return [rate, f"{len(training.gaussians)}", f"{found['psnr']:.2f} dB", f"{found['ssim']:.4f}"]
 
-    rows = [["Numba and torch, all threads", *run(CPU, 0)], ["Numba and torch, 1 thread", *run(CPU, 1)]]
-    rows.append(["Warp and torch on the processor, 1 thread", *run(WarpLearningBackend("cpu"), 1)])
+    rows = [["Numba and torch, all threads", *run(CPU, 0)]]
+    if not pair:
+        rows.append(["Numba and torch, 1 thread", *run(CPU, 1)])
+        rows.append(["Warp and torch on the processor, 1 thread", *run(WarpLearningBackend("cpu"), 1)])
     card = select_backend("cuda")
     rows.append(["Warp and torch on CUDA", *([missing] * 4 if card is CPU else run(card, 0))])
     head = (

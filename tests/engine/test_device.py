@@ -9,6 +9,8 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+from cards import DEVICE
+
 from drgs_blender.core.frame import Adjustment, ObjectState
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.engine import jit_events
@@ -18,7 +20,7 @@ from drgs_blender.engine.session import Session
 @pytest.fixture
 def warp_session(monkeypatch, asset_path):
     """A session for which Warp's processor is the card: the same code, without the card."""
-    monkeypatch.setattr("drgs_blender.render.gpu.select_backend.name_of", lambda device: "cpu")
+    monkeypatch.setattr("drgs_blender.render.gpu.select_backend.name_of", lambda device: DEVICE)
     session = Session()
     session.load_asset(asset_path)
     return session

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from cards import DEVICE
 
 if TYPE_CHECKING:
     from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
@@ -17,7 +18,7 @@ def _device() -> WarpRenderBackend:
     pytest.importorskip("warp", reason="warp-lang is not installed")
     from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 
-    return WarpRenderBackend("cpu")
+    return WarpRenderBackend(DEVICE)
 
 
 @pytest.fixture

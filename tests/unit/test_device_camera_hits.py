@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+from cards import DEVICE
 from shapes import scene_of, sphere_mesh, sphere_surfels
 from test_device_integrate import among_meshes, ball, floor, placed, psnr
 from test_raster import look_along_y
@@ -126,7 +127,7 @@ def test_meshes_behind_surfels_leave_the_surfels_as_they_are(device: WarpRenderB
 
 
 def test_a_card_that_fails_between_hits_and_points_leaves_them_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    device, scene, camera = WarpRenderBackend("cpu"), among_meshes()[0], VIEWS["perspective"]
+    device, scene, camera = WarpRenderBackend(DEVICE), among_meshes()[0], VIEWS["perspective"]
     expected = seen(CPU, scene, camera)
     parameters = camera_parameters(camera, RenderSettings(subpixel_samples=3, seed=5), 2)
     trace = device.trace
@@ -152,7 +153,7 @@ def test_a_card_that_fails_between_hits_and_points_leaves_them_whole(monkeypatch
 
 def test_points_whose_hits_are_lost_and_not_found_again_are_on_some_face(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where a device met the edge of a face, the processor's ray may go past."""
-    device, scene, camera = WarpRenderBackend("cpu"), among_meshes()[0], VIEWS["perspective"]
+    device, scene, camera = WarpRenderBackend(DEVICE), among_meshes()[0], VIEWS["perspective"]
     parameters = camera_parameters(camera, RenderSettings(subpixel_samples=3, seed=5), 2)
 
     def lost(*arguments: object) -> object:

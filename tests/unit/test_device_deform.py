@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+from cards import DEVICE, assert_same, host
 from test_deform_mesh_driven import blob, matrix, shell_surfels
 
 from drgs_blender.compute.warp.kernels import Launcher
@@ -56,7 +57,7 @@ POSES: dict[str, Callable[[Mesh], dict[str, Any]]] = {
 
 @pytest.fixture(scope="module")
 def deformer() -> Deformer:
-    return Deformer(Launcher("cpu"))
+    return Deformer(Launcher(DEVICE))
 
 
 @pytest.mark.slow
@@ -71,14 +72,14 @@ def test_a_device_poses_surfels_as_the_processor_does(deformer: Deformer, name: 
     found = arrays_of(there, deformer.launcher)
     for field in FIELDS:
         expected = getattr(here, field)
-        assert is_there(found[field]) and np.asarray(found[field]).dtype == expected.dtype
-        np.testing.assert_allclose(found[field], expected, 1e-5, 1e-6, err_msg=field)
-        np.testing.assert_array_equal(getattr(there, field), expected, field)  # made here when it is asked for
+        assert is_there(found[field]) and host(found[field]).dtype == expected.dtype
+        np.testing.assert_allclose(host(found[field]), expected, 1e-5, 1e-6, err_msg=field)
+        assert_same(getattr(there, field), expected, 1e-6, field)  # made here when it is asked for
 
 
 def test_what_does_not_change_is_copied_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a second frame, only vertices and matrix go to the card, and nothing comes back from it before it is read."""
-    asset, launcher, copied = driven(), Launcher("cpu"), []
+    asset, launcher, copied = driven(), Launcher(DEVICE), []
     launcher.apart, copy = True, launcher.array
     monkeypatch.setattr(launcher, "array", lambda array, *more: copied.append(array.nbytes) or copy(array, *more))
     deformer, vertices = Deformer(launcher), bent(asset.mesh)
@@ -90,7 +91,7 @@ def test_what_does_not_change_is_copied_once(monkeypatch: pytest.MonkeyPatch) ->
     there = deformer.pose(asset, vertices)
     arrays_of(there, launcher)
     assert sum(copied) == vertices.nbytes + 72
-    np.testing.assert_allclose(there._there["centre"], driven().pose(vertices).centre, 1e-5, 1e-6)
+    np.testing.assert_allclose(host(there._there["centre"]), driven().pose(vertices).centre, 1e-5, 1e-6)
 
 
 def test_surfels_on_vertices_that_are_not_finite_are_counted(deformer: Deformer) -> None:
@@ -120,13 +121,13 @@ def test_surfels_of_several_objects_lie_on_the_device_as_one(deformer: Deformer)
     assert len(whole) == 3 * len(first)
     for field in FIELDS:
         expected = np.concatenate([getattr(part, field) for part in parts])
-        np.testing.assert_allclose(whole.on(deformer.launcher)[field], expected, 1e-5, 1e-6, err_msg=field)
+        np.testing.assert_allclose(host(whole.on(deformer.launcher)[field]), expected, 1e-5, 1e-6, err_msg=field)
     np.testing.assert_array_equal(second.roughness, shades["roughness"])
 
 
 def test_no_memory_to_join_surfels_in_is_the_devices_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which the processor's work then follows."""
-    launcher, driver = Launcher("cpu"), driven()
+    launcher, driver = Launcher(DEVICE), driven()
     parts = [driver.pose(driver.mesh.vertices) for _ in range(2)]
 
     def full(*_: Any, **__: Any) -> None:

@@ -11,6 +11,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from capture_cases import BALLS, balls  # noqa: E402
+from cards import DEVICE  # noqa: E402
 from shapes import sphere_mesh  # noqa: E402
 from test_decouple import sky  # noqa: E402
 
@@ -30,7 +31,7 @@ POINTS = 300
 
 @pytest.fixture
 def there() -> WarpLearningBackend:
-    return WarpLearningBackend("cpu")
+    return WarpLearningBackend(DEVICE)
 
 
 def two_balls(places: Any = (((0, 0, 0), 1), ((2.2, 0, 0), 1))) -> Mesh:

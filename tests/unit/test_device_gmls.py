@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+from cards import DEVICE, assert_same
 from scipy.spatial.transform import Rotation
 from test_deform_gmls import CENTRE, cloud
 from test_simulate_bake import job_of
@@ -28,7 +29,7 @@ SOURCES, POINTS = cloud(2000, 0), cloud(700, 2)
 @pytest.fixture
 def launcher() -> Launcher:
     """Warp's processor with memory of its own, as a card has."""
-    found = Launcher("cpu")
+    found = Launcher(DEVICE)
     found.apart = True
     return found
 
@@ -67,7 +68,7 @@ def test_a_device_carries_points_as_the_processor_does(
     points, found, alone = Carrier(weights, launcher).carry(x, gradients)
     assert points.dtype == expected.dtype == kind and found.dtype == np.float32
     assert alone == turned and (turned > 0) == (name != "bent" and neighbours > 1)
-    np.testing.assert_array_equal(found, grown)
+    assert_same(found, grown, 1e-6)
     # Sums of single precision around the nearest source, in another order; then the sum with where that is.
     near = np.abs(expected - x[weights.source[:, 0]]).max() + np.abs(x - x.mean(axis=0)).max()
     np.testing.assert_allclose(points, expected, rtol=2 * EPS if kind is np.float32 else 0, atol=2 * EPS * near)
@@ -115,7 +116,7 @@ def test_of_a_frame_only_the_sources_go_to_the_device(launcher: Launcher, monkey
 @pytest.fixture
 def card(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Warp's processor is the card; the number of points of each call of `Carrier.carry`."""
-    monkeypatch.setattr("drgs_blender.simulation.solver.name_of", lambda device: "cpu")
+    monkeypatch.setattr("drgs_blender.simulation.solver.name_of", lambda device: DEVICE)
     inner, calls = Carrier.carry, []
 
     def carried(carrier: Carrier, *given: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:

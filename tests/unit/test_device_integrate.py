@@ -11,6 +11,8 @@ import trimesh
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+from cards import DEVICE
+
 from drgs_blender.core.frame import Layer, Light, MeshState, ObjectState, RenderSettings, Visibility, World
 from drgs_blender.core.materials import Image, Material, SurfaceDetail, Texture
 from drgs_blender.render.backend import CPU
@@ -36,7 +38,8 @@ def _not_optimised(device: WarpRenderBackend, monkeypatch: pytest.MonkeyPatch) -
     """Compiling takes longer than these small scenes: half as long without LLVM's optimisation."""
     import warp
 
-    monkeypatch.setattr(warp.config, "optimization_level", 0)
+    if DEVICE == "cpu":
+        monkeypatch.setattr(warp.config, "optimization_level", 0)
 
 
 def sky(size: tuple[int, int] = (32, 64)) -> EnvironmentLight:
@@ -288,7 +291,7 @@ def test_without_a_card_the_processor_does_all_and_says_so(monkeypatch: pytest.M
 
 def test_a_device_that_fails_is_left_alone_and_its_work_done_here(device: WarpRenderBackend, monkeypatch) -> None:
     scene, light, shining, points = under_lights()
-    broken = WarpRenderBackend("cpu")
+    broken = WarpRenderBackend(DEVICE)
     monkeypatch.setattr(
         broken.launcher, "_scratch_for", lambda *arguments: (_ for _ in ()).throw(RuntimeError("out of memory\nat 0"))
     )
@@ -334,7 +337,7 @@ def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> Non
     """A card cannot read this memory: here it is spoilt once the copies are made. Its scratch memory is turned."""
     scene, light, shining, points = among_meshes()
     expected = integrate(scene, light, points, SETTINGS, 3, shining)
-    apart = WarpRenderBackend("cpu")
+    apart = WarpRenderBackend(DEVICE)
     apart.launcher.apart = True
     apart.mirror.tables(scene, light, shining)
     materials = scene.mesh_materials

@@ -13,6 +13,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from capture_cases import balls  # noqa: E402
+from cards import DEVICE, assert_same  # noqa: E402
 from test_reconstruct_attributes import EYE, surfels  # noqa: E402
 from test_reconstruct_patches import given as two_views  # noqa: E402
 
@@ -40,11 +41,16 @@ FAST_FAULTS = {("forth", "device"), ("back", "memory")}
 
 @pytest.fixture(scope="module")
 def on_device() -> WarpLearningBackend:
-    return WarpLearningBackend("cpu")
+    return WarpLearningBackend(DEVICE)
 
 
 def random(*shape: int, seed: int = 0, low: float = 0.0, high: float = 1.0) -> Any:
     return torch.tensor(np.random.default_rng([seed, *shape]).uniform(low, high, shape), dtype=torch.float32)
+
+
+def at(by: LearningBackend, *values: Any) -> tuple[Any, ...]:
+    """Tensors where the backend has them."""
+    return tuple(value.to(by.device) for value in values)
 
 
 def assert_alike(
@@ -54,8 +60,8 @@ def assert_alike(
     results = []
     for by in (CPU, on_device):
         given = [value.clone().requires_grad_() for value in inputs]
-        found = work(by, *given)
-        found = found if isinstance(found, tuple) else (found,)
+        found = work(by, *at(by, *given))
+        found = at(CPU, *(found if isinstance(found, tuple) else (found,)))
         sum((f * random(*f.shape, seed=9, low=-1)).sum() for f in found).backward()
         grads = [torch.zeros_like(g) if g.grad is None else g.grad for g in given]
         results.append([*(f.detach() for f in found), *grads])
@@ -66,11 +72,11 @@ def assert_alike(
 @pytest.mark.parametrize(("bands", "reflections"), [(0, True), (2, True), (1, False)])
 def test_attributes(on_device: WarpLearningBackend, bands: int, reflections: bool) -> None:
     raw, centre = surfels()
-    names = list(raw)
-    assert_alike(
-        lambda by, *values: by.attributes(dict(zip(names, values, strict=True)), centre, EYE, bands, reflections),
-        list(raw.values()), on_device,
-    )  # fmt: skip
+
+    def work(by: LearningBackend, *values: Any) -> Any:
+        return by.attributes(dict(zip(raw, values, strict=True)), *at(by, centre), EYE, bands, reflections)
+
+    assert_alike(work, list(raw.values()), on_device)
 
 
 def test_what_is_mirrored(on_device: WarpLearningBackend) -> None:
@@ -80,7 +86,7 @@ def test_what_is_mirrored(on_device: WarpLearningBackend) -> None:
     alpha[:3] = 0.9 * float(BARE)
     features[4, 5, 3:6] = 0
     rays, cube = random(HEIGHT, WIDTH, 3, seed=2, low=-1), random(6, 3, 32, 32, seed=3, low=-2)
-    assert_alike(lambda by, f, a, c: by.mirrored(f, a, rays, pyramid(c)), [features, alpha, cube], on_device)
+    assert_alike(lambda by, f, a, c: by.mirrored(f, a, *at(by, rays), pyramid(c)), [features, alpha, cube], on_device)
 
 
 def test_gradients_of_shared_texels_do_not_depend_on_the_order() -> None:
@@ -113,27 +119,32 @@ def test_losses_of_the_shape(on_device: WarpLearningBackend, weights: tuple[floa
     maps = [alpha, alpha * (3 + 0.3 * random(HEIGHT, WIDTH, seed=1)), random(HEIGHT, WIDTH, seed=2)]
     normal, mask = random(HEIGHT, WIDTH, 3, seed=3, low=-0.7, high=0.7), random(HEIGHT, WIDTH, seed=4)
     rays, counts = random(HEIGHT, WIDTH, 3, seed=5, low=-1), random(HEIGHT, WIDTH, seed=6)
-    work = lambda by, a, z, d, n: by.shape_loss(a, z, d, n, mask, rays, counts, weights)  # noqa: E731
+    work = lambda by, a, z, d, n: by.shape_loss(a, z, d, n, *at(by, mask, rays, counts), weights)  # noqa: E731
     assert_alike(work, [*maps, normal], on_device)
 
 
 def test_patches_of_two_views(on_device: WarpLearningBackend) -> None:
     given = two_views()
     moving = [given.pop("depth"), given.pop("normal")]
-    assert_alike(lambda by, depth, normal: by.patch_loss(depth, normal, **given), moving, on_device, close=1e-2)
+
+    def loss(by: LearningBackend, depth: Any, normal: Any) -> Any:
+        there = {k: at(by, v)[0] if isinstance(v, torch.Tensor) else v for k, v in given.items()}
+        return by.patch_loss(depth, normal, **(there | {"greys": at(by, *given["greys"])}))
+
+    assert_alike(loss, moving, on_device, close=1e-2)
 
 
 def test_a_step_down(on_device: WarpLearningBackend) -> None:
     """To the last bit; gradients that are no numbers change nothing."""
     found = []
     for by in (CPU, on_device):
-        value, first, second = random(50, 6), random(50, 6, seed=1), random(50, 6, seed=2)
+        value, first, second = at(by, random(50, 6), random(50, 6, seed=1), random(50, 6, seed=2))
         gradient = random(50, 6, seed=3, low=-1)
         gradient[3, 2] = float("nan")
-        by.descend(value, gradient, first, second, np.linspace(0.01, 0.06, 6, dtype=np.float32))
-        found.append(torch.stack([value, first, second]))
-    assert torch.equal(*found)
-    assert found[0][0, 3, 2] == random(50, 6)[3, 2] != found[0][0, 3, 1]
+        by.descend(value, *at(by, gradient), first, second, np.linspace(0.01, 0.06, 6, dtype=np.float32))
+        found.append(torch.stack([value, first, second]).cpu())
+    assert_same(found[1], found[0], 1e-6)
+    assert found[1][0, 3, 2] == random(50, 6)[3, 2] != found[1][0, 3, 1]
 
 
 # --- whole steps -----------------------------------------------------------------------------------------------------
@@ -212,7 +223,7 @@ def test_a_device_that_fails_is_a_warning_and_the_processor_goes_on(
     caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
     """From where it failed: nothing is lost."""
-    on_device = WarpLearningBackend("cpu")
+    on_device = WarpLearningBackend(DEVICE)
     training = learned(capture, region, on_device, 10)
     expected = Training(capture, region, SCHEDULE)
     expected.restore(training.arrays())
@@ -246,7 +257,7 @@ def fail_at(
 def test_a_step_that_fails_half_done_is_done_again(
     capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    on_device = WarpLearningBackend("cpu")
+    on_device = WarpLearningBackend(DEVICE)
     training = learned(capture, region, on_device, 10)
     fail_at(DESCEND, on_device, RuntimeError("CUDA error"), monkeypatch)
     training.step()
@@ -261,7 +272,7 @@ def broken(*_: Any, **__: Any) -> None:
 
 def kept(capture: Capture, region: Region) -> tuple[Training, Training]:
     """A training on a device that has kept its state, and one of this processor with the same."""
-    training, here = learned(capture, region, WarpLearningBackend("cpu"), 7), Training(capture, region, SCHEDULE)
+    training, here = learned(capture, region, WarpLearningBackend(DEVICE), 7), Training(capture, region, SCHEDULE)
     training.fallback.save_state()
     here.restore(training.arrays())
     return training, here
@@ -292,7 +303,7 @@ def test_a_run_taken_up_on_a_device_goes_back_to_where_it_was_taken_up(
     capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun = learned(capture, region, CPU, 5)
-    training = Training(capture, region, SCHEDULE, backend=WarpLearningBackend("cpu"))
+    training = Training(capture, region, SCHEDULE, backend=WarpLearningBackend(DEVICE))
     training.restore(begun.arrays())
     step_that_loses_all(training, monkeypatch)
     begun.step()
@@ -311,7 +322,7 @@ def test_a_device_that_fails_before_the_first_step_learns_nothing(
         return on(self, by) if by is CPU else broken()
 
     monkeypatch.setattr(Gaussians, "on", broken_there)
-    training = Training(capture, region, SCHEDULE, backend=WarpLearningBackend("cpu"))
+    training = Training(capture, region, SCHEDULE, backend=WarpLearningBackend(DEVICE))
     assert training.fallback.backend is CPU
     assert "illegal memory" in training.fallback.failed
     training.step()
@@ -320,7 +331,7 @@ def test_a_device_that_fails_before_the_first_step_learns_nothing(
 def test_a_device_that_fails_between_two_starts_loses_neither(monkeypatch: pytest.MonkeyPatch) -> None:
     """The second begins with its first step, not with the first one's last."""
     capture = balls(count=24, size=40)
-    training = Training(capture, find_region(capture), SCHEDULE, backend=WarpLearningBackend("cpu"))
+    training = Training(capture, find_region(capture), SCHEDULE, backend=WarpLearningBackend(DEVICE))
     rival, on = training.trial.rival, Gaussians.on
     assert rival is not None
     while training.iteration < 11:
@@ -383,7 +394,7 @@ def test_nothing_of_this_process_meets_what_is_on_a_device(
         assert {tensor.device.type for tensor in tensors} == {"meta"}, kernel.function.__name__
         asked.append(kernel)
 
-    on_device = WarpLearningBackend("cpu")
+    on_device = WarpLearningBackend(DEVICE)
     on_device.device = torch.device("meta")
     monkeypatch.setattr(on_device.launcher, "launch", launch)
     ends = lambda counts: (torch.nn.functional.pad(torch.cumsum(counts, 0), (1, 0)), 1000)  # noqa: E731
@@ -404,7 +415,7 @@ def test_an_asset_is_learned_on_the_device_asked_for(
 ) -> None:
     """Surfels, mesh, surfels on the mesh: as on this processor, but for what begins as last digits."""
     pytest.importorskip("skimage")
-    monkeypatch.setattr(select_backend, "name_of", lambda device: "cpu")
+    monkeypatch.setattr(select_backend, "name_of", lambda device: DEVICE)
     used = []
     rasterise = WarpLearningBackend.rasterise
     monkeypatch.setattr(WarpLearningBackend, "rasterise", lambda *a, **k: used.append(1) or rasterise(*a, **k))

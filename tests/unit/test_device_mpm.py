@@ -13,6 +13,7 @@ from simulation_cases import energy, lattice, momenta, solver_of
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
 
+from cards import DEVICE
 from test_simulate_bake import asset_file, content, job_of
 
 from drgs_blender.cli.main import main
@@ -43,7 +44,7 @@ _FACES = [
 @pytest.fixture(scope="module")
 def launcher() -> Launcher:
     """Warp's processor with memory of its own, as a card has."""
-    found = Launcher("cpu")
+    found = Launcher(DEVICE)
     found.apart = True
     return found
 
@@ -318,7 +319,7 @@ def test_a_device_that_fails_within_a_frame_loses_nothing(
 @pytest.fixture
 def card(monkeypatch: pytest.MonkeyPatch) -> None:
     """Warp's processor is the card."""
-    monkeypatch.setattr("drgs_blender.simulation.solver.name_of", lambda device: "cpu")
+    monkeypatch.setattr("drgs_blender.simulation.solver.name_of", lambda device: DEVICE)
 
 
 @pytest.mark.slow

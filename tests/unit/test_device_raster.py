@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+from cards import DEVICE, assert_near
 from shapes import scene_of, sphere_mesh, sphere_surfels
 from test_raster import join, look_along_y, plane_of_surfels, random_surfels
 
@@ -46,9 +47,9 @@ def test_a_device_finds_the_samples_that_the_processor_finds(
     seen = here.alpha > 0
     assert seen.mean() > 0.1
     np.testing.assert_array_equal(there.alpha > 0, seen)
-    np.testing.assert_allclose(there.alpha, here.alpha, atol=1e-6)
-    np.testing.assert_allclose(there.depth[seen], here.depth[seen], rtol=1e-5)
-    np.testing.assert_allclose(there.surface[seen], here.surface[seen], atol=1e-5)
+    assert_near(there.alpha, here.alpha, atol=1e-6)
+    assert_near(there.depth[seen], here.depth[seen], rtol=1e-5)
+    assert_near(there.surface[seen], here.surface[seen], atol=1e-5)
     np.testing.assert_array_equal(there.object_index[seen], here.object_index[seen])
 
 
@@ -104,7 +105,7 @@ def test_points_are_tied_to_the_mesh_as_the_processor_ties_them(
 
 
 def test_blended_samples_are_not_copied_to_a_card_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    device, scene, camera, copied = WarpRenderBackend("cpu"), scene_of(sphere_mesh(2)), look_along_y(48, 40), []
+    device, scene, camera, copied = WarpRenderBackend(DEVICE), scene_of(sphere_mesh(2)), look_along_y(48, 40), []
     device.launcher.apart, copy = True, device.launcher.array
     monkeypatch.setattr(
         device.launcher, "array", lambda array, *more, **how: copied.append(array) or copy(array, *more, **how)

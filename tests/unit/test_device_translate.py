@@ -11,6 +11,8 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+from cards import DEVICE
+
 from drgs_blender.compute.jit import njit
 from drgs_blender.compute.warp.kernels import Launcher, ScratchArray, WarpKernel
 from drgs_blender.compute.warp.runtime import load_module, warp
@@ -54,14 +56,14 @@ def on_device(function: Any, columns: list[np.ndarray], extra: tuple = (), nativ
         f"    t = wp.tid()\n    {found} = {call}\n{writes}"
     )
     wp, module = warp(), load_module(translation.source)
-    inputs = [wp.array(c, dtype=getattr(wp, k), device="cpu") for c, k in zip(columns, kinds)]
+    inputs = [wp.array(c, dtype=getattr(wp, k), device=DEVICE) for c, k in zip(columns, kinds)]
     for value in extra:
         struct = getattr(module, type(value).__name__)()
         for name, part in value._asdict().items():
             setattr(struct, name, part)
         inputs.append(struct)
-    out = wp.zeros((len(columns[0]), results), dtype=wp.float64, device="cpu")
-    wp.launch(module.run, dim=len(columns[0]), inputs=[*inputs, out], device="cpu")
+    out = wp.zeros((len(columns[0]), results), dtype=wp.float64, device=DEVICE)
+    wp.launch(module.run, dim=len(columns[0]), inputs=[*inputs, out], device=DEVICE)
     return out.numpy()
 
 
@@ -270,7 +272,7 @@ def test_records_hold_arrays_and_tuples_by_name() -> None:
         spans = Spans(Span(values, (F(0.25), F(3.0)), doubled, Scale(F(0.3), 7)), 5)
         expected, found = np.zeros((2, 40), np.float32), np.zeros((2, 40), np.float32)
         records(0, 1, Own(np.zeros(1, np.int64)), spans, expected)
-        Launcher("cpu").launch(WarpKernel(records, Own(ScratchArray("int64", (1,))), {}), 40, [spans], list(found))
+        Launcher(DEVICE).launch(WarpKernel(records, Own(ScratchArray("int64", (1,))), {}), 40, [spans], list(found))
         np.testing.assert_array_equal(found, expected)
 
 
@@ -298,12 +300,12 @@ def _inner(a, b):  # type: ignore[no-untyped-def]
 
 def test_rows_of_arrays_are_arrays() -> None:
     table, found = np.random.default_rng(1).normal(size=(9, 2, 3)), np.zeros(9)
-    Launcher("cpu").launch(WarpKernel(rows_of, (), {}), 9, [table], [found])
+    Launcher(DEVICE).launch(WarpKernel(rows_of, (), {}), 9, [table], [found])
     np.testing.assert_array_equal(found, table[:, 1, 0] * table[:, 0, 1] + 3 + 2)
 
 
 def test_a_recorded_launch_does_its_work_whenever_it_is_called() -> None:
-    launcher = Launcher("cpu")
+    launcher = Launcher(DEVICE)
     table, found = launcher.array(np.ones((9, 2, 3)), copy=True), launcher.zeros((9,), "float64")
     again = launcher.recorded(WarpKernel(rows_of, (), {}), 9, [table], [found])
     assert not found.numpy().any()

@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+from cards import DEVICE
 from test_device_integrate import ball, floor, placed
 
 from drgs_blender.compute.warp.kernels import WarpKernel
@@ -56,7 +57,7 @@ def assert_agree(device: WarpRenderBackend, scene: TraceScene) -> None:
 
 @pytest.fixture
 def device() -> WarpRenderBackend:
-    return WarpRenderBackend("cpu")
+    return WarpRenderBackend(DEVICE)
 
 
 def moved(item: TraceObject, by: np.ndarray) -> TraceObject:
@@ -105,7 +106,7 @@ def test_what_stands_in_places_is_followed(device: WarpRenderBackend) -> None:
 
 
 def test_of_a_scene_that_moves_only_vertices_go_to_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
-    device, scene, item, copied = WarpRenderBackend("cpu"), TraceScene(), ball((0.0, 0.0, 0.0), 1.0), []
+    device, scene, item, copied = WarpRenderBackend(DEVICE), TraceScene(), ball((0.0, 0.0, 0.0), 1.0), []
     device.launcher.apart, copy = True, device.launcher.array
     monkeypatch.setattr(
         device.launcher, "array", lambda array, *more, **how: copied.append(array.nbytes) or copy(array, *more, **how)

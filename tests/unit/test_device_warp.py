@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cards import DEVICE
 
 from drgs_blender.compute.folders import cache_folder
 from drgs_blender.compute.warp.kernels import Launcher, WarpKernel
@@ -81,7 +82,7 @@ found = np.zeros(3, np.float32)
 
 def test_whatever_warp_raises_is_the_devices_failure_but_a_stop_is_none() -> None:
     pytest.importorskip("warp", reason="warp-lang is not installed")
-    launcher = Launcher("cpu")
+    launcher = Launcher(DEVICE)
     with pytest.raises(DeviceError, match="kernel build failed"), launcher.failures("light"):
         raise Exception("CUDA kernel build failed with error code 6\nlog")
     with pytest.raises(Cancelled), launcher.failures("light"):
@@ -103,7 +104,7 @@ def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
 
 def test_a_folder_of_kernels_that_cannot_be_written_is_the_devices_failure(folder: Path) -> None:
     pytest.importorskip("warp", reason="warp-lang is not installed")
-    launcher = Launcher("cpu")
+    launcher = Launcher(DEVICE)
     shutil.rmtree(folder / "warp", ignore_errors=True)
     (folder / "warp").write_bytes(b"")
     with pytest.raises(DeviceError, match="nothing"):

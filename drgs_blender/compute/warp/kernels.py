@@ -49,6 +49,8 @@ class WarpKernel:
         See `Translation`.
     constants : callable
         See `Translation`.
+    level : int, optional
+        Of optimisation by NVIDIA's compiler, 1 to 3; None: Warp's own.
     """
 
     def __init__(
@@ -57,12 +59,13 @@ class WarpKernel:
         scratch: ScratchTree,
         natives: Mapping[Any, Any],
         constants: Constants = lambda module, name, value: value,
+        level: int | None = None,
     ) -> None:
-        self.function, self.scratch = function, scratch
+        self.function, self.scratch, self._level = function, scratch, level
         self._natives, self._constants = natives, constants
 
     def module(self, types: tuple[Type, ...], fused: bool) -> ModuleType:
-        """Module whose ``run`` is the kernel for arguments of these types."""
+        """Module whose ``run`` is the kernel for arguments of these types; `fused` for a card."""
         translation = Translation(self._natives, self._constants, fused)
         kinds = _types(self.scratch)
         made = translation.function(self.function, ["int64", "int64", kinds, *types])
@@ -75,7 +78,10 @@ class WarpKernel:
         translation.add(
             f"@wp.kernel\ndef run({', '.join(parameters)}):\n    t = wp.tid()\n    {made.name}({', '.join(arguments)})"
         )
-        return load_module(translation.source)
+        module = load_module(translation.source)
+        if fused and self._level is not None:
+            warp().set_module_options({"optimization_level": self._level}, module)
+        return module
 
 
 class Launcher:

@@ -31,7 +31,13 @@ class TensorLauncher(Launcher):
         self.place = torch.device(str(warp().device_to_torch(self.device)))
 
     def launch(self, kernel: WarpKernel, pieces: int, arguments: Sequence[Any], out: Sequence[Any]) -> None:
-        """`Launcher.launch`, among torch's own work on the device; nothing where there are no pieces."""
+        """`Launcher.launch`, among torch's own work on the device; nothing where there are no pieces.
+
+        Raises
+        ------
+        ValueError
+            For a tensor of another device.
+        """
         if not pieces:
             return
         with self._in_order():
@@ -39,6 +45,8 @@ class TensorLauncher(Launcher):
 
     def _shared(self, value: Any) -> Any:
         if isinstance(value, torch.Tensor):
+            if value.device != self.place:  # its address would be read on the other, which ends all work there
+                raise ValueError(f"a tensor on {value.device} for a kernel on {self.place}")
             return warp().from_torch(value.detach())
         plain = isinstance(value, tuple) and not hasattr(value, "_fields")
         return tuple(map(self._shared, value)) if plain else value
