@@ -66,10 +66,14 @@ def compare(program: str, earlier: Checkout, now: Checkout, pairs: int) -> list[
     return rows
 
 
+def _section(commit: str) -> str:
+    return f"earlier {commit}"
+
+
 def measured_before(commit: str, document: str) -> list[list[object]]:
     """Rows of `COLUMNS` that docs/benchmarks.md has for the same commit."""
-    section = section_pattern("earlier").search(document)
-    if section is None or f"of commit {commit} and" not in section[0]:
+    section = section_pattern(_section(commit)).search(document)
+    if section is None:
         return []
     lines = re.findall(r"^\| (.+) \|$", section[0], re.MULTILINE)
     return [list(line.split(" | ")) for line in lines[1:]]
@@ -95,7 +99,7 @@ def main() -> None:
                 "programs measured last) after one that compiles: medians, and the ratios of the pairs. Times and "
                 "rates, as in the program's own section.\n\n"
             )
-            write_section("earlier", "Against an earlier commit", body + table(COLUMNS, rows))
+            write_section(_section(options.commit), f"Against commit {options.commit}", body + table(COLUMNS, rows))
 
 
 if __name__ == "__main__":
