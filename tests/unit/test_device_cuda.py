@@ -97,6 +97,7 @@ def test_particles_kernels_compile_for_a_card(tmp_path: Path, case: str) -> None
         cells.INDEX,
         cells.FIND_HOMES,
         steps.PREPARE,
+        steps.GATHER,
         steps.SOLVE,
         steps.MOVE,
         steps.END_STEP,

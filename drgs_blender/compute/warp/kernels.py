@@ -172,7 +172,7 @@ class Launcher:
         module = self._ready(kernel, tuple(type_for(a) for a in (*arguments, out)))
         stride = min(pieces, MAX_THREADS)
         inputs = [self._argument(module, part) for part in parts_of(tuple(arguments))]
-        given = [stride, *self._scratch_for(kernel, stride), *inputs, *found]
+        given = [stride, *self._scratch_for(kernel, stride), *inputs, *(self._argument(module, part) for part in found)]
         return warp().launch(module.run, stride, given, device=self.device, **how)
 
     def _ready(self, kernel: WarpKernel, types: tuple[Type, ...]) -> ModuleType:
