@@ -421,3 +421,10 @@ def test_an_asset_is_learned_on_the_device_asked_for(
     reports = [asset.provenance["report"] for asset in (expected, found)]
     assert abs(reports[0]["psnr"] - reports[1]["psnr"]) < 0.3
     assert reports[0]["psnr"] > 18
+
+
+def test_a_tensor_of_another_device_is_refused(on_device: WarpLearningBackend) -> None:
+    """A card would read its address in its own memory, and fail at everything from then on."""
+    value = torch.zeros(3, 2, device="meta")
+    with pytest.raises(ValueError, match="a tensor on meta for a kernel on"):
+        on_device.launcher.launch(DESCEND, 3, (value, value), (value, value, value))

@@ -86,8 +86,8 @@ def pixel_gradient_rows(thread, stride, scratch, maps, texels, seen, incoming, o
     texels, seen, incoming : array
         As of `reflection_probe.pixel_gradients`.
     out : tuple of array
-        Gradients of features and coverage, rows of the texels (h * w, 8) and their gradients (h * w, 8, 3), all of
-        zeros; written.
+        Gradients of features and coverage, rows of the texels (h * w, 8) and their gradients (h * w, 8, 3); all
+        but the rows of zeros; written.
     """
     features, alpha, rays = maps
     to_features, to_alpha, places, shares = out
@@ -159,7 +159,9 @@ class _Mirrored(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Any, ...]:
         launcher, blended, cover, rays, light, seen = ctx.save
         to_features, to_alpha = torch.zeros_like(blended), torch.zeros_like(cover)
-        places = torch.zeros((cover.numel(), _TEXELS), dtype=torch.int64, device=cover.device)
+        # Pixels that mirror nothing add zeros: to all rows, for a card adds to one row one after the other.
+        number = torch.arange(cover.numel() * _TEXELS, device=cover.device)
+        places = (number % len(light)).reshape(-1, _TEXELS)
         shares = blended.new_zeros(cover.numel(), _TEXELS, 3)
         given = (blended, cover, rays), light, seen, gradients[0].contiguous()
         launcher.launch(PIXEL_GRADIENTS, cover.numel(), given, (to_features, to_alpha, places, shares))

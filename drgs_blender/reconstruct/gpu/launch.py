@@ -72,8 +72,8 @@ class TensorLauncher(Launcher):
                 raise ValueError(f"a tensor on {value.device} for a kernel on {self.place}")
             return SharedTensor(value)
         if isinstance(value, tuple):
-            make = type(value)._make if hasattr(value, "_fields") else tuple
-            return make(map(self._shared, value))
+            parts = map(self._shared, value)
+            return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
         return value
 
     def _argument(self, module: ModuleType, value: Any) -> Any:

@@ -99,7 +99,22 @@ def _difference(alpha, depth, rays, y1, x1, y0, x0):  # type: ignore[no-untyped-
 
 @njit
 def disagree(y, x, maps, counts, most, slopes, to_normal):  # type: ignore[no-untyped-def]
-    """Disagreement of an inner pixel; writes gradients of its normal and of its two differences (2, h, w, 3)."""
+    """Disagreement of an inner pixel's normals, times its count.
+
+    Parameters
+    ----------
+    y, x : int
+    maps : tuple of array
+        Coverage, sums of depth and of normals, and rays, as of `shape_loss`.
+    counts : (h, w) float32 array
+        As of `shape_loss`.
+    most : float32
+        Factor of the gradients.
+    slopes : (2, h, w, 3) float32 array
+        Gradients of the two differences of neighbours; the pixel's are written.
+    to_normal : (h, w, 3) float32 array
+        Gradients of the normals; the pixel's is written.
+    """
     alpha, depth, normal, rays = maps
     covered = alpha[y, x]
     if not covered > COVERED:
@@ -137,7 +152,18 @@ def _disagreement(first, last, maps, counts, most, slopes, to_normal, rows):  # 
 
 @njit
 def add_to_depth(y, x, alpha, depth, rays, slopes, to_alpha, to_depth):  # type: ignore[no-untyped-def]
-    """Add the gradients of a pixel's depth and coverage, from its four neighbours."""
+    """Add the gradients of a pixel's depth and coverage, from its four neighbours.
+
+    Parameters
+    ----------
+    y, x : int
+    alpha, depth, rays : array
+        As of `shape_loss`.
+    slopes : (2, h, w, 3) float32 array
+        Of `disagree`.
+    to_alpha, to_depth : (h, w) float32 array
+        Added to.
+    """
     height, width = alpha.shape
     g = np.float32(0.0)
     for c in range(3):

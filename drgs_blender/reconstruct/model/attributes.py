@@ -189,7 +189,21 @@ def write_colours(
 
 @njit
 def write_gradients(first, last, rotation, values, normal, found, incoming, out):  # type: ignore[no-untyped-def]
-    """Gradients of the raw parameters, into arrays of zeros; `values` as of `write_colours`."""
+    """Gradients of the raw parameters of a range of surfels.
+
+    Parameters
+    ----------
+    first, last : int
+    rotation : (n, 4) float32 array
+    values : (n, k) float32 array
+        As of `write_colours`.
+    normal : (n, 3) float32 array
+        As of `frames`.
+    found, incoming : Attributes or tuple of array
+        What the parameters gave, and its gradients.
+    out : Learned or tuple of array
+        Of zeros; written.
+    """
     u, v, alpha, features = found
     g_u, g_v, g_alpha, g_features = incoming
     to_scale, to_rotation, to_opacity, to_sh, to_tint, to_blur = out

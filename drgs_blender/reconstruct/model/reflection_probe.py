@@ -145,7 +145,18 @@ def _look_up_rows(first, last, features, alpha, rays, texels, seen):  # type: ig
 
 @njit
 def look_up(pixel, alpha, ray, texels, seen):  # type: ignore[no-untyped-def]
-    """Add the light that comes from where a pixel reflects to `seen` (3,)."""
+    """Add the light that comes from where a pixel reflects.
+
+    Parameters
+    ----------
+    pixel : (10,) float32 array
+        Features.
+    alpha : float32
+    ray : (3,) float32 array
+    texels : (texels, 3) float32 array
+    seen : (3,) float32 array
+        Added to.
+    """
     _, _, _, direction = _turned(pixel, ray)
     _, _, face, a, b = _face(direction)
     _, low, mix = _levels(pixel, alpha)
@@ -163,7 +174,19 @@ def look_up(pixel, alpha, ray, texels, seen):  # type: ignore[no-untyped-def]
 
 @njit
 def texel_shares(pixel, alpha, ray, incoming, places, shares):  # type: ignore[no-untyped-def]
-    """The eight texels that a pixel has looked up: their rows (8,), and their gradients (8, 3)."""
+    """The eight texels that a pixel has looked up, and their gradients.
+
+    Parameters
+    ----------
+    pixel, alpha, ray : array or float
+        As of `look_up`.
+    incoming : (3,) float32 array
+        Gradient of what the pixel mirrors.
+    places : (8,) int64 array
+        Rows of the texels; written.
+    shares : (8, 3) float32 array
+        Gradients; written.
+    """
     _, _, _, direction = _turned(pixel, ray)
     _, _, face, a, b = _face(direction)
     _, low, mix = _levels(pixel, alpha)
@@ -196,7 +219,19 @@ def _look_up_backward(first, last, features, alpha, rays, texels, seen, incoming
 
 @njit
 def pixel_gradients(given, texels, adds, out):  # type: ignore[no-untyped-def]
-    """Gradients of a pixel's features and coverage; those of texels are added where `adds`, see `texel_shares`."""
+    """Gradients of a pixel's features and coverage, and of the texels that it has looked up.
+
+    Parameters
+    ----------
+    given : tuple
+        Features, coverage and ray as of `look_up`, what it has seen, and the gradient of what it mirrors.
+    texels : (texels, 3) float32 array
+    adds : bool
+        Whether those of texels are added; `texel_shares` finds them otherwise.
+    out : tuple
+        Gradients of features (10,), written; coverages of a row of pixels, the pixel's place among them, written; and
+        texels (texels, 3).
+    """
     pixel, alpha, ray, seen, incoming = given
     to_pixel, to_alpha, x, to_texels = out
     one, two = np.float32(1.0), np.float32(2.0)

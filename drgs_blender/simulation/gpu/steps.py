@@ -155,7 +155,7 @@ def chosen(weights: Any, which: Any) -> Any:
 
 
 def gathered(i: Any, j: Any, k: Any, s: Any, ci: Any, blocks: Any, given: Any, pins: Any) -> Any:
-    """Momentum and mass of node (i, j, k) of active block s from the cells at `ci` along x, and those of what is pinned.
+    """Momentum and mass of node (i, j, k) of active block s, from the cells at `ci` along x, and of what is pinned.
 
     `given` is what `prepare_particles` wrote.
     """
