@@ -32,14 +32,15 @@ def source_digest() -> str:
 def asset_path(name: str, textures: bool = False, **options: Any) -> Path:
     """`.drgs` of an example as `drgs make` builds it with `options`, made once for these sources.
 
-    Without `textures` its materials are those of its vertices alone, which Cycles is given as well.
+    Without `textures` its materials are those of its vertices alone, which Cycles is given as well, and it has no more
+    surfels than these need.
     """
-    kind = ["textures"] if textures else []
+    kind = ["textures" if textures else "plain"]
     path = OUT / source_digest() / ("-".join([name, *map(str, options.values()), *kind]) + ".drgs")
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         file, defaults = SOURCES[name]
-        options |= {} if textures else {"max_texture": 0}
+        options |= {} if textures else {"max_texture": 0, "max_surfels": 1}
         write_asset(path, make_asset(ROOT / "examples" / file, **defaults, **options))
     return path
 

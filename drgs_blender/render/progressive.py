@@ -183,8 +183,8 @@ class Progressive:
         self._adaptive = part_count(frame.settings) > 1
         self._next = 0
         self._parameters = camera_parameters(frame.camera, frame.settings, frame.noise_index)
-        _, top, _, bottom = frame.camera.window
-        height = strip_height(frame.camera.window[2] - frame.camera.window[0], frame.settings.subpixel_count)
+        left, top, right, bottom = frame.camera.window
+        height = backend.strips * strip_height(right - left, frame.settings.subpixel_count)
         self._strips = [_Strip((y, min(y + height, bottom))) for y in range(top, bottom, height)]
         self._visible: VisibleSurfaces | None = None
         self._left = KEPT_BYTES

@@ -9,12 +9,15 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
-from cards import DEVICE
+from cards import DEVICE, IS_CARD
 
 from drgs_blender.core.frame import Adjustment, ObjectState
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.engine import jit_events
 from drgs_blender.engine.session import Session
+
+#: dB between devices; of a card, one of these few pixels may see the other of two faces.
+LIKE = 45.0 if IS_CARD else 60.0
 
 
 @pytest.fixture
@@ -39,7 +42,7 @@ def test_the_picture_is_the_processors(session, warp_session, make_frame, change
     here, there = session.render(frames[0]), warp_session.render(frames[1])
     assert there.warnings == here.warnings
     for name in passes:
-        assert here[name].any() and psnr(here[name], there[name]) > 60.0
+        assert here[name].any() and psnr(here[name], there[name]) > LIKE
 
 
 @pytest.mark.slow
@@ -68,7 +71,7 @@ def test_surfels_stay_on_a_device_from_deformation_to_picture(session, warp_sess
             poses.clear()
             pictures.append(which.render(frame)["Combined"])
             counts.append(len(poses))
-        assert psnr(*pictures) > 60.0, case
+        assert psnr(*pictures) > LIKE, case
         assert counts[0] > 0 and counts[1] == (case == "grainy")
 
 
@@ -80,7 +83,7 @@ def test_viewports_grow_on_a_device(session, warp_session, make_frame):
         while passes.statistics["view.fraction"] < 1.0:
             passes = which.refine("v")
         last.append(passes["Combined"])
-    assert psnr(*last) > 60.0
+    assert psnr(*last) > LIKE
 
 
 def test_without_a_card_a_frame_is_rendered_here_with_a_warning(session, make_frame, monkeypatch):

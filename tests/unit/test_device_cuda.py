@@ -71,14 +71,17 @@ def test_learnings_kernels_compile_for_a_card(tmp_path: Path) -> None:
     import test_device_learning
     import test_device_surfels
 
-    from drgs_blender.reconstruct.gpu import gather, kernels, losses, warp_backend
+    from drgs_blender.reconstruct.gpu import appearance, gather, kernels, losses, warp_backend
 
     device = warp_backend.WarpLearningBackend("cpu")
     test_device_surfels.test_every_map_has_a_gradient_of_its_own(device.launcher)
     test_device_learning.test_difference_from_a_photograph(device)
+    test_device_learning.test_attributes(device, 2, True)
+    test_device_learning.test_what_is_mirrored(device)
+    test_device_learning.test_losses_of_the_shape(device, (0.0, 0.0, 0.25))
     test_device_learning.test_a_step_down(device)
     test_device_gather.test_what_arrives_and_its_derivatives(device, {})
-    modules = kernels, losses, warp_backend, gather
+    modules = appearance, kernels, losses, warp_backend, gather
     wanted = {
         kernel for module in modules for kernel in vars(module).values() if isinstance(kernel, kernels.WarpKernel)
     }
@@ -97,6 +100,7 @@ def test_particles_kernels_compile_for_a_card(tmp_path: Path, case: str) -> None
         cells.INDEX,
         cells.FIND_HOMES,
         steps.PREPARE,
+        steps.GATHER,
         steps.SOLVE,
         steps.MOVE,
         steps.END_STEP,

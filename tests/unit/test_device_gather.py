@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from capture_cases import BALLS, balls  # noqa: E402
-from cards import DEVICE  # noqa: E402
+from cards import DEVICE, IS_CARD  # noqa: E402
 from shapes import sphere_mesh  # noqa: E402
 from test_decouple import sky  # noqa: E402
 
@@ -119,4 +119,4 @@ def test_materials_and_light_are_those_that_the_processor_finds(
     for name in ("albedo", "roughness", "environment"):
         a, b = getattr(here, name), getattr(other, name)
         assert np.ptp(a) > 0.05, name
-        assert np.linalg.norm(a - b) < 0.01 * np.linalg.norm(a), name
+        assert np.linalg.norm(a - b) < (0.03 if IS_CARD else 0.01) * np.linalg.norm(a), name

@@ -51,6 +51,8 @@ class WarpKernel:
         See `Translation`.
     level : int, optional
         Of optimisation by NVIDIA's compiler, 1 to 3; None: Warp's own.
+    exact : bool
+        Products and sums round as on the CPU, also on a card: where the difference of equal products has to be zero.
     """
 
     def __init__(
@@ -60,13 +62,14 @@ class WarpKernel:
         natives: Mapping[Any, Any],
         constants: Constants = lambda module, name, value: value,
         level: int | None = None,
+        exact: bool = False,
     ) -> None:
-        self.function, self.scratch, self._level = function, scratch, level
+        self.function, self.scratch, self._level, self._exact = function, scratch, level, exact
         self._natives, self._constants = natives, constants
 
     def module(self, types: tuple[Type, ...], fused: bool) -> ModuleType:
         """Module whose ``run`` is the kernel for arguments of these types; `fused` for a card."""
-        translation = Translation(self._natives, self._constants, fused)
+        translation = Translation(self._natives, self._constants, fused and not self._exact)
         kinds = _types(self.scratch)
         made = translation.function(self.function, ["int64", "int64", kinds, *types])
         scratch = [f"r{i}" for i in range(len(given(kinds)))]
@@ -172,7 +175,7 @@ class Launcher:
         module = self._ready(kernel, tuple(type_for(a) for a in (*arguments, out)))
         stride = min(pieces, MAX_THREADS)
         inputs = [self._argument(module, part) for part in parts_of(tuple(arguments))]
-        given = [stride, *self._scratch_for(kernel, stride), *inputs, *found]
+        given = [stride, *self._scratch_for(kernel, stride), *inputs, *(self._argument(module, part) for part in found)]
         return warp().launch(module.run, stride, given, device=self.device, **how)
 
     def _ready(self, kernel: WarpKernel, types: tuple[Type, ...]) -> ModuleType:

@@ -81,9 +81,10 @@ def _constants(module: ModuleType, name: str, value: Any) -> Any:
     return 1 if module is pose and name == "_BLOCK" else value
 
 
-WEIGH = WarpKernel(weigh_corners, (), {})
-SUM = WarpKernel(sum_corners, (), {})
-POSE = WarpKernel(pose.pose_surfels, (), {}, _constants)
+# Exact: faces without area have to be found as the CPU finds them, or surfels near them turn elsewhere.
+WEIGH = WarpKernel(weigh_corners, (), {}, exact=True)
+SUM = WarpKernel(sum_corners, (), {}, exact=True)
+POSE = WarpKernel(pose.pose_surfels, (), {}, _constants, exact=True)
 
 
 class _Tables(NamedTuple):

@@ -1,4 +1,8 @@
-"""Appearance of a view in tensor operations, for any device: `attributes` and `reflection` without compiled code."""
+"""Appearance of a view on a device: `model.attributes` and `model.reflection_probe`, one thread per surfel or pixel.
+
+The functions of a surfel and of a pixel are the CPU's. Texels that many pixels share sum their gradients as whole
+numbers, in any order the same.
+"""
 
 from __future__ import annotations
 
@@ -8,102 +12,168 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from ...compute.warp.kernels import WarpKernel
 from ...core.arrays import Array
 from ...formats.harmonics import polynomials
-from ..model.attributes import BLUR, NORMAL, TINT
-from ..model.reflection_probe import BARE, LEVELS, SHARPEST
+from ..model.attributes import BLUR, TINT, Attributes, Learned, write_colours, write_frames, write_gradients
+from ..model.reflection_probe import BARE, look_up, pixel_gradients, texel_shares
+from .launch import TensorLauncher
 
 #: Bits of the largest of the whole numbers that gradients of texels are summed as; 2^27 pixels may share a texel.
 _BITS = 36
+#: Texels that a pixel looks up: four of each of two levels.
+_TEXELS = 8
+
+
+def attribute_rows(thread, stride, scratch, raw, away, values, out):  # type: ignore[no-untyped-def]
+    """`attributes.frames` and `attributes.write_colours`.
+
+    Parameters
+    ----------
+    thread, stride, scratch : int64 or tuple
+        See `compute.warp.kernels`; so of all kernels here.
+    raw, away, values : Learned or array
+        As of `attributes.write_colours`.
+    out : tuple of array
+        The fields of `Attributes`, and normals (n, 3); written.
+    """
+    u, v, alpha, features, normal = out
+    for i in range(thread, len(away), stride):
+        write_frames(i, i + 1, raw.scale, raw.rotation, u, v, normal)
+        write_colours(i, i + 1, raw, normal, away, values, Attributes(u, v, alpha, features))
+
+
+def attribute_gradient_rows(thread, stride, scratch, rotation, values, normal, found, incoming, out):  # type: ignore[no-untyped-def]
+    """`attributes.write_gradients`.
+
+    Parameters
+    ----------
+    thread, stride, scratch : int64 or tuple
+    rotation, values, normal, found, incoming, out : array or tuple
+        As of `attributes.write_gradients`.
+    """
+    for i in range(thread, len(normal), stride):
+        write_gradients(i, i + 1, rotation, values, normal, found, incoming, out)
+
+
+def look_up_pixels(thread, stride, scratch, features, alpha, rays, texels, out):  # type: ignore[no-untyped-def]
+    """`reflection_probe.look_up`.
+
+    Parameters
+    ----------
+    thread, stride, scratch : int64 or tuple
+    features, alpha, rays, texels : array
+        As of `reflection_probe.mirrored`.
+    out : tuple of array
+        Light (h, w, 3), of zeros; written.
+    """
+    (seen,) = out
+    h, w = alpha.shape
+    for number in range(thread, h * w, stride):
+        y, x = number // w, number % w
+        if alpha[y, x] > BARE:
+            look_up(features[y, x], alpha[y, x], rays[y, x], texels, seen[y, x])
+
+
+def pixel_gradient_rows(thread, stride, scratch, maps, texels, seen, incoming, out):  # type: ignore[no-untyped-def]
+    """`reflection_probe.pixel_gradients` and `reflection_probe.texel_shares`.
+
+    Parameters
+    ----------
+    thread, stride, scratch : int64 or tuple
+    maps : tuple of array
+        Features, coverage and rays, as of `reflection_probe.mirrored`.
+    texels, seen, incoming : array
+        As of `reflection_probe.pixel_gradients`.
+    out : tuple of array
+        Gradients of features and coverage, rows of the texels (h * w, 8) and their gradients (h * w, 8, 3); all
+        but the rows of zeros; written.
+    """
+    features, alpha, rays = maps
+    to_features, to_alpha, places, shares = out
+    h, w = alpha.shape
+    for number in range(thread, h * w, stride):
+        y, x = number // w, number % w
+        if alpha[y, x] > BARE:
+            pixel = features[y, x], alpha[y, x], rays[y, x], seen[y, x], incoming[y, x]
+            pixel_gradients(pixel, texels, False, (to_features[y, x], to_alpha[y], x, shares[number]))
+            texel_shares(features[y, x], alpha[y, x], rays[y, x], incoming[y, x], places[number], shares[number])
+
+
+ATTRIBUTES, ATTRIBUTE_GRADIENTS = WarpKernel(attribute_rows, (), {}), WarpKernel(attribute_gradient_rows, (), {})
+LOOK_UP, PIXEL_GRADIENTS = WarpKernel(look_up_pixels, (), {}), WarpKernel(pixel_gradient_rows, (), {})
 
 
 def attributes(
-    parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, reflections: bool
+    launcher: TensorLauncher, parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, reflections: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """`attributes.attributes`."""
     away = normalize(centre.detach() - torch.tensor(eye, dtype=torch.float32, device=centre.device), dim=1)
-    u, v, normal = frames(parameters["scale"], parameters["rotation"])
-    sh = parameters["sh"]
-    degree = min(bands, int(sh.shape[1] ** 0.5) - 1)
+    degree = min(bands, int(parameters["sh"].shape[1] ** 0.5) - 1)
     x, y, z = away.unbind(1)
     values = torch.stack(polynomials(x, y, z, torch.ones_like(x), degree), 1)
-    colour = (0.5 + (values[:, :, None] * sh[:, : values.shape[1]]).sum(1)).clamp(min=0)
-    back = (away * normal).sum(1, keepdim=True) > 0
-    features = [colour, torch.where(back, -normal, normal)]
-    if reflections:
-        features += [torch.sigmoid(parameters["tint"]), torch.sigmoid(parameters["blur"])[:, None]]
-    return u, v, torch.sigmoid(parameters["opacity"]), torch.cat(features, 1)
+    return _Attributes.apply(launcher, away, values, reflections, *(parameters[name] for name in Learned._fields))
 
 
-def frames(scale: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`attributes.frames`."""
-    w, x, y, z = normalize(rotation, dim=1).unbind(1)
-    u = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1)
-    v = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], 1)
-    normal = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
-    size = scale.exp()
-    return u * size[:, :1], v * size[:, 1:], normal
-
-
-def mirrored(features: Tensor, alpha: Tensor, rays: Tensor, texels: Tensor) -> Tensor:
-    """`reflection_probe.mirrored`."""
-    rows = torch.nonzero(alpha.detach().flatten() > float(BARE))[:, 0]
-    pixel = features.flatten(0, 1).index_select(0, rows)
-    blur = pixel[:, BLUR] / alpha.flatten().index_select(0, rows)
-    ray, normal = normalize(rays.flatten(0, 1)[rows], dim=1), normalize(pixel[:, NORMAL : NORMAL + 3], dim=1)
-    direction = ray - 2 * (ray * normal).sum(1, keepdim=True) * normal
-    face, a, b = _places(direction)
-    level = blur * (LEVELS - 1)
-    low = level.detach().long().clamp(0, LEVELS - 2)
-    mix = (level - low)[:, None]
-    seen = (1 - mix) * _look_up(texels, low, face, a, b) + mix * _look_up(texels, low + 1, face, a, b)
-    out = features.new_zeros(alpha.numel(), 3)
-    return out.index_copy(0, rows, pixel[:, TINT : TINT + 3] * seen).reshape(*alpha.shape, 3)
-
-
-def _places(direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Number (n,) of the cube's face that each direction leaves through, and place (a, b) on it in -1..1."""
-    x, y, z = direction.detach().abs().unbind(1)
-    axis = torch.where((x >= y) & (x >= z), 0, torch.where(y >= z, 1, 2))
-    main, first, second = (direction.gather(1, ((axis + k) % 3)[:, None])[:, 0] for k in range(3))
-    size = main.abs().clamp(min=1e-12)
-    return 2 * axis + (main.detach() < 0), first / size, second / size
-
-
-def _look_up(texels: Tensor, level: Tensor, face: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """(n, 3) light of the levels (n,) at places on faces, between four texels."""
-    sizes = SHARPEST >> level
-    (i, s), (j, t) = (_between(place, sizes) for place in (a, b))
-    # Before a level lie 6 (SHARPEST^2 + ... + (2 size)^2) texels.
-    at = 8 * (SHARPEST**2 - sizes**2) + (face * sizes + j) * sizes + i
-    first, right, below, opposite = _Rows.apply(texels, torch.stack([at, at + 1, at + sizes, at + sizes + 1])).unbind(0)
-    top, bottom = first + s * (right - first), below + s * (opposite - below)
-    return top + t * (bottom - top)
-
-
-def _between(place: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
-    """First of the two texels that a place in -1..1 lies between, and the part (n, 1) of the second."""
-    x = ((place + 1) * (0.5 * sizes) - 0.5).clamp(min=0).minimum((sizes - 1).to(place))
-    first = torch.minimum(x.detach().long(), sizes - 2)
-    return first, (x - first)[:, None]
-
-
-class _Rows(torch.autograd.Function):
-    """Rows of a table. Many may be one; their gradients are summed as whole numbers: in any order the same."""
+class _Attributes(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, launcher: TensorLauncher, away: Tensor, values: Tensor, reflections: bool, *parameters: Tensor
+    ) -> tuple[Tensor, ...]:
+        raw = Learned(*(p.detach().contiguous() for p in parameters))
+        n, new = len(away), away.new_empty
+        found = Attributes(new(n, 3), new(n, 3), new(n), new(n, BLUR + 1 if reflections else TINT))
+        normal = new(n, 3)
+        launcher.launch(ATTRIBUTES, n, (raw, away, values), (*found, normal))
+        ctx.save = (launcher, raw, values, normal, found)
+        return tuple(found)
 
     @staticmethod
-    def forward(ctx: Any, table: Tensor, index: Tensor) -> Tensor:
-        ctx.save_for_backward(index)
-        ctx.rows = len(table)
-        return table[index]
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Any, ...]:
+        launcher, raw, values, normal, found = ctx.save
+        incoming = tuple(
+            torch.zeros_like(a) if g is None else g.contiguous() for g, a in zip(gradients, found, strict=True)
+        )
+        to = tuple(map(torch.zeros_like, raw))
+        launcher.launch(ATTRIBUTE_GRADIENTS, len(normal), (raw.rotation, values, normal, tuple(found), incoming), to)
+        return None, None, None, None, *to
+
+
+def mirrored(launcher: TensorLauncher, features: Tensor, alpha: Tensor, rays: Tensor, texels: Tensor) -> Tensor:
+    """`reflection_probe.mirrored`."""
+    return _Mirrored.apply(features, alpha, rays, texels, launcher)
+
+
+class _Mirrored(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, features: Tensor, alpha: Tensor, rays: Tensor, texels: Tensor, launcher: TensorLauncher
+    ) -> Tensor:
+        blended, cover, light = (t.detach().contiguous() for t in (features, alpha, texels))
+        seen = blended.new_zeros(*cover.shape, 3)
+        launcher.launch(LOOK_UP, cover.numel(), (blended, cover, rays, light), (seen,))
+        ctx.save = (launcher, blended, cover, rays, light, seen)
+        return blended[..., TINT : TINT + 3] * seen
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Any, ...]:
-        (index,) = ctx.saved_tensors
-        given = torch.nan_to_num(gradients[0].flatten(0, -2).double(), 0.0, 0.0, 0.0)
-        total = torch.zeros(ctx.rows, given.shape[1], dtype=torch.int64, device=given.device)
-        if not given.numel():
-            return total.float(), None
-        unit = torch.exp2(torch.frexp(given.abs().max()).exponent.double() - _BITS)
-        total.index_add_(0, index.flatten(), (given / unit).round().long())
-        return (total * unit).float(), None
+        launcher, blended, cover, rays, light, seen = ctx.save
+        to_features, to_alpha = torch.zeros_like(blended), torch.zeros_like(cover)
+        # Pixels that mirror nothing add zeros: to all rows, for a card adds to one row one after the other.
+        number = torch.arange(cover.numel() * _TEXELS, device=cover.device)
+        places = (number % len(light)).reshape(-1, _TEXELS)
+        shares = blended.new_zeros(cover.numel(), _TEXELS, 3)
+        given = (blended, cover, rays), light, seen, gradients[0].contiguous()
+        launcher.launch(PIXEL_GRADIENTS, cover.numel(), given, (to_features, to_alpha, places, shares))
+        return to_features, to_alpha, None, sum_rows(places.flatten(), shares.flatten(0, 1), len(light)), None
+
+
+def sum_rows(index: Tensor, values: Tensor, rows: int) -> Tensor:
+    """(rows, k) float32 sums of the values (m, k) of each index (m,), as whole numbers; NaN and infinity count as 0."""
+    given = torch.nan_to_num(values.double(), 0.0, 0.0, 0.0)
+    total = torch.zeros(rows, given.shape[1], dtype=torch.int64, device=given.device)
+    if not given.numel():
+        return total.float()
+    unit = torch.exp2(torch.frexp(given.abs().max()).exponent.double() - _BITS)
+    total.index_add_(0, index, (given / unit).round().long())
+    return (total * unit).float()

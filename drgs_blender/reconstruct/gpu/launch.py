@@ -2,14 +2,36 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import torch
 
 from ...compute.warp.kernels import Launcher, WarpKernel
 from ...compute.warp.runtime import warp
+
+
+class SharedTensor:
+    """A tensor as an argument of a kernel: Warp's descriptor of it, which is made much faster than an array.
+
+    Attributes
+    ----------
+    dtype : type
+        Warp's.
+    ndim : int
+    ptr : int
+        Address.
+    descriptor : object
+        What `warp.launch` takes.
+    """
+
+    __slots__ = ("descriptor", "dtype", "ndim", "ptr")
+
+    def __init__(self, tensor: torch.Tensor) -> None:
+        wp = warp()
+        self.dtype, self.ndim, self.ptr = wp.dtype_from_torch(tensor.dtype), tensor.dim(), tensor.data_ptr()
+        self.descriptor = wp.from_torch(tensor.detach(), return_ctype=True)
 
 
 class TensorLauncher(Launcher):
@@ -29,6 +51,7 @@ class TensorLauncher(Launcher):
     def __init__(self, device: str) -> None:
         super().__init__(device)
         self.place = torch.device(str(warp().device_to_torch(self.device)))
+        self._stream: Any = None
 
     def launch(self, kernel: WarpKernel, pieces: int, arguments: Sequence[Any], out: Sequence[Any]) -> None:
         """`Launcher.launch`, among torch's own work on the device; nothing where there are no pieces.
@@ -40,23 +63,27 @@ class TensorLauncher(Launcher):
         """
         if not pieces:
             return
-        with self._in_order():
-            super().launch(kernel, pieces, self._shared(tuple(arguments)), self._shared(tuple(out)))
+        self._join()
+        super().launch(kernel, pieces, self._shared(tuple(arguments)), self._shared(tuple(out)))
 
     def _shared(self, value: Any) -> Any:
         if isinstance(value, torch.Tensor):
             if value.device != self.place:  # its address would be read on the other, which ends all work there
                 raise ValueError(f"a tensor on {value.device} for a kernel on {self.place}")
-            return warp().from_torch(value.detach())
-        plain = isinstance(value, tuple) and not hasattr(value, "_fields")
-        return tuple(map(self._shared, value)) if plain else value
+            return SharedTensor(value)
+        if isinstance(value, tuple):
+            parts = map(self._shared, value)
+            return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+        return value
 
-    @contextlib.contextmanager
-    def _in_order(self) -> Iterator[None]:
-        """Warp's work in the queue of torch's: each finds what the other has written."""
+    def _argument(self, module: ModuleType, value: Any) -> Any:
+        return value.descriptor if isinstance(value, SharedTensor) else super()._argument(module, value)
+
+    def _join(self) -> None:
+        """Warp's work goes into the queue of torch's from now on: each finds what the other has written."""
         if not self.device.is_cuda:
-            yield
             return
-        wp = warp()
-        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.place))):
-            yield
+        stream = torch.cuda.current_stream(self.place)
+        if self._stream != stream or self.device.stream.cuda_stream != stream.cuda_stream:
+            warp().set_stream(warp().stream_from_torch(stream), self.device, sync=True)
+            self._stream = stream

@@ -1,6 +1,6 @@
-"""Losses of a view, for any device: `photometric` and `shape` in plain tensor operations.
+"""Losses of a view on a device: `shape` pixel by pixel as on the CPU, `photometric` and `patches` by tensor operations.
 
-The blur alone is a kernel of Warp: libraries of convolutions round otherwise, and not the same way each time.
+Their blur is a kernel of Warp: libraries of convolutions round otherwise, and not the same way each time.
 """
 
 from __future__ import annotations
@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from ...compute.warp.kernels import WarpKernel
-from ...render.sampling import ZERO
+from ...render.sampling import ZERO, F
 from ..losses.patches import DISPLACED, FAINT, GRAZING, REACH, Pair
 from ..losses.photometric import C1, C2, DISSIMILARITY, SATURATED, WINDOW
-from ..losses.shape import COVERED, THIN
+from ..losses.shape import add_to_depth, disagree
 from .launch import TensorLauncher
 
 
@@ -69,7 +68,44 @@ def blur_columns(thread, stride, scratch, window, channels, pictures, out):  # t
         blurred[k, y, x] = total
 
 
+def disagree_pixels(thread, stride, scratch, maps, counts, most, out):  # type: ignore[no-untyped-def]
+    """`shape.disagree` of all inner pixels.
+
+    Parameters
+    ----------
+    thread, stride, scratch : int64 or tuple
+    maps, counts, most : tuple, array or float
+        As of `shape.disagree`.
+    out : tuple of array
+        Slopes and gradients of normals as of `shape.disagree`, and disagreements (h, w); all of zeros; written.
+    """
+    slopes, to_normal, away = out
+    h, w = away.shape
+    for number in range(thread, h * w, stride):
+        y, x = number // w, number % w
+        if y > 0 and y < h - 1 and x > 0 and x < w - 1:
+            away[y, x] = disagree(y, x, maps, counts, F(most), slopes, to_normal)
+
+
+def add_to_depths(thread, stride, scratch, alpha, depth, rays, slopes, out):  # type: ignore[no-untyped-def]
+    """`shape.add_to_depth` of all pixels.
+
+    Parameters
+    ----------
+    thread, stride, scratch : int64 or tuple
+    alpha, depth, rays, slopes : array
+        As of `shape.add_to_depth`.
+    out : tuple of array
+        Gradients of coverage and depth; added to.
+    """
+    to_alpha, to_depth = out
+    h, w = alpha.shape
+    for number in range(thread, h * w, stride):
+        add_to_depth(number // w, number % w, alpha, depth, rays, slopes, to_alpha, to_depth)
+
+
 ROWS, COLUMNS = WarpKernel(blur_rows, (), {}), WarpKernel(blur_columns, (), {})
+DISAGREE, TO_DEPTH = WarpKernel(disagree_pixels, (), {}), WarpKernel(add_to_depths, (), {})
 
 
 def blur(launcher: TensorLauncher, pictures: Tensor) -> Tensor:
@@ -110,23 +146,40 @@ def difference(launcher: TensorLauncher, picture: Tensor, photograph: Tensor) ->
 
 
 def shape_loss(
-    alpha: Tensor, depth: Tensor, distortion: Tensor, normal: Tensor, mask: Tensor | None, rays: Tensor,
-    counts: Tensor, weights: tuple[float, float, float],
+    launcher: TensorLauncher, alpha: Tensor, depth: Tensor, distortion: Tensor, normal: Tensor, mask: Tensor | None,
+    rays: Tensor, counts: Tensor, weights: tuple[float, float, float],
 ) -> Tensor:  # fmt: skip
     """`shape.shape_loss`."""
-    by_mask, by_distortion, by_normals = weights
-    loss = by_distortion * distortion.mean()
-    if mask is not None and by_mask:
-        loss = loss + by_mask * (alpha - mask).abs().mean()
-    if by_normals and min(alpha.shape) > 2:
-        points = (depth / alpha.clamp(min=float(THIN)))[..., None] * rays
-        across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
-        slope = normalize(torch.linalg.cross(down, across), dim=-1)
-        covered = alpha.detach()[1:-1, 1:-1]
-        away = (covered - (slope * normal[1:-1, 1:-1]).sum(-1)).clamp(min=0)
-        inner = torch.where(covered > float(COVERED), counts[1:-1, 1:-1] * away, torch.zeros_like(away))
-        loss = loss + by_normals * inner.mean()
-    return loss
+    return _Shape.apply(alpha, depth, distortion, normal, mask, rays, counts, weights, launcher)
+
+
+class _Shape(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, alpha: Tensor, depth: Tensor, distortion: Tensor, normal: Tensor, mask: Tensor | None, rays: Tensor,
+        counts: Tensor, weights: tuple[float, float, float], launcher: TensorLauncher,
+    ) -> Tensor:  # fmt: skip
+        a, z, n = (t.detach().contiguous() for t in (alpha, depth, normal))
+        by_mask, by_distortion, by_normals = weights
+        to_alpha, to_depth, to_normal = torch.zeros_like(a), torch.zeros_like(z), torch.zeros_like(n)
+        loss = by_distortion * distortion.detach().mean()
+        if mask is not None and by_mask:
+            error = a - mask
+            loss = loss + by_mask * error.abs().mean()
+            to_alpha += (by_mask / a.numel()) * error.sign()
+        if by_normals and min(a.shape) > 2:
+            inner = (a.shape[0] - 2) * (a.shape[1] - 2)
+            slopes, away = n.new_zeros(2, *n.shape), torch.zeros_like(a)
+            given = (a, z, n, rays), counts, float(by_normals / inner)
+            launcher.launch(DISAGREE, a.numel(), given, (slopes, to_normal, away))
+            launcher.launch(TO_DEPTH, a.numel(), (a, z, rays, slopes), (to_alpha, to_depth))
+            loss = loss + by_normals / inner * away.sum()
+        ctx.gradients = [to_alpha, to_depth, torch.full_like(a, by_distortion / a.numel()), to_normal]
+        return loss
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Any, ...]:
+        return *(gradients[0] * g for g in ctx.gradients), None, None, None, None, None
 
 
 def patch_loss(

@@ -65,7 +65,7 @@ class WarpLearningBackend(LearningBackend):
     def attributes(
         self, parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, reflections: bool
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return appearance.attributes(parameters, centre, eye, bands, reflections)
+        return appearance.attributes(self.launcher, parameters, centre, eye, bands, reflections)
 
     def rasterise(
         self, centre: Tensor, tangent_u: Tensor, tangent_v: Tensor, opacity: Tensor, features: Tensor, camera: Camera,
@@ -74,7 +74,7 @@ class WarpLearningBackend(LearningBackend):
         return rasterise(self.launcher, centre, tangent_u, tangent_v, opacity, features, camera, statistics)
 
     def mirrored(self, features: Tensor, alpha: Tensor, rays: Tensor, texels: Tensor) -> Tensor:
-        return appearance.mirrored(features, alpha, rays, texels)
+        return appearance.mirrored(self.launcher, features, alpha, rays, texels)
 
     def difference(self, picture: Tensor, photograph: Tensor) -> Tensor:
         return losses.difference(self.launcher, picture, photograph)
@@ -83,7 +83,7 @@ class WarpLearningBackend(LearningBackend):
         self, alpha: Tensor, depth: Tensor, distortion: Tensor, normal: Tensor, mask: Tensor | None, rays: Tensor,
         counts: Tensor, weights: tuple[float, float, float],
     ) -> Tensor:  # fmt: skip
-        return losses.shape_loss(alpha, depth, distortion, normal, mask, rays, counts, weights)
+        return losses.shape_loss(self.launcher, alpha, depth, distortion, normal, mask, rays, counts, weights)
 
     def patch_loss(
         self, depth: Tensor, normal: Tensor, counts: Tensor, rays: Tensor, greys: tuple[Tensor, Tensor],

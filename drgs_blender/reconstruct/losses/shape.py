@@ -98,56 +98,94 @@ def _difference(alpha, depth, rays, y1, x1, y0, x0):  # type: ignore[no-untyped-
 
 
 @njit
-def _disagreement(first, last, maps, counts, most, slopes, to_normal, rows):  # type: ignore[no-untyped-def]
-    """Sums of the rows, gradients of the normals, and of the two differences of each pixel (2, h, w, 3)."""
+def disagree(y, x, maps, counts, most, slopes, to_normal):  # type: ignore[no-untyped-def]
+    """Disagreement of an inner pixel's normals, times its count.
+
+    Parameters
+    ----------
+    y, x : int
+    maps : tuple of array
+        Coverage, sums of depth and of normals, and rays, as of `shape_loss`.
+    counts : (h, w) float32 array
+        As of `shape_loss`.
+    most : float32
+        Factor of the gradients.
+    slopes : (2, h, w, 3) float32 array
+        Gradients of the two differences of neighbours; the pixel's are written.
+    to_normal : (h, w, 3) float32 array
+        Gradients of the normals; the pixel's is written.
+    """
     alpha, depth, normal, rays = maps
-    height, width = alpha.shape
+    covered = alpha[y, x]
+    if not covered > COVERED:
+        return np.float32(0.0)
+    ax, ay, az = _difference(alpha, depth, rays, y, x + 1, y, x - 1)
+    dx, dy, dz = _difference(alpha, depth, rays, y + 1, x, y - 1, x)
+    cx, cy, cz = dy * az - dz * ay, dz * ax - dx * az, dx * ay - dy * ax
+    r = np.float32(1.0) / max(np.sqrt(cx * cx + cy * cy + cz * cz), np.float32(1e-12))
+    cx, cy, cz = cx * r, cy * r, cz * r
+    nx, ny, nz = normal[y, x, 0], normal[y, x, 1], normal[y, x, 2]
+    cosine = cx * nx + cy * ny + cz * nz
+    if not covered - cosine > 0:
+        return np.float32(0.0)
+    weight = most * counts[y, x]
+    to_normal[y, x, 0], to_normal[y, x, 1], to_normal[y, x, 2] = -weight * cx, -weight * cy, -weight * cz
+    scale = -weight * r
+    gx, gy, gz = scale * (nx - cosine * cx), scale * (ny - cosine * cy), scale * (nz - cosine * cz)
+    slopes[0, y, x, 0], slopes[0, y, x, 1] = gy * dz - gz * dy, gz * dx - gx * dz
+    slopes[0, y, x, 2] = gx * dy - gy * dx
+    slopes[1, y, x, 0], slopes[1, y, x, 1] = ay * gz - az * gy, az * gx - ax * gz
+    slopes[1, y, x, 2] = ax * gy - ay * gx
+    return counts[y, x] * (covered - cosine)
+
+
+@njit
+def _disagreement(first, last, maps, counts, most, slopes, to_normal, rows):  # type: ignore[no-untyped-def]
+    """Sums of the rows, and gradients, as of `disagree`."""
+    height, width = maps[0].shape
     for y in range(max(first, 1), min(last, height - 1)):
         total = 0.0
         for x in range(1, width - 1):
-            covered = alpha[y, x]
-            if not covered > COVERED:
-                continue
-            ax, ay, az = _difference(alpha, depth, rays, y, x + 1, y, x - 1)
-            dx, dy, dz = _difference(alpha, depth, rays, y + 1, x, y - 1, x)
-            cx, cy, cz = dy * az - dz * ay, dz * ax - dx * az, dx * ay - dy * ax
-            r = np.float32(1.0) / max(np.sqrt(cx * cx + cy * cy + cz * cz), np.float32(1e-12))
-            cx, cy, cz = cx * r, cy * r, cz * r
-            nx, ny, nz = normal[y, x, 0], normal[y, x, 1], normal[y, x, 2]
-            cosine = cx * nx + cy * ny + cz * nz
-            if not covered - cosine > 0:
-                continue
-            total += counts[y, x] * (covered - cosine)
-            weight = most * counts[y, x]
-            to_normal[y, x, 0], to_normal[y, x, 1], to_normal[y, x, 2] = -weight * cx, -weight * cy, -weight * cz
-            scale = -weight * r
-            gx, gy, gz = scale * (nx - cosine * cx), scale * (ny - cosine * cy), scale * (nz - cosine * cz)
-            slopes[0, y, x, 0], slopes[0, y, x, 1] = gy * dz - gz * dy, gz * dx - gx * dz
-            slopes[0, y, x, 2] = gx * dy - gy * dx
-            slopes[1, y, x, 0], slopes[1, y, x, 1] = ay * gz - az * gy, az * gx - ax * gz
-            slopes[1, y, x, 2] = ax * gy - ay * gx
+            total += disagree(y, x, maps, counts, most, slopes, to_normal)
         rows[y] = total
 
 
 @njit
-def _to_depth(first, last, alpha, depth, rays, slopes, to_alpha, to_depth):  # type: ignore[no-untyped-def]
-    """Add the gradients of depth and coverage, each pixel from its four neighbours."""
+def add_to_depth(y, x, alpha, depth, rays, slopes, to_alpha, to_depth):  # type: ignore[no-untyped-def]
+    """Add the gradients of a pixel's depth and coverage, from its four neighbours.
+
+    Parameters
+    ----------
+    y, x : int
+    alpha, depth, rays : array
+        As of `shape_loss`.
+    slopes : (2, h, w, 3) float32 array
+        Of `disagree`.
+    to_alpha, to_depth : (h, w) float32 array
+        Added to.
+    """
     height, width = alpha.shape
+    g = np.float32(0.0)
+    for c in range(3):
+        p = np.float32(0.0)
+        if x > 0:
+            p += slopes[0, y, x - 1, c]
+        if x < width - 1:
+            p -= slopes[0, y, x + 1, c]
+        if y > 0:
+            p += slopes[1, y - 1, x, c]
+        if y < height - 1:
+            p -= slopes[1, y + 1, x, c]
+        g += p * rays[y, x, c]
+    inverse = np.float32(1.0) / max(alpha[y, x], THIN)
+    to_depth[y, x] += g * inverse
+    if alpha[y, x] >= THIN:
+        to_alpha[y, x] -= g * depth[y, x] * inverse * inverse
+
+
+@njit
+def _to_depth(first, last, alpha, depth, rays, slopes, to_alpha, to_depth):  # type: ignore[no-untyped-def]
+    """`add_to_depth` of rows of pixels."""
     for y in range(first, last):
-        for x in range(width):
-            g = np.float32(0.0)
-            for c in range(3):
-                p = np.float32(0.0)
-                if x > 0:
-                    p += slopes[0, y, x - 1, c]
-                if x < width - 1:
-                    p -= slopes[0, y, x + 1, c]
-                if y > 0:
-                    p += slopes[1, y - 1, x, c]
-                if y < height - 1:
-                    p -= slopes[1, y + 1, x, c]
-                g += p * rays[y, x, c]
-            inverse = np.float32(1.0) / max(alpha[y, x], THIN)
-            to_depth[y, x] += g * inverse
-            if alpha[y, x] >= THIN:
-                to_alpha[y, x] -= g * depth[y, x] * inverse * inverse
+        for x in range(alpha.shape[1]):
+            add_to_depth(y, x, alpha, depth, rays, slopes, to_alpha, to_depth)

@@ -101,7 +101,7 @@ def attributes(
 def frames(scale: Array, rotation: Array) -> tuple[Array, Array, Array]:
     """Tangents of `rotation` (n, 4) wxyz scaled by exp of `scale` (n, 2), and the normal; any length; (n, 3) each."""
     u, v, normal = (np.empty((len(scale), 3), np.float32) for _ in range(3))
-    over_range(_frames, len(scale), scale, rotation, u, v, normal, fewest=ELEMENTS)
+    over_range(write_frames, len(scale), scale, rotation, u, v, normal, fewest=ELEMENTS)
     return u, v, normal
 
 
@@ -118,7 +118,7 @@ class _Attributes(torch.autograd.Function):
         values = basis(away, degree).astype(np.float32)
         u, v, normal = frames(raw.scale, raw.rotation)
         found = Attributes(u, v, np.empty(n, np.float32), np.empty((n, BLUR + 1 if reflections else TINT), np.float32))
-        over_range(_colour, n, raw, normal, away, values, found, fewest=ELEMENTS)
+        over_range(write_colours, n, raw, normal, away, values, found, fewest=ELEMENTS)
         ctx.save = (raw, values, normal, found)
         return tuple(map(torch.from_numpy, found))
 
@@ -131,7 +131,7 @@ class _Attributes(torch.autograd.Function):
         ))  # fmt: skip
         to = Learned(*map(np.zeros_like, raw))
         given = raw.rotation, values, normal, found, incoming
-        over_range(_backward, len(normal), *given, to, fewest=ELEMENTS)
+        over_range(write_gradients, len(normal), *given, to, fewest=ELEMENTS)
         return None, None, None, None, *map(torch.from_numpy, to)
 
 
@@ -141,7 +141,8 @@ def _logistic(x):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _frames(first: int, last: int, scale: Array, rotation: Array, u: Array, v: Array, normal: Array) -> None:
+def write_frames(first: int, last: int, scale: Array, rotation: Array, u: Array, v: Array, normal: Array) -> None:
+    """`frames` of a range of surfels."""
     one, two = np.float32(1.0), np.float32(2.0)
     for i in range(first, last):
         w, x, y, z = rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3]
@@ -163,7 +164,9 @@ def _frames(first: int, last: int, scale: Array, rotation: Array, u: Array, v: A
 
 
 @njit
-def _colour(first: int, last: int, raw: Learned, normal: Array, away: Array, values: Array, out: Attributes) -> None:
+def write_colours(
+    first: int, last: int, raw: Learned, normal: Array, away: Array, values: Array, out: Attributes
+) -> None:
     """Opacity and features, written; `away` (n, 3) from the eye, `values` (n, k) of the harmonics in that direction."""
     opacity, sh, tint, blur = raw.opacity, raw.sh, raw.tint, raw.blur
     alpha, features = out.opacity, out.features
@@ -185,8 +188,22 @@ def _colour(first: int, last: int, raw: Learned, normal: Array, away: Array, val
 
 
 @njit
-def _backward(first, last, rotation, values, normal, found, incoming, out):  # type: ignore[no-untyped-def]
-    """Gradients of the raw parameters, into arrays of zeros; `values` as of `_colour`."""
+def write_gradients(first, last, rotation, values, normal, found, incoming, out):  # type: ignore[no-untyped-def]
+    """Gradients of the raw parameters of a range of surfels.
+
+    Parameters
+    ----------
+    first, last : int
+    rotation : (n, 4) float32 array
+    values : (n, k) float32 array
+        As of `write_colours`.
+    normal : (n, 3) float32 array
+        As of `frames`.
+    found, incoming : Attributes or tuple of array
+        What the parameters gave, and its gradients.
+    out : Learned or tuple of array
+        Of zeros; written.
+    """
     u, v, alpha, features = found
     g_u, g_v, g_alpha, g_features = incoming
     to_scale, to_rotation, to_opacity, to_sh, to_tint, to_blur = out

@@ -62,7 +62,7 @@ class _Mirrored(torch.autograd.Function):
     def forward(ctx: Any, features: Tensor, alpha: Tensor, rays: Array, texels: Tensor) -> Tensor:
         blended, cover, light = (np.ascontiguousarray(t.detach().numpy()) for t in (features, alpha, texels))
         seen = np.zeros((*cover.shape, 3), np.float32)
-        over_range(_look_up, len(cover), blended, cover, rays, light, seen, fewest=ROWS)
+        over_range(_look_up_rows, len(cover), blended, cover, rays, light, seen, fewest=ROWS)
         ctx.save = (blended, cover, rays, light, seen)
         return torch.from_numpy(blended[..., TINT : TINT + 3] * seen)
 
@@ -79,11 +79,16 @@ class _Mirrored(torch.autograd.Function):
 
 @njit
 def _face(d):  # type: ignore[no-untyped-def]
-    """Axis of the face that a direction leaves through, the face's number, and place (a, b) on it in -1..1."""
-    x, y, z = abs(d[0]), abs(d[1]), abs(d[2])
-    axis = 0 if x >= y and x >= z else 1 if y >= z else 2
-    size = max(abs(d[axis]), np.float32(1e-12))
-    return axis, 2 * axis + (d[axis] < 0), d[(axis + 1) % 3] / size, d[(axis + 2) % 3] / size
+    """Axis of the face that a direction leaves through, the direction along it, the face's number, and place (a, b)."""
+    x, y, z = d
+    ax, ay, az = abs(x), abs(y), abs(z)
+    axis, main, first, second = 2, z, x, y
+    if ax >= ay and ax >= az:
+        axis, main, first, second = 0, x, y, z
+    elif ay >= az:
+        axis, main, first, second = 1, y, z, x
+    size = max(abs(main), np.float32(1e-12))
+    return axis, main, 2 * axis + (1 if main < 0 else 0), first / size, second / size
 
 
 @njit
@@ -130,25 +135,73 @@ def _levels(pixel, alpha):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _look_up(first, last, features, alpha, rays, texels, seen):  # type: ignore[no-untyped-def]
+def _look_up_rows(first, last, features, alpha, rays, texels, seen):  # type: ignore[no-untyped-def]
     """Light that comes from where each pixel reflects."""
     for y in range(first, last):
         for x in range(alpha.shape[1]):
-            if not alpha[y, x] > BARE:
-                continue
-            _, _, _, direction = _turned(features[y, x], rays[y, x])
-            _, face, a, b = _face(direction)
-            _, low, mix = _levels(features[y, x], alpha[y, x])
-            for k in range(2):
-                start, size = _start(low + k)
-                share = mix if k else np.float32(1.0) - mix
-                i, s, _ = _texel(a, size)
-                j, t, _ = _texel(b, size)
-                at = start + (face * size + j) * size + i
-                for c in range(3):
-                    top = texels[at, c] + s * (texels[at + 1, c] - texels[at, c])
-                    bottom = texels[at + size, c] + s * (texels[at + size + 1, c] - texels[at + size, c])
-                    seen[y, x, c] += share * (top + t * (bottom - top))
+            if alpha[y, x] > BARE:
+                look_up(features[y, x], alpha[y, x], rays[y, x], texels, seen[y, x])
+
+
+@njit
+def look_up(pixel, alpha, ray, texels, seen):  # type: ignore[no-untyped-def]
+    """Add the light that comes from where a pixel reflects.
+
+    Parameters
+    ----------
+    pixel : (10,) float32 array
+        Features.
+    alpha : float32
+    ray : (3,) float32 array
+    texels : (texels, 3) float32 array
+    seen : (3,) float32 array
+        Added to.
+    """
+    _, _, _, direction = _turned(pixel, ray)
+    _, _, face, a, b = _face(direction)
+    _, low, mix = _levels(pixel, alpha)
+    for k in range(2):
+        start, size = _start(low + k)
+        share = mix if k == 1 else np.float32(1.0) - mix
+        i, s, _ = _texel(a, size)
+        j, t, _ = _texel(b, size)
+        at = start + (face * size + j) * size + i
+        for c in range(3):
+            top = texels[at, c] + s * (texels[at + 1, c] - texels[at, c])
+            bottom = texels[at + size, c] + s * (texels[at + size + 1, c] - texels[at + size, c])
+            seen[c] += share * (top + t * (bottom - top))
+
+
+@njit
+def texel_shares(pixel, alpha, ray, incoming, places, shares):  # type: ignore[no-untyped-def]
+    """The eight texels that a pixel has looked up, and their gradients.
+
+    Parameters
+    ----------
+    pixel, alpha, ray : array or float
+        As of `look_up`.
+    incoming : (3,) float32 array
+        Gradient of what the pixel mirrors.
+    places : (8,) int64 array
+        Rows of the texels; written.
+    shares : (8, 3) float32 array
+        Gradients; written.
+    """
+    _, _, _, direction = _turned(pixel, ray)
+    _, _, face, a, b = _face(direction)
+    _, low, mix = _levels(pixel, alpha)
+    one = np.float32(1.0)
+    for k in range(2):
+        start, size = _start(low + k)
+        share = mix if k == 1 else one - mix
+        i, s, _ = _texel(a, size)
+        j, t, _ = _texel(b, size)
+        for corner in range(4):
+            right, below = corner % 2, corner // 2
+            places[4 * k + corner] = start + (face * size + j + below) * size + i + right
+            w = share * (s if right == 1 else one - s) * (t if below == 1 else one - t)
+            for c in range(3):
+                shares[4 * k + corner, c] = w * incoming[c] * pixel[TINT + c]
 
 
 @njit
@@ -160,22 +213,37 @@ def _look_up_backward(first, last, features, alpha, rays, texels, seen, incoming
         for y in range(part * height // _PARTS, (part + 1) * height // _PARTS):
             for x in range(alpha.shape[1]):
                 if alpha[y, x] > BARE:
-                    _pixel_backward(
-                        features[y, x], alpha[y, x], rays[y, x], texels, seen[y, x], incoming[y, x], to_features[y, x],
-                        to_alpha[y], x, to_texels[part],
-                    )  # fmt: skip
+                    pixel = features[y, x], alpha[y, x], rays[y, x], seen[y, x], incoming[y, x]
+                    pixel_gradients(pixel, texels, True, (to_features[y, x], to_alpha[y], x, to_texels[part]))
 
 
 @njit
-def _pixel_backward(pixel, alpha, ray, texels, seen, incoming, to_pixel, to_alpha, x, to_texels):  # type: ignore[no-untyped-def]
+def pixel_gradients(given, texels, adds, out):  # type: ignore[no-untyped-def]
+    """Gradients of a pixel's features and coverage, and of the texels that it has looked up.
+
+    Parameters
+    ----------
+    given : tuple
+        Features, coverage and ray as of `look_up`, what it has seen, and the gradient of what it mirrors.
+    texels : (texels, 3) float32 array
+    adds : bool
+        Whether those of texels are added; `texel_shares` finds them otherwise.
+    out : tuple
+        Gradients of features (10,), written; coverages of a row of pixels, the pixel's place among them, written; and
+        texels (texels, 3).
+    """
+    pixel, alpha, ray, seen, incoming = given
+    to_pixel, to_alpha, x, to_texels = out
     one, two = np.float32(1.0), np.float32(2.0)
     view, normal, inverse, direction = _turned(pixel, ray)
-    axis, face, a, b = _face(direction)
+    axis, main, face, a, b = _face(direction)
     blur, low, mix = _levels(pixel, alpha)
-    g_a = g_b = g_mix = np.float32(0.0)
+    g_a, g_b, g_mix = np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for k in range(2):
         start, size = _start(low + k)
-        share, sign = (mix, one) if k else (one - mix, -one)
+        share, sign = one - mix, -one
+        if k == 1:
+            share, sign = mix, one
         i, s, slope_a = _texel(a, size)
         j, t, slope_b = _texel(b, size)
         at = start + (face * size + j) * size + i
@@ -186,22 +254,26 @@ def _pixel_backward(pixel, alpha, ray, texels, seen, incoming, to_pixel, to_alph
             g_mix += sign * g * (top + t * (bottom - top))
             g_a += share * g * slope_a * ((one - t) * (q10 - q00) + t * (q11 - q01))
             g_b += share * g * slope_b * (bottom - top)
-            w = share * g
-            to_texels[at, c] += w * (one - s) * (one - t)
-            to_texels[at + 1, c] += w * s * (one - t)
-            to_texels[at + size, c] += w * (one - s) * t
-            to_texels[at + size + 1, c] += w * s * t
+            if adds:
+                w = share * g
+                to_texels[at, c] += w * (one - s) * (one - t)
+                to_texels[at + 1, c] += w * s * (one - t)
+                to_texels[at + size, c] += w * (one - s) * t
+                to_texels[at + size + 1, c] += w * s * t
     for c in range(3):
         to_pixel[TINT + c] = incoming[c] * seen[c]
     g_blur = g_mix * np.float32(LEVELS - 1)
     to_pixel[BLUR] = g_blur / alpha
     to_alpha[x] = -g_blur * blur / alpha
     # Of the direction, of the unit normal that it is reflected by, and of the normal as it was blended.
-    main = direction[axis]
-    size = max(abs(main), np.float32(1e-12))
-    last = -(g_a * a + g_b * b) / (size if main >= 0 else -size)
-    g_a, g_b = g_a / size, g_b / size
-    gx, gy, gz = (last, g_a, g_b) if axis == 0 else (g_b, last, g_a) if axis == 1 else (g_a, g_b, last)
+    length = max(abs(main), np.float32(1e-12))
+    last = -(g_a * a + g_b * b) / (length if main >= 0 else -length)
+    g_a, g_b = g_a / length, g_b / length
+    gx, gy, gz = g_a, g_b, last
+    if axis == 0:
+        gx, gy, gz = last, g_a, g_b
+    elif axis == 1:
+        gx, gy, gz = g_b, last, g_a
     along = -two * (gx * normal[0] + gy * normal[1] + gz * normal[2])
     facing = -two * (view[0] * normal[0] + view[1] * normal[1] + view[2] * normal[2])
     hx, hy, hz = along * view[0] + facing * gx, along * view[1] + facing * gy, along * view[2] + facing * gz

@@ -18,6 +18,8 @@ from .steps import (
     CELL,
     DISTANCE,
     END_STEP,
+    GATHER,
+    LAYERS,
     LINEAR,
     MOST_DRIFT,
     MOST_SPEED,
@@ -33,6 +35,7 @@ from .steps import (
     SOLVE,
     SPIN,
     STEP,
+    SUMS,
     SURFACE,
     TOPS,
     VECTORS,
@@ -140,7 +143,7 @@ class DeviceGrid(Grid):
         self._launches, self._blocks = [], count
         self._active, self._neighbour = zeros((count, 3), "int32"), zeros((count, 27), "int32")
         self._first, self._numbers = zeros((count, STARTS), "int32"), zeros((count,), "int64")
-        self._nodes = zeros((count * 64, 4))
+        self._nodes, self._sums = zeros((count * 64, 4)), zeros((LAYERS, count * 64, SUMS))
         known = n, self._keys, self._numbers, self._sizes
         self._index = recorded(INDEX, count * (27 + STARTS), known, (self._active, self._neighbour, self._first))
         self._house = recorded(FIND_HOMES, n, known, (self._home,))
@@ -155,7 +158,7 @@ class DeviceGrid(Grid):
         particles, properties = (s["x"], s["v"], s["affine"], s["tau"]), (self._mass, self._volume, self._pin)
         given = self._cell, self._packet
         colliders = there["shapes"], there["turns"], there["vectors"], there["contacts"]
-        obstacles = colliders, bool(scene.colliders), self._planes, bool(len(scene.planes)), *pins
+        obstacles = colliders, bool(scene.colliders), self._planes, bool(len(scene.planes)), pins[1]
         wind = tuple(map(float, scene.forces.wind))
         forces = scene.least, wind, there["rows"], bool(len(scene.fields))
         blocks = self._sizes, self._active, self._first, self._neighbour
@@ -163,7 +166,10 @@ class DeviceGrid(Grid):
         matter = self._mass, self._model, self._parameters, self._solid, len(s["total"]) > 0
         return [
             launcher.recorded(PREPARE, n, (self._order, particles, properties, grid, time), given),
-            launcher.recorded(SOLVE, self._blocks * 64, (blocks, given, grid, time, obstacles, forces), (self._nodes,)),
+            launcher.recorded(GATHER, self._blocks * 64 * LAYERS, (blocks, given, pins, clock), (self._sums,)),
+            launcher.recorded(
+                SOLVE, self._blocks * 64, (blocks, self._sums, grid, time, obstacles, forces), (self._nodes,)
+            ),
             launcher.recorded(
                 MOVE, n, (homes, self._nodes, matter, (self._pin, *pins), grid, time), (*s.values(), self._fastest)
             ),

@@ -43,6 +43,9 @@ _NOWHERE = -9
 DISTANCE, VELOCITY, SIZE, SHAPE = 0, 1, 2, 5
 CELLS, THICKNESS, CONTACT, FRICTION, SURFACE = 0, 1, 2, 3, 4
 SHIFT, LINEAR, SPIN, ORIGIN, VECTORS = 0, 1, 2, 3, 4
+#: Layers of cells along x that the particles around a node may have been in when they were sorted, and what a layer
+#: gives: momentum (x, y, z) and mass, of all particles and of what is pinned.
+LAYERS, SUMS = 5, 8
 #: Places among which the highest speed is sought.
 SLOTS = 32
 
@@ -151,8 +154,8 @@ def chosen(weights: Any, which: Any) -> Any:
     return weights[0] if which == 0 else (weights[1] if which == 1 else weights[2])
 
 
-def gathered(i: Any, j: Any, k: Any, s: Any, blocks: Any, given: Any, pins: Any) -> Any:
-    """Momentum and mass of node (i, j, k) of active block s, and those of what is pinned.
+def gathered(i: Any, j: Any, k: Any, s: Any, ci: Any, blocks: Any, given: Any, pins: Any) -> Any:
+    """Momentum and mass of node (i, j, k) of active block s, from the cells at `ci` along x, and of what is pinned.
 
     `given` is what `prepare_particles` wrote.
     """
@@ -162,35 +165,65 @@ def gathered(i: Any, j: Any, k: Any, s: Any, blocks: Any, given: Any, pins: Any)
     px, py, pz, m = ZERO, ZERO, ZERO, ZERO
     hx, hy, hz, held = ZERO, ZERO, ZERO, ZERO
     # Cells that the particles around the node may have been in when they were sorted; along z they are in two blocks.
-    for ci in range(i - 3, i + 2):
-        for cj in range(j - 3, j + 2):
-            column = ((ci & 3) * 4 + (cj & 3)) * 4
-            e = (((ci >> 2) - (i >> 2) + 1) * 3 + (cj >> 2) - (j >> 2) + 1) * 3 + 1 - (k >> 2)
-            for half in range(2):
-                ck = k - 3 if half == 0 else k + 1
-                b = np.int64(neighbour[s, e + (ck >> 2)])
-                if b < 0:
+    for cj in range(j - 3, j + 2):
+        column = ((ci & 3) * 4 + (cj & 3)) * 4
+        e = (((ci >> 2) - (i >> 2) + 1) * 3 + (cj >> 2) - (j >> 2) + 1) * 3 + 1 - (k >> 2)
+        for half in range(2):
+            ck = k - 3 if half == 0 else k + 1
+            b = np.int64(neighbour[s, e + (ck >> 2)])
+            if b < 0:
+                continue
+            low, high = (ck & 3 if half == 0 else 0), (4 if half == 0 else (ck & 3) + 1)
+            for p in range(first[b, column + low], first[b, column + high]):
+                ii, jj, kk = i - cell[p, 0], j - cell[p, 1], k - cell[p, 2]
+                if ii < 0 or ii > 2 or jj < 0 or jj > 2 or kk < 0 or kk > 2:
                     continue
-                low, high = (ck & 3 if half == 0 else 0), (4 if half == 0 else (ck & 3) + 1)
-                for p in range(first[b, column + low], first[b, column + high]):
-                    ii, jj, kk = i - cell[p, 0], j - cell[p, 1], k - cell[p, 2]
-                    if ii < 0 or ii > 2 or jj < 0 or jj > 2 or kk < 0 or kk > 2:
-                        continue
-                    w = chosen(weights_of(packet[p, 0]), ii) * chosen(weights_of(packet[p, 1]), jj)
-                    w = w * chosen(weights_of(packet[p, 2]), kk)
-                    a, c, d = F(ii), F(jj), F(kk)
-                    px += w * (packet[p, 4] + a * packet[p, 7] + c * packet[p, 8] + d * packet[p, 9])
-                    py += w * (packet[p, 5] + a * packet[p, 10] + c * packet[p, 11] + d * packet[p, 12])
-                    pz += w * (packet[p, 6] + a * packet[p, 13] + c * packet[p, 14] + d * packet[p, 15])
-                    m += w * packet[p, MASS]
-                    if pinned and cell[p, PIN] >= 0:
-                        q = np.int64(cell[p, PIN])
-                        own = w * packet[p, MASS]
-                        hx += own * pin_velocity[q, 0]
-                        hy += own * pin_velocity[q, 1]
-                        hz += own * pin_velocity[q, 2]
-                        held += own
+                w = chosen(weights_of(packet[p, 0]), ii) * chosen(weights_of(packet[p, 1]), jj)
+                w = w * chosen(weights_of(packet[p, 2]), kk)
+                a, c, d = F(ii), F(jj), F(kk)
+                px += w * (packet[p, 4] + a * packet[p, 7] + c * packet[p, 8] + d * packet[p, 9])
+                py += w * (packet[p, 5] + a * packet[p, 10] + c * packet[p, 11] + d * packet[p, 12])
+                pz += w * (packet[p, 6] + a * packet[p, 13] + c * packet[p, 14] + d * packet[p, 15])
+                m += w * packet[p, MASS]
+                if pinned and cell[p, PIN] >= 0:
+                    q = np.int64(cell[p, PIN])
+                    own = w * packet[p, MASS]
+                    hx += own * pin_velocity[q, 0]
+                    hy += own * pin_velocity[q, 1]
+                    hz += own * pin_velocity[q, 2]
+                    held += own
     return px, py, pz, m, hx, hy, hz, held
+
+
+def gather_nodes(thread, stride, scratch, blocks, given, pins, clock, out):  # type: ignore[no-untyped-def]
+    """Particles to grid: what each layer of cells along x gives to the nodes of active blocks.
+
+    A thread takes one layer of a node: nodes alone are too few to fill a card.
+
+    Parameters
+    ----------
+    thread, stride, scratch : int64 or tuple
+    blocks : tuple
+    given : tuple of array
+        Output of `prepare_particles`.
+    pins : tuple
+        Velocities of pins and whether there are any.
+    clock : array
+    out : tuple of array
+        Sums of each layer, (LAYERS, slots * 64, SUMS) float32; written.
+    """
+    sizes, active, first, neighbour = blocks
+    (sums,) = out
+    if clock[STOPPED] != 0.0:
+        return
+    total = sizes[0] * 64
+    for at in range(thread, total * LAYERS, stride):
+        layer, node = at // total, at % total
+        s, n = node // 64, node % 64
+        i, j, k = 4 * active[s, 0] + n // 16, 4 * active[s, 1] + n // 4 % 4, 4 * active[s, 2] + n % 4
+        px, py, pz, m, hx, hy, hz, held = gathered(i, j, k, s, i - 3 + layer, (first, neighbour), given, pins)
+        sums[layer, node, 0], sums[layer, node, 1], sums[layer, node, 2], sums[layer, node, 3] = px, py, pz, m
+        sums[layer, node, 4], sums[layer, node, 5], sums[layer, node, 6], sums[layer, node, 7] = hx, hy, hz, held
 
 
 def touched_by(v: Any, place: Any, step: Any, c: Any, colliders: Any) -> Any:
@@ -225,8 +258,8 @@ def bounded_by(v: Any, place: Any, spacing: Any, planes: Any, q: Any) -> Any:
     return vx, vy, vz
 
 
-def solve_nodes(thread, stride, scratch, blocks, given, grid, time, obstacles, forces, out):  # type: ignore[no-untyped-def]
-    """Particles to grid, and the grid's own step: velocities of all nodes of active blocks.
+def solve_nodes(thread, stride, scratch, blocks, sums, grid, time, obstacles, forces, out):  # type: ignore[no-untyped-def]
+    """The grid's own step: velocities of all nodes of active blocks.
 
     Parameters
     ----------
@@ -234,21 +267,21 @@ def solve_nodes(thread, stride, scratch, blocks, given, grid, time, obstacles, f
     scratch : object
         Not used.
     blocks : tuple
-    given : tuple of array
-        Output of `prepare_particles`.
+    sums : array
+        Output of `gather_nodes`.
     grid : tuple
     time : tuple of array
     obstacles : tuple
-        Colliders and whether there are any; planes and whether; velocities of pins and whether.
+        Colliders and whether there are any; planes and whether; whether there are pins.
     forces : tuple
         kg, below which a node is empty; wind; rows of fields and whether there are any.
     out : tuple of array
         Nodes.
     """
-    sizes, active, first, neighbour = blocks
+    sizes, active, _, _ = blocks
     origin, spacing = grid
     clock, times = time
-    colliders, touched, planes, bounded, pin_velocity, pinned = obstacles
+    colliders, touched, planes, bounded, pinned = obstacles
     least, wind, rows, blown = forces
     (nodes,) = out
     if clock[STOPPED] != 0.0:
@@ -258,7 +291,14 @@ def solve_nodes(thread, stride, scratch, blocks, given, grid, time, obstacles, f
     for at in range(thread, sizes[0] * 64, stride):
         s, n = at // 64, at % 64
         i, j, k = 4 * active[s, 0] + n // 16, 4 * active[s, 1] + n // 4 % 4, 4 * active[s, 2] + n % 4
-        px, py, pz, m, hx, hy, hz, held = gathered(i, j, k, s, (first, neighbour), given, (pin_velocity, pinned))
+        px, py, pz, m = ZERO, ZERO, ZERO, ZERO
+        hx, hy, hz, held = ZERO, ZERO, ZERO, ZERO
+        for layer in range(LAYERS):
+            px, py, pz = px + sums[layer, at, 0], py + sums[layer, at, 1], pz + sums[layer, at, 2]
+            m += sums[layer, at, 3]
+            if pinned:
+                hx, hy, hz = hx + sums[layer, at, 4], hy + sums[layer, at, 5], hz + sums[layer, at, 6]
+                held += sums[layer, at, 7]
         if m < least or m == ZERO:
             nodes[at, 0], nodes[at, 1], nodes[at, 2], nodes[at, 3] = ZERO, ZERO, ZERO, ZERO
             continue
@@ -417,6 +457,7 @@ def end_step(thread, stride, scratch, spacing, times, out):  # type: ignore[no-u
 
 
 PREPARE = WarpKernel(prepare_particles, (), NATIVES)
+GATHER = WarpKernel(gather_nodes, (), NATIVES)
 SOLVE = WarpKernel(solve_nodes, (), NATIVES)
 MOVE = WarpKernel(move_particles, (), NATIVES)
 END_STEP = WarpKernel(end_step, (), NATIVES)
