@@ -43,7 +43,8 @@ WC, WG, WE, WL, SIZE = (LANES * i for i in range(46, 51))
 UX, UY, UZ = (LANES * i for i in range(51, 54))
 # where smooth meshes have a terminator offset: see `scene.terminator`, and the part of it that a shadow ray gets
 HX, HY, HZ, LIMIT, MOVED = (LANES * i for i in range(54, 59))
-PACKET_FLOATS = 59 * LANES
+#: Four fields, 256 bytes, divide it: at 51 or 59 fields the kernel takes a tenth longer (bench/bench_earlier.py).
+PACKET_FLOATS = 60 * LANES
 #: Where lights are linked, the set of the surface: of a point's samples, which have no throughput, and of paths.
 POINT_SET, PATH_SET = TR, WL
 # uint32 fields: three random numbers, the key of more, the owner (a point, or a path), a place in a table, the row of
@@ -69,7 +70,7 @@ class Batch(NamedTuple):
 
     Attributes
     ----------
-    floats : (packets * 59 * LANES,) float32 array
+    floats : (packets * 60 * LANES,) float32 array
         Fields from OX to MOVED.
     ints : (packets * 8 * LANES,) uint32 array
         Fields from N0 to OWN.
@@ -455,7 +456,7 @@ def grazing(s, i):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    s : (packets * 59 * LANES,) float32 array
+    s : (packets * 60 * LANES,) float32 array
         `Batch.floats`.
     i : int64
         Index of the slot in it, see `at`.
