@@ -66,8 +66,9 @@ def known_ground(folder: Path) -> str | None:
 
 
 def write_capture(
-    folder: Path, pictures: dict[str, Picture], found: Registration, said: list[str], more: dict[str, Any]
-) -> None:
+    folder: Path, pictures: dict[str, Picture], found: Registration, said: list[str], more: dict[str, Any],
+    guessed: dict[str, str],
+) -> None:  # fmt: skip
     """Write the pictures with their cameras, and the report; `transforms.json` comes last.
 
     Parameters
@@ -81,6 +82,8 @@ def write_capture(
         Lines of the report's drawing.
     more : dict
         Further entries of `capture.json`.
+    guessed : dict of str to str
+        `Alignment.guessed`, which readers of the capture say again.
 
     Raises
     ------
@@ -121,11 +124,13 @@ def write_capture(
     if len(found.points):
         _write_points(folder / POINTS, found)
     draw_cameras(folder / DRAWING, found, said)
-    write_report(folder / REPORT, found, {"notes": notes, **more})
+    write_report(folder / REPORT, found, {"notes": notes, "guessed": guessed, **more})
     # nerfstudio's keys: the world stays as it is (Z up); the points that surfels begin at.
     text: dict[str, Any] = {"camera_model": "OPENCV", "orientation_override": "none", "frames": frames}
     if len(found.points):
         text["ply_file_path"] = POINTS
+    if guessed:
+        text["guessed"] = guessed
     replace_file(folder / CAMERAS, [json.dumps(text, indent=1).encode()])
 
 

@@ -1,0 +1,287 @@
+"""Exposure brackets to one linear picture each: the weighted mean of what every exposure says of the radiance."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..core.arrays import Array
+from ..core.color import linear_to_srgb, srgb_to_linear
+from ..core.errors import AssetError, Cancelled, first_of
+from ..formats.exr import write_exr_picture
+from .brackets import Bracket, Brackets, reference, stops_of, white_of
+from .features import Tell
+from .pictures import Picture, decode
+
+logger = logging.getLogger(__name__)
+
+#: Encoded values from which a pixel counts as saturated: JPEG writes clipped ones a little lower, too.
+_SATURATED = 0.98
+#: Least weight of an unsaturated value, so that black in every exposure is black.
+_LEAST = 1e-3
+#: Cells along the longer side in which exposures are compared, and pixels of one at least; cells that must be
+#: comparable; least mean of one, encoded: below it noise and rounding decide.
+_CELLS, _BLOCK, _ENOUGH, _DARK = 64, 4, 20, 0.08
+#: Least correlation of the logarithms of two exposures of one view; stops of contrast below which that says nothing.
+_ALIKE, _FLAT = 0.9, 0.15
+#: Stops by which the ratio of two exposures may differ from what EXIF says.
+_AGREE = 0.5
+#: Rows that are added at once.
+_ROWS = 256
+#: Part of the pixels above white from which the report says so.
+_ABOVE = 1e-3
+
+
+@dataclass(slots=True)
+class Merged:
+    """What became of brackets: pictures in the order of their files, files that are left out and why, lines to say."""
+
+    pictures: list[Picture]
+    left_out: dict[str, str] = field(default_factory=dict)
+    lines: list[str] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class _Doubts:
+    """What is wrong with brackets, to be told once for all."""
+
+    other_views: list[str] = field(default_factory=list)
+    disagree: list[str] = field(default_factory=list)
+    unread: dict[str, str] = field(default_factory=dict)
+    brightest: float = 0.0
+
+
+def merge_brackets(pictures: Sequence[Picture], found: Brackets, folder: Path, subject: str, tell: Tell,
+                   cancelled: Callable[[], bool]) -> Merged:  # fmt: skip
+    """Merge brackets to EXR files, linear Rec.709, of one scale: 1 is white at the median of the middle exposures.
+
+    The radiance of a pixel is the mean over the exposures of its linear value divided by the exposure, weighted by the
+    exposure and a hat over the encoded value (Debevec and Malik 1997, with the curve of sRGB); saturated values count
+    only where all are: then the shortest exposure is what is known.
+
+    Parameters
+    ----------
+    pictures : sequence of Picture
+        All of the folder.
+    found : Brackets
+    folder : Path
+        To write into.
+    subject : str
+        For messages.
+    tell, cancelled : callable
+
+    Raises
+    ------
+    AssetError
+        No picture is left.
+    Cancelled
+        `cancelled` said so.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    references, doubts, made, one_by_one = reference(found.groups), _Doubts(), {}, set()
+    for index, group in enumerate(found.groups):
+        if cancelled():
+            raise Cancelled
+        tell("merging exposures", index / len(found.groups))
+        merged = _merge(group, folder, white_of(group, references), doubts)
+        if merged is None:
+            one_by_one |= {id(picture) for picture in group.pictures}
+        else:
+            made[id(group.pictures[0])] = merged
+    left_out = {name: f"cannot be read ({problem})" for name, problem in doubts.unread.items()}
+    single = {id(picture) for picture in found.others} | one_by_one
+    result = []
+    for picture in pictures:
+        if (merged := made.get(id(picture))) is not None:
+            result.append(merged)
+        elif id(picture) in single and picture.path.name not in left_out:
+            result.append(picture)
+    if not result:
+        raise AssetError(
+            subject, f"has only pictures that cannot be read: {first_of(list(left_out))}", "Copy them again"
+        )
+    _tell(doubts, subject)
+    return Merged(result, left_out, _lines(found, len(made), doubts))
+
+
+def _merge(group: Bracket, folder: Path, white: float, doubts: _Doubts) -> Picture | None:
+    """A bracket as one picture; None where its pictures are no bracket, or none can be read."""
+    middle = group.middle
+    target = folder / f"{middle.name}.exr"
+    masks = [picture.mask for picture in (middle, *group.pictures) if picture.mask is not None]
+    exif = replace(middle.exif, orientation=1)
+    if exif.exposure is not None:
+        exif = replace(exif, exposure=white)
+    names = tuple(picture.path.name for picture in group.pictures)
+    picture = Picture(target, middle.name, masks[0] if masks else None, exif, middle.size, merged=names)
+    picture.alpha = middle.alpha
+    radiance = _Radiance(white)
+    for one in sorted(group.pictures, key=stops_of, reverse=True):  # the shortest exposure first
+        try:
+            pixels = decode(one)
+        except AssetError as error:
+            doubts.unread[one.path.name] = error.problem
+            continue
+        if not radiance.add(pixels, stops_of(one), one is middle):
+            doubts.other_views.append(str(group))
+            return None
+    if radiance.count == 0:
+        return None
+    pixels = radiance.result()
+    write_exr_picture(target, pixels)
+    _note(picture, radiance, pixels, doubts)
+    if radiance.error > _AGREE:
+        doubts.disagree.append(f"{group} ({radiance.error:.1f} stops)")
+    return picture
+
+
+def _note(picture: Picture, radiance: _Radiance, pixels: Array, doubts: _Doubts) -> None:
+    """What is unusual about a merged picture."""
+    picture.notes.append(f"merged from {radiance.count} exposures ({', '.join(picture.merged)})")
+    if radiance.lost > _ABOVE:
+        picture.notes.append(f"{radiance.lost:.1%} of its pixels are saturated in every exposure")
+    above = float((pixels[..., :3].max(axis=2) > 1).mean())
+    if above > _ABOVE:
+        picture.notes.append(f"{above:.1%} of its pixels are brighter than white, which drgs reconstruct clips")
+    doubts.brightest = max(doubts.brightest, above)
+
+
+class _Radiance:
+    """The weighted mean as it grows by one exposure after the other, the shortest first."""
+
+    def __init__(self, white: float) -> None:
+        self._white = white
+        self._total: Array | None = None
+        self._weight: Array | None = None
+        self._shortest: Array | None = None
+        self._alpha: Array | None = None
+        self._cells: tuple[Array, Array] | None = None
+        self.count = 0
+        self.error = 0.0
+        self.lost = 0.0
+
+    def add(self, pixels: Array, stops: float, middle: bool) -> bool:
+        """Add (h, w, 3 or 4) pixels of `decode`; False where they show another view."""
+        scale = np.float32(2.0 ** (stops - self._white))
+        cells = _compared(pixels, scale)
+        if self._cells is not None and not self._same_view(cells):
+            return False
+        self._cells = cells
+        if pixels.shape[2] == 4 and (self._alpha is None or middle):
+            self._alpha = np.asarray(np.clip(pixels[..., 3:] / _most(pixels), 0, 1), np.float32)
+        first = self._total is None
+        if first:
+            self._total, self._weight, self._shortest = (np.zeros((*pixels.shape[:2], 3), np.float32) for _ in range(3))
+        assert self._total is not None and self._weight is not None and self._shortest is not None
+        for row in range(0, len(pixels), _ROWS):  # memory: whole planes of both would double it
+            rows = slice(row, row + _ROWS)
+            linear, weight = _linear_and_weight(pixels[rows, :, :3])
+            linear *= scale
+            weight /= scale
+            self._weight[rows] += weight
+            if first:
+                self._shortest[rows] = linear
+            self._total[rows] += linear * weight
+        self.count += 1
+        return True
+
+    def _same_view(self, cells: tuple[Array, Array]) -> bool:
+        """Whether cells fit those of the exposure before; how far they are from what EXIF says is kept in `error`."""
+        assert self._cells is not None
+        (one, one_valid), (other, other_valid) = self._cells, cells
+        if one.shape != other.shape:
+            return False
+        valid = one_valid & other_valid
+        if valid.sum() < _ENOUGH:
+            return True  # nothing to compare
+        a, b = np.log2(one[valid]), np.log2(other[valid])
+        self.error = max(self.error, abs(float(np.median(a - b))))
+        if min(a.std(), b.std()) < _FLAT:
+            return True
+        return float(np.corrcoef(a, b)[0, 1]) >= _ALIKE
+
+    def result(self) -> Array:
+        """(h, w, 3 or 4) float32, linear; colours are multiplied by the alpha, as EXR has them."""
+        assert self._total is not None and self._weight is not None and self._shortest is not None
+        known = self._weight > 0
+        self.lost = float((~known).any(axis=2).mean())
+        colour = np.divide(self._total, self._weight, out=self._shortest, where=known)
+        if self._alpha is None:
+            return colour
+        return np.concatenate([colour * self._alpha, self._alpha], axis=2, dtype=np.float32)
+
+
+def _most(pixels: Array) -> float:
+    return float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else 1.0
+
+
+def _linear_and_weight(colour: Array) -> tuple[Array, Array]:
+    """Linear values of (...) pixels, and their weights: a hat over the encoded value, 0 where saturated."""
+    if colour.dtype.kind == "u":  # a table is a tenth of the work
+        steps = np.arange(int(_most(colour)) + 1, dtype=np.float32) / np.float32(_most(colour))
+        return srgb_to_linear(steps)[colour], _hat(steps)[colour]
+    linear = np.maximum(colour, 0).astype(np.float32)
+    return linear, _hat(linear_to_srgb(np.minimum(linear, 1)))
+
+
+def _hat(encoded: Array) -> Array:
+    weight = np.minimum(encoded, 1 - encoded) + np.float32(_LEAST)
+    return np.where(encoded >= _SATURATED, 0, weight).astype(np.float32)
+
+
+def _compared(pixels: Array, scale: np.float32) -> tuple[Array, Array]:
+    """(mean radiance of green in cells, which of them have no saturated pixel and are not dark)."""
+    height, width = pixels.shape[:2]
+    longest = min(_CELLS, max(height, width) // _BLOCK)
+    cells = [max(1, round(longest * side / max(height, width))) for side in (height, width)]
+    rows, columns = (np.linspace(0, side, n + 1).astype(int)[:-1] for side, n in zip((height, width), cells))
+    ends = np.append(rows, height), np.append(columns, width)
+    area = np.diff(ends[0])[:, None] * np.diff(ends[1])
+    limit = _SATURATED * _most(pixels) if pixels.dtype.kind == "u" else float(srgb_to_linear(np.array(_SATURATED)))
+    green = _linear_and_weight(pixels[..., 1])[0]
+    free = (pixels[..., :3].max(axis=2) < limit).astype(np.float32)
+    mean, part = (
+        np.add.reduceat(np.add.reduceat(one, rows, axis=0), columns, axis=1) / np.maximum(area, 1)
+        for one in (green, free)
+    )
+    dark = float(srgb_to_linear(np.array(_DARK)))
+    return mean * scale, (part >= 1 - 1e-6) & (mean > dark)
+
+
+def _tell(doubts: _Doubts, subject: str) -> None:
+    if doubts.unread:
+        named = [f"{name} ({problem})" for name, problem in doubts.unread.items()]
+        logger.warning(
+            "%s: %d exposures cannot be read and are left out of their brackets: %s",
+            subject,
+            len(named),
+            first_of(named),
+        )
+    if doubts.other_views:
+        logger.warning(
+            "%s: %d brackets by EXIF show no one view and are not merged; each of their pictures is used as it is: %s",
+            subject, len(doubts.other_views), first_of(doubts.other_views),
+        )  # fmt: skip
+    if doubts.disagree:
+        logger.warning(
+            "%s: %d brackets differ otherwise in brightness than EXIF says, so their colours are not those of the "
+            "light: %s. The camera's contrast curve does that, or light that changed; develop raw files to linear EXR, "
+            "or to TIFF without a curve",
+            subject, len(doubts.disagree), first_of(doubts.disagree),
+        )  # fmt: skip
+
+
+def _lines(found: Brackets, merged: int, doubts: _Doubts) -> list[str]:
+    """What is said of the brackets."""
+    if not merged:
+        return []
+    steps = found.complete[0].steps if found.complete else []
+    stops = ", ".join(f"{-step:+.1f}" if step else "0" for step in steps)
+    line = f"brackets: {merged} merged, of {found.size} exposures ({stops} stops)"
+    if doubts.brightest > _ABOVE:
+        line += f"; up to {doubts.brightest:.1%} of a picture is brighter than white, which drgs reconstruct clips"
+    return [line]
