@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from ..core.arrays import Array
+from ..core.asset.archive import replace_file
 from ..core.color import linear_to_srgb, srgb_to_linear
 from ..core.errors import AssetError, Cancelled, first_of
 from ..formats.exr import write_exr_picture
@@ -46,13 +48,39 @@ class Merged:
 
 
 @dataclass(slots=True)
-class _Doubts:
-    """What is wrong with brackets, to be told once for all."""
+class _Outcome:
+    """What became of one bracket; kept beside its picture, for a run that goes on.
 
-    other_views: list[str] = field(default_factory=list)
-    disagree: list[str] = field(default_factory=list)
+    Attributes
+    ----------
+    used : list of str
+        Names of the merged files; none where they show several views, or none can be read.
+    unread : dict of str to str
+        Name -> what is wrong.
+    views : bool
+        They show several views.
+    error : float
+        Stops by which exposures differ otherwise than EXIF says.
+    lost, above : float
+        Parts of the pixels that are saturated in every exposure, that are brighter than white.
+    """
+
+    used: list[str] = field(default_factory=list)
     unread: dict[str, str] = field(default_factory=dict)
-    brightest: float = 0.0
+    views: bool = False
+    error: float = 0.0
+    lost: float = 0.0
+    above: float = 0.0
+
+    @property
+    def notes(self) -> list[str]:
+        """What is unusual about the merged picture."""
+        notes = [f"merged from {len(self.used)} exposures ({', '.join(self.used)})"]
+        if self.lost > _ABOVE:
+            notes.append(f"{self.lost:.1%} of its pixels are saturated in every exposure")
+        if self.above > _ABOVE:
+            notes.append(f"{self.above:.1%} of its pixels are brighter than white, which drgs reconstruct clips")
+        return notes
 
 
 def merge_brackets(pictures: Sequence[Picture], found: Brackets, folder: Path, subject: str, tell: Tell,
@@ -69,7 +97,7 @@ def merge_brackets(pictures: Sequence[Picture], found: Brackets, folder: Path, s
         All of the folder.
     found : Brackets
     folder : Path
-        To write into.
+        To write into; pictures that a run before this has merged there from the same files are kept.
     subject : str
         For messages.
     tell, cancelled : callable
@@ -82,72 +110,70 @@ def merge_brackets(pictures: Sequence[Picture], found: Brackets, folder: Path, s
         `cancelled` said so.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    references, doubts, made, one_by_one = reference(found.groups), _Doubts(), {}, set()
+    references = reference(found)
+    outcomes = []
     for index, group in enumerate(found.groups):
         if cancelled():
             raise Cancelled
         tell("merging exposures", index / len(found.groups))
-        merged = _merge(group, folder, white_of(group, references), doubts)
-        if merged is None:
-            one_by_one |= {id(picture) for picture in group.pictures}
+        outcomes.append(_outcome(group, folder / f"{group.middle.name}.exr", white_of(group, references)))
+    left_out = {name: f"cannot be read ({why})" for one in outcomes for name, why in one.unread.items()}
+    made: dict[int, Picture] = {}
+    alone = {id(picture) for picture in found.others}
+    for group, outcome in zip(found.groups, outcomes, strict=True):
+        if outcome.used:
+            made[id(group.pictures[0])] = _picture(group, folder, white_of(group, references), outcome)
         else:
-            made[id(group.pictures[0])] = merged
-    left_out = {name: f"cannot be read ({problem})" for name, problem in doubts.unread.items()}
-    single = {id(picture) for picture in found.others} | one_by_one
-    result = []
-    for picture in pictures:
-        if (merged := made.get(id(picture))) is not None:
-            result.append(merged)
-        elif id(picture) in single and picture.path.name not in left_out:
-            result.append(picture)
+            alone |= {id(picture) for picture in group.pictures if picture.path.name not in left_out}
+    result = [made.get(id(one), one) for one in pictures if id(one) in made or id(one) in alone]
     if not result:
-        raise AssetError(
-            subject, f"has only pictures that cannot be read: {first_of(list(left_out))}", "Copy them again"
-        )
-    _tell(doubts, subject)
-    return Merged(result, left_out, _lines(found, len(made), doubts))
+        problem = f"has only pictures that cannot be read: {first_of(list(left_out))}"
+        raise AssetError(subject, problem, "Copy them again")
+    _tell(found.groups, outcomes, subject)
+    return Merged(result, left_out, _lines(found, outcomes))
 
 
-def _merge(group: Bracket, folder: Path, white: float, doubts: _Doubts) -> Picture | None:
-    """A bracket as one picture; None where its pictures are no bracket, or none can be read."""
+def _picture(group: Bracket, folder: Path, white: float, outcome: _Outcome) -> Picture:
+    """The merged picture of a bracket."""
     middle = group.middle
-    target = folder / f"{middle.name}.exr"
     masks = [picture.mask for picture in (middle, *group.pictures) if picture.mask is not None]
     exif = replace(middle.exif, orientation=1)
     if exif.exposure is not None:
         exif = replace(exif, exposure=white)
-    names = tuple(picture.path.name for picture in group.pictures)
-    picture = Picture(target, middle.name, masks[0] if masks else None, exif, middle.size, merged=names)
-    picture.alpha = middle.alpha
-    radiance = _Radiance(white)
+    picture = Picture(folder / f"{middle.name}.exr", middle.name, masks[0] if masks else None, exif, middle.size)
+    picture.notes, picture.alpha, picture.merged = outcome.notes, middle.alpha, tuple(outcome.used)
+    return picture
+
+
+def _outcome(group: Bracket, target: Path, white: float) -> _Outcome:
+    """A bracket merged into `target`, or what a run before this says of it."""
+    kept = target.with_suffix(".json")
+    try:
+        return _Outcome(**json.loads(kept.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        outcome = _merge(group, target, white)
+    replace_file(kept, [json.dumps(asdict(outcome)).encode()])  # after the picture: then that is whole
+    return outcome
+
+
+def _merge(group: Bracket, target: Path, white: float) -> _Outcome:
+    """A bracket merged into `target`, unless its pictures are none or cannot be read."""
+    radiance, outcome = _Radiance(white), _Outcome()
     for one in sorted(group.pictures, key=stops_of, reverse=True):  # the shortest exposure first
         try:
             pixels = decode(one)
         except AssetError as error:
-            doubts.unread[one.path.name] = error.problem
+            outcome.unread[one.path.name] = error.problem
             continue
-        if not radiance.add(pixels, stops_of(one), one is middle):
-            doubts.other_views.append(str(group))
-            return None
-    if radiance.count == 0:
-        return None
-    pixels = radiance.result()
-    write_exr_picture(target, pixels)
-    _note(picture, radiance, pixels, doubts)
-    if radiance.error > _AGREE:
-        doubts.disagree.append(f"{group} ({radiance.error:.1f} stops)")
-    return picture
-
-
-def _note(picture: Picture, radiance: _Radiance, pixels: Array, doubts: _Doubts) -> None:
-    """What is unusual about a merged picture."""
-    picture.notes.append(f"merged from {radiance.count} exposures ({', '.join(picture.merged)})")
-    if radiance.lost > _ABOVE:
-        picture.notes.append(f"{radiance.lost:.1%} of its pixels are saturated in every exposure")
-    above = float((pixels[..., :3].max(axis=2) > 1).mean())
-    if above > _ABOVE:
-        picture.notes.append(f"{above:.1%} of its pixels are brighter than white, which drgs reconstruct clips")
-    doubts.brightest = max(doubts.brightest, above)
+        if not radiance.add(pixels, stops_of(one), one is group.middle):
+            return _Outcome(unread=outcome.unread, views=True)
+    outcome.used = [one.path.name for one in group.pictures if one.path.name not in outcome.unread]
+    if outcome.used:
+        merged = radiance.result()
+        write_exr_picture(target, merged)
+        outcome.error, outcome.lost = radiance.error, radiance.lost
+        outcome.above = float((merged[..., :3].max(axis=2) > 1).mean())
+    return outcome
 
 
 class _Radiance:
@@ -252,36 +278,37 @@ def _compared(pixels: Array, scale: np.float32) -> tuple[Array, Array]:
     return mean * scale, (part >= 1 - 1e-6) & (mean > dark)
 
 
-def _tell(doubts: _Doubts, subject: str) -> None:
-    if doubts.unread:
-        named = [f"{name} ({problem})" for name, problem in doubts.unread.items()]
+def _tell(groups: Sequence[Bracket], outcomes: Sequence[_Outcome], subject: str) -> None:
+    """Warnings, one for each kind of doubt."""
+    pairs = list(zip(groups, outcomes, strict=True))
+    if unread := [f"{name} ({why})" for one in outcomes for name, why in one.unread.items()]:
         logger.warning(
             "%s: %d exposures cannot be read and are left out of their brackets: %s",
-            subject,
-            len(named),
-            first_of(named),
-        )
-    if doubts.other_views:
+            subject, len(unread), first_of(unread),
+        )  # fmt: skip
+    if views := [str(group) for group, one in pairs if one.views]:
         logger.warning(
             "%s: %d brackets by EXIF show no one view and are not merged; each of their pictures is used as it is: %s",
-            subject, len(doubts.other_views), first_of(doubts.other_views),
+            subject, len(views), first_of(views),
         )  # fmt: skip
-    if doubts.disagree:
+    if disagree := [f"{group} ({one.error:.1f} stops)" for group, one in pairs if one.error > _AGREE]:
         logger.warning(
             "%s: %d brackets differ otherwise in brightness than EXIF says, so their colours are not those of the "
             "light: %s. The camera's contrast curve does that, or light that changed; develop raw files to linear EXR, "
             "or to TIFF without a curve",
-            subject, len(doubts.disagree), first_of(doubts.disagree),
+            subject, len(disagree), first_of(disagree),
         )  # fmt: skip
 
 
-def _lines(found: Brackets, merged: int, doubts: _Doubts) -> list[str]:
+def _lines(found: Brackets, outcomes: Sequence[_Outcome]) -> list[str]:
     """What is said of the brackets."""
+    merged = sum(bool(one.used) for one in outcomes)
     if not merged:
         return []
     steps = found.complete[0].steps if found.complete else []
     stops = ", ".join(f"{-step:+.1f}" if step else "0" for step in steps)
     line = f"brackets: {merged} merged, of {found.size} exposures ({stops} stops)"
-    if doubts.brightest > _ABOVE:
-        line += f"; up to {doubts.brightest:.1%} of a picture is brighter than white, which drgs reconstruct clips"
+    above = max(one.above for one in outcomes)
+    if above > _ABOVE:
+        line += f"; up to {above:.1%} of a picture is brighter than white, which drgs reconstruct clips"
     return [line]

@@ -52,8 +52,8 @@ class Bracket:
 
     @property
     def middle(self) -> Picture:
-        """The picture of middle exposure."""
-        return sorted(self.pictures, key=stops_of)[len(self.pictures) // 2]
+        """The picture of middle exposure, of two the brighter."""
+        return sorted(self.pictures, key=stops_of)[(len(self.pictures) - 1) // 2]
 
     def __str__(self) -> str:
         return " + ".join(picture.path.name for picture in self.pictures)
@@ -242,11 +242,14 @@ def _of_other_size(groups: Sequence[Bracket]) -> list[str]:
     return [f"{p.path.name} ({p.size[0]} x {p.size[1]}, not {usual[0]} x {usual[1]})" for p in odd]
 
 
-def reference(groups: Sequence[Bracket]) -> dict[tuple[object, ...], float]:
+def reference(found: Brackets) -> dict[tuple[object, ...], float]:
     """Kind of pictures -> exposure value at which 1 is white in merged ones: the median of the middle exposures."""
     middles: dict[tuple[object, ...], list[float]] = {}
-    for group in groups:
-        middles.setdefault(_comparable(group.middle), []).append(stops_of(group.middle))
+    complete = {_comparable(group.middle) for group in found.complete}
+    for group in found.groups:
+        kind = _comparable(group.middle)
+        if len(group.pictures) == found.size or kind not in complete:
+            middles.setdefault(kind, []).append(stops_of(group.middle))
     return {kind: float(np.median(values)) for kind, values in middles.items()}
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import tifffile
@@ -24,13 +26,13 @@ SIZE = (48, 36)
 
 
 def radiance(view: int) -> np.ndarray:
-    """(h, w, 3) of a smooth scene over 11 stops, in parts of the middle exposure's white."""
+    """(h, w, 3) of a smooth scene over 10 stops, in parts of the middle exposure's white."""
     random = np.random.default_rng(view)
     noise = random.normal(size=(5, 6, 3)).astype(np.float32)
     planes = [np.asarray(Image.fromarray(noise[..., c]).resize(SIZE, Image.Resampling.BICUBIC)) for c in range(3)]
     stack = np.stack(planes, axis=-1)
     stack = (stack - stack.min()) / np.ptp(stack)
-    return (2.0 ** (-6.5 + 9.3 * stack)).astype(np.float32)
+    return (2.0 ** (-6.5 + 10 * stack)).astype(np.float32)
 
 
 def tags(seconds, number=8.0, iso=100, second=0, **more) -> Image.Exif:
@@ -89,6 +91,7 @@ def test_brackets_become_the_radiance_of_the_scene(tmp_path):
         assert known.mean() > 0.6
         assert np.abs(found / truth - 1)[known].max() < 0.02
         bright = truth > 8 * 1.02  # saturated in all: what the shortest shows
+        assert bright.any()
         np.testing.assert_allclose(found[bright], 8, rtol=0.01)
 
 
@@ -332,6 +335,26 @@ def test_deep_pictures_are_merged_in_their_depth(tmp_path):
     assert np.abs(decode(done.pictures[0]) / radiance(0) - 1)[known].max() < 2e-3
 
 
+def test_a_run_that_goes_on_keeps_what_is_merged_and_says_it_again(tmp_path, caplog):
+    photos, work = tmp_path / "photos", tmp_path / "work"
+    shoot(photos, 3)
+    Image.fromarray(expose(radiance(7) / 8)).save(photos / "01_1.png", exif=tags(1 / 480, second=21))
+    pictures = find_pictures(photos)
+    found = find_brackets(pictures, "auto", photos)
+    assert found is not None
+    answers = iter([False, False, True])
+    with pytest.raises(Cancelled):
+        bracket_merge.merge_brackets(pictures, found, work, "p", lambda *_: None, lambda: next(answers))
+    before = (work / "00_0.exr").stat().st_mtime_ns
+    assert not caplog.messages
+    done = merged(photos, tmp_path)
+    assert (work / "00_0.exr").stat().st_mtime_ns == before and len(done.pictures) == 5
+    told, notes = caplog.messages, [picture.notes for picture in done.pictures]
+    caplog.clear()
+    again = merged(photos, tmp_path)
+    assert caplog.messages == told and [picture.notes for picture in again.pictures] == notes and told
+
+
 def test_merging_can_be_cancelled_and_goes_before_long_work(tmp_path):
     photos = tmp_path / "photos"
     shoot(photos, 3)
@@ -345,6 +368,50 @@ def test_merging_can_be_cancelled_and_goes_before_long_work(tmp_path):
         pipeline.make_capture(
             photos, tmp_path / "out", pipeline.Settings(poses="features"), lambda *_: None, lambda: False
         )
+
+
+def test_a_bracketed_set_becomes_a_capture_that_reconstruct_reads(tmp_path, monkeypatch, caplog):
+    """The whole command but for structure from motion, whose cameras are made up."""
+    from test_capture_registration import registration, ring
+
+    from drgs_blender.reconstruct.readers import read_capture
+    from drgs_blender.reconstruct.readers.lens import Lens
+
+    photos, out = tmp_path / "photos", tmp_path / "out"
+    shoot(photos, 6, left_out=((2, 2),))
+
+    def register(database, folder, models, photos, *_):
+        cameras = dict(zip([photo.file for photo in photos], ring(len(photos)).values(), strict=True))
+        found = registration(cameras, np.zeros((0, 3)))
+        found.lenses = dict.fromkeys(cameras, Lens(*SIZE, 45.0, 45.0, 24.0, 18.0))
+        return found
+
+    monkeypatch.setattr(pipeline, "register", register)
+    monkeypatch.setattr(pipeline.features, "extract", lambda *_: None)
+    monkeypatch.setattr(pipeline.features, "match", lambda *_: None)
+    settings = pipeline.Settings(poses="features", masks="auto")
+    made = pipeline.make_capture(photos, out, settings, lambda *_: None, lambda: False)
+    assert "up: how the cameras were held (guessed); ground: what the cameras look at (guessed)" in made.lines
+    assert any(line.startswith("brackets: 6 merged, of 3 exposures") for line in made.lines)
+    assert (
+        "no masks are made" in caplog.text and "up is guessed" in caplog.text and "02_0.png + 02_1.png" in caplog.text
+    )
+    report = json.loads((out / "capture.json").read_text())
+    assert report["brackets"]["01_0"] == ["01_0.png", "01_1.png", "01_2.png"] and report["left_out"] == {}
+    assert set(report["guessed"]) == {"scale", "up", "ground"}
+    assert "merged from 2 exposures (02_0.png, 02_1.png)" in report["notes"]["02_0.exr"]
+    frames = json.loads((out / "transforms.json").read_text())["frames"]
+    assert len({frame["exposure_value"] for frame in frames}) == 1 and frames[0]["file_path"] == "images/00_0.exr"
+    caplog.clear()
+    capture = read_capture(out)
+    assert len(capture.views) == 6 and "without knowing scale" in caplog.text
+    wanted = linear_to_srgb(np.clip(radiance(0), 0, 1))
+    np.testing.assert_allclose(capture.views[0].colour, wanted, atol=0.015)
+    assert pipeline.make_capture(photos, out, settings, lambda *_: None, lambda: False).kept
+    none = pipeline.Settings(poses="features", brackets="none")
+    made = pipeline.make_capture(photos, out, none, lambda *_: None, lambda: False)
+    assert not made.kept and made.of == made.pictures + len(made.left_out) == 17
+    assert {path.suffix for path in (out / "images").iterdir()} == {".png"}
 
 
 def test_merged_pictures_are_no_brackets_to_the_inspection(tmp_path):
