@@ -141,7 +141,9 @@ def _picture(group: Bracket, folder: Path, white: float, outcome: _Outcome) -> P
     if exif.exposure is not None:
         exif = replace(exif, exposure=white)
     picture = Picture(folder / f"{middle.name}.exr", middle.name, masks[0] if masks else None, exif, middle.size)
-    picture.notes, picture.alpha, picture.merged = outcome.notes, middle.alpha, tuple(outcome.used)
+    sources = [f"{one.path.name}: {note}" for one in group.pictures for note in one.notes]
+    picture.notes = [*outcome.notes, *sources]
+    picture.alpha, picture.merged = middle.alpha, tuple(outcome.used)
     return picture
 
 
