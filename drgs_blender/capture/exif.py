@@ -11,6 +11,8 @@ from typing import Any
 from PIL import ExifTags
 from PIL import Image as Pillow
 
+from .gravity import Vector, up_of_maker_note
+
 #: Diagonal of a full-frame sensor, mm: "35 mm equivalent" focal lengths mean the angle of view along it (CIPA DCG-001).
 _FULL_FRAME = math.hypot(36.0, 24.0)
 #: Focal-plane resolution units in mm; EXIF 2.3 table 8.
@@ -35,6 +37,8 @@ class Metadata:
         What it is computed of, as far as it is known.
     taken : float, optional
         When, seconds; differences of one camera's pictures mean something, the value does not.
+    up : tuple of float, optional
+        Up as the phone measured it, in the frame of the upright picture: right, up, towards the camera.
     """
 
     orientation: int = 1
@@ -45,6 +49,7 @@ class Metadata:
     aperture: float | None = None
     iso: float | None = None
     taken: float | None = None
+    up: Vector | None = None
 
     @property
     def stops(self) -> float | None:
@@ -84,6 +89,7 @@ def read_exif(image: Pillow.Image) -> Metadata:
         aperture,
         iso,
         _time(when, part),
+        up_of_maker_note(details.get(ExifTags.Base.MakerNote), orientation, str(details.get(ExifTags.Base.LensModel))),
     )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import AssetError, UsageError, first_of
-from . import bracket_merge, brackets, capture_folder, features, libraries, marker_poses, pictures, video
+from . import bracket_merge, brackets, capture_folder, features, gravity, libraries, marker_poses, pictures, video
 from .features import Photo, Tell
 from .inspection import inspect
 from .marker_sheet import MarkerSheet, recognise
@@ -131,7 +131,10 @@ def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, can
     left_out |= ready.broken | unread
     photos = [photo for photo, picture in zip(ready.photos, ready.pictures) if any(picture is one for one in fit)]
     by_file = {photo.file: picture for photo, picture in zip(ready.photos, ready.pictures)}
-    found, alignment = _cameras(ready, photos, film is not None, source, settings, _part(tell, 0.2, 0.85), cancelled)
+    ups = {photo.file: up for photo in photos if (up := by_file[photo.file].exif.up) is not None}
+    found, alignment = _cameras(
+        ready, photos, ups, film is not None, source, settings, _part(tell, 0.2, 0.85), cancelled
+    )
     alignment.apply(found)
     for photo in photos:
         if photo.file not in found.matrices:
@@ -191,7 +194,8 @@ def _frames(film: Path, work: Path, count: int, tell: Tell, cancelled: Callable[
     return pictures.find_pictures(folder)
 
 
-def _cameras(ready: Prepared, photos: list[Photo], ordered: bool, source: Path, settings: Settings, tell: Tell,
+def _cameras(ready: Prepared, photos: list[Photo], ups: dict[str, gravity.Vector], ordered: bool, source: Path,
+             settings: Settings, tell: Tell,
              cancelled: Callable[[], bool]) -> tuple[Registration, Alignment]:  # fmt: skip
     """Cameras, from a marker sheet or from features, and the world they belong in."""
     sheet = None
@@ -240,7 +244,7 @@ def _cameras(ready: Prepared, photos: list[Photo], ordered: bool, source: Path, 
                 "%s: the marker sheet does not fit the other cameras; it may have moved. It is not used", source
             )
     if alignment is None:
-        alignment = align_to_ground(found, settings.distance)
+        alignment = align_to_ground(found, settings.distance, gravity.measured_up(found, ups, str(source)))
         _tell_guesses(alignment, source)
     return found, alignment
 
@@ -255,9 +259,10 @@ def _tell_guesses(alignment: Alignment, source: Path) -> None:
         )  # fmt: skip
     if "ground" in guessed:
         logger.warning(
-            "%s: no level plane is found under the object: up is guessed (%s), and so is where the ground is (%s). Lay "
-            "a marker sheet (drgs markers) or something with texture under it, or turn the object where it is used",
-            source, alignment.up_from, alignment.ground_from,
+            "%s: no level plane is found under the object: %s (%s) guessed. Lay a marker sheet (drgs markers) or "
+            "something with texture under it, or turn and move the object where it is used",
+            source, "up and the height of the ground are" if "up" in guessed else "the height of the ground is",
+            "; ".join(why for name, why in guessed.items() if name != "scale"),
         )  # fmt: skip
 
 
@@ -286,11 +291,11 @@ def _tell_left_out(found: Registration, photos: list[Photo], by_file: dict[str, 
 def _lines(made: Made) -> list[str]:
     """What is said of a capture."""
     alignment: Any = made.alignment
-    doubt = " (guessed)" if "ground" in alignment.guessed else ""
+    doubt = {name: " (guessed)" for name in alignment.guessed}
     return [
         f"{made.pictures} of {made.of} pictures have cameras ({made.method}; reprojection error {made.error:.2f} px)",
         f"scale: {alignment.scale_from}",
-        f"up: {alignment.up_from}{doubt}; ground: {alignment.ground_from}{doubt}",
+        f"up: {alignment.up_from}{doubt.get('up', '')}; ground: {alignment.ground_from}{doubt.get('ground', '')}",
     ]
 
 

@@ -22,7 +22,8 @@ _TRIALS, _THICKNESS = 2000, 0.012
 _GROUND, _BELOW = 0.12, 0.06
 #: What the ground rests on: points on it; the lower end of all points; nothing but the cameras.
 PLANE, LOWEST, GUESSED = "plane under the object", "lowest points", "what the cameras look at"
-#: What up rests on without a plane.
+#: What up rests on without a plane: phones' accelerometers; how people hold cameras; nothing.
+MEASURED = "gravity, as the phone measured it"
 HELD, UNKNOWN_UP = "how the cameras were held", "nothing: the cameras were held in all ways"
 
 
@@ -116,7 +117,7 @@ def align_to_markers(found: Registration, markers: Registration, sheet: str) -> 
     return Alignment(scale, rotation, shift, said, said, said)
 
 
-def align_to_ground(found: Registration, distance: float | None = None) -> Alignment:
+def align_to_ground(found: Registration, distance: float | None = None, up: Array | None = None) -> Alignment:
     """Up and ground of cameras and points: the plane under the object, else the points' lower end.
 
     Parameters
@@ -124,20 +125,25 @@ def align_to_ground(found: Registration, distance: float | None = None) -> Align
     found : Registration
     distance : float, optional
         True median distance of the cameras from the object, metres; None: not known.
+    up : (3,) array, optional
+        Up as it was measured, in the cameras' world; None: as they were held.
     """
     matrices = np.stack(list(found.matrices.values()))
     centres = matrices[:, :3, 3]
     centre = look_at(matrices)
     away = float(np.median(np.linalg.norm(centres - centre, axis=1)))
-    known = direction_up(matrices)
-    up = np.array([0.0, 0.0, 1.0]) if known is None else known
+    up_from = MEASURED
+    if up is None:
+        held = direction_up(matrices)
+        up_from = UNKNOWN_UP if held is None else HELD
+        up = np.array([0.0, 0.0, 1.0]) if held is None else held
     near = found.points[np.linalg.norm(found.points - centre, axis=1) < away] if len(found.points) else found.points
     plane = ground_plane(near, centres, up, away)
     if plane is not None:
         normal, offset = plane
         up_from = ground_from = PLANE
     else:
-        normal, up_from = up, UNKNOWN_UP if known is None else HELD
+        normal = up
         heights = near @ normal
         offset = float(np.quantile(heights, 0.01)) if len(near) >= 20 else float(centre @ normal)
         ground_from = LOWEST if len(near) >= 20 else GUESSED
