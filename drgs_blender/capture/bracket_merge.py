@@ -30,8 +30,9 @@ _LEAST = 1e-3
 _CELLS, _BLOCK, _ENOUGH, _DARK = 64, 4, 20, 0.08
 #: Least correlation of the logarithms of two exposures of one view; stops of contrast below which that says nothing.
 _ALIKE, _FLAT = 0.9, 0.15
-#: Stops by which the ratio of two exposures may differ from what EXIF says.
-_AGREE = 0.5
+#: Stops by which the ratio of two exposures may differ from what EXIF says; what EXIF's rounding explains of that, as
+#: of 1/60 s for 1/64 s: up to there the pictures know better, by so many cells.
+_AGREE, _ROUNDED, _MEASURED = 0.5, 0.12, 50
 #: Rows that are added at once.
 _ROWS = 256
 #: Part of the pixels above white from which the report says so.
@@ -188,17 +189,20 @@ class _Radiance:
         self._shortest: Array | None = None
         self._alpha: Array | None = None
         self._cells: tuple[Array, Array] | None = None
+        self._shift = self._middle_shift = 0.0
         self.count = 0
         self.error = 0.0
         self.lost = 0.0
 
     def add(self, pixels: Array, stops: float, middle: bool) -> bool:
         """Add (h, w, 3 or 4) pixels of `decode`; False where they show another view."""
-        scale = np.float32(2.0 ** (stops - self._white))
-        cells = _compared(pixels, scale)
+        cells = _compared(pixels, np.float32(2.0 ** (stops - self._white)))
         if self._cells is not None and not self._same_view(cells):
             return False
-        self._cells = cells
+        self._cells = cells[0] * np.float32(2.0**self._shift), cells[1]
+        if middle:
+            self._middle_shift = self._shift
+        scale = np.float32(2.0 ** (stops + self._shift - self._white))
         if pixels.shape[2] == 4 and (self._alpha is None or middle):
             self._alpha = np.asarray(np.clip(pixels[..., 3:] / _most(pixels), 0, 1), np.float32)
         first = self._total is None
@@ -218,7 +222,10 @@ class _Radiance:
         return True
 
     def _same_view(self, cells: tuple[Array, Array]) -> bool:
-        """Whether cells fit those of the exposure before; how far they are from what EXIF says is kept in `error`."""
+        """Whether cells fit those of the exposure before; how far they are from what EXIF says is kept.
+
+        Ratios that EXIF only rounds are measured: `_shift` is what makes the exposure that of the one before.
+        """
         assert self._cells is not None
         (one, one_valid), (other, other_valid) = self._cells, cells
         if one.shape != other.shape:
@@ -227,7 +234,10 @@ class _Radiance:
         if valid.sum() < _ENOUGH:
             return True  # nothing to compare
         a, b = np.log2(one[valid]), np.log2(other[valid])
-        self.error = max(self.error, abs(float(np.median(a - b))))
+        apart = float(np.median(a - b)) - self._shift
+        self.error = max(self.error, abs(apart))
+        if abs(apart) <= _ROUNDED and len(a) >= _MEASURED:
+            self._shift += apart
         if min(a.std(), b.std()) < _FLAT:
             return True
         return float(np.corrcoef(a, b)[0, 1]) >= _ALIKE
@@ -238,6 +248,7 @@ class _Radiance:
         known = self._weight > 0
         self.lost = float((~known).any(axis=2).mean())
         colour = np.divide(self._total, self._weight, out=self._shortest, where=known)
+        colour *= np.float32(2.0**-self._middle_shift)  # the middle exposure has the scale that EXIF says
         if self._alpha is None:
             return colour
         return np.concatenate([colour * self._alpha, self._alpha], axis=2, dtype=np.float32)

@@ -38,7 +38,8 @@ def up_of_maker_note(note: Any, orientation: int, lens: str) -> Vector | None:
 
     Parameters
     ----------
-    note : bytes, or what else EXIF has there
+    note : bytes
+        Of another type it is no maker note.
     orientation : int
         EXIF's.
     lens : str

@@ -111,6 +111,8 @@ def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, can
     if settings.masks == "none":
         for picture in given:
             picture.mask, picture.alpha = None, False
+    if film is not None and settings.brackets not in (brackets.AUTO, brackets.NONE):
+        raise UsageError("brackets", f"is {settings.brackets}, and {film.name} a video", "Leave it out for videos")
     bracketed = brackets.find_brackets(given, settings.brackets, source) if film is None else None
     digest = pictures.digest(given, settings)
     if capture_folder.complete(folder, digest):

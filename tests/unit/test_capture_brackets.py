@@ -102,6 +102,25 @@ def srgb_floor() -> float:
     return float(srgb_to_linear(np.float32(0.42)))
 
 
+def larger(pixels: np.ndarray) -> np.ndarray:
+    """The same with 5 x 5 pixels for each."""
+    return np.kron(pixels, np.ones((5, 5, 1), np.float32))
+
+
+def test_exposure_times_that_exif_rounds_are_measured(tmp_path):
+    """Cameras write 1/60 s for 1/64 s and 1/250 s for 1/256 s: 4 % of the light between them."""
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for view in range(2):
+        for k, (stop, time) in enumerate(((0, 60), (-2, 250), (2, 15))):
+            image = Image.fromarray(expose(larger(radiance(view)) * 2.0**stop))
+            image.save(photos / f"{view}{k}.png", exif=tags(1 / time, second=20 * view + k))
+    for view, picture in enumerate(merged(photos, tmp_path).pictures):
+        truth, found = larger(radiance(view)), decode(picture)
+        known = (truth < 0.95 * 4) & (truth * 4 > srgb_floor())
+        assert np.abs(found / truth - 1)[known].max() < 0.02
+
+
 def test_saturated_exposures_do_not_count(tmp_path):
     """A flat picture that is clipped in all but the shortest exposure."""
     photos = tmp_path / "photos"
