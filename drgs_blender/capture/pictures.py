@@ -36,6 +36,8 @@ UNREAD = frozenset((".heic", ".heif", ".avif", ".hdr", ".jxl"))
 #: Where the photographs of a folder are, the first that has some.
 _FOLDERS = ("images", "photos", "input", ".")
 _QUALITY = 97
+#: What the report says of pixels that are written as white.
+CLIPPED = "brighter than white and clipped"
 #: EXIF orientation -> (quarter turns counter-clockwise, mirrored left to right afterwards); EXIF 2.3 figure 19.
 _TURNS = {1: (0, 0), 2: (0, 1), 3: (2, 0), 4: (2, 1), 5: (3, 1), 6: (3, 0), 7: (1, 1), 8: (1, 0)}
 
@@ -165,7 +167,7 @@ def find_pictures(source: Path) -> list[Picture]:
             "%s: %d pictures are not used as they are stored, the first is %s: %s",
             source, len(noted), noted[0].path.name, "; ".join(noted[0].notes),
         )  # fmt: skip
-    _check_masks(pictures, source)
+    _check_masks(pictures)
     return pictures
 
 
@@ -197,8 +199,8 @@ def _described(picture: Picture) -> Picture:
     return picture
 
 
-def _check_masks(pictures: list[Picture], source: Path) -> None:
-    """Raise AssetError where a mask has another shape than its photograph; name those without one."""
+def _check_masks(pictures: list[Picture]) -> None:
+    """Raise AssetError where a mask has another shape than its photograph."""
     masked = [picture for picture in pictures if picture.mask]
     for picture in masked:
         assert picture.mask is not None
@@ -209,9 +211,6 @@ def _check_masks(pictures: list[Picture], source: Path) -> None:
             problem = f"is {width} x {height} pixels, {picture.path.name} {w} x {h}"
             remedy = "Draw the mask over the turned picture" if turned else "Draw it over the whole photograph"
             raise AssetError(str(picture.mask), problem, remedy)
-    if masked and len(masked) < len(pictures):
-        without = [picture.path.name for picture in pictures if not picture.mask]
-        logger.warning("%s: %d of %d pictures have no mask: %s", source, len(without), len(pictures), first_of(without))
 
 
 def decode(picture: Picture) -> Array:
@@ -317,7 +316,7 @@ def write_picture(picture: Picture, folder: Path) -> Path:
     if pixels.dtype.kind == "f":
         above = float((pixels[..., :3].max(axis=2) > 1).mean())
         if above > 1e-3:
-            picture.notes.append(f"{above:.1%} of its pixels are brighter than white and clipped")
+            picture.notes.append(f"{above:.1%} of its pixels are {CLIPPED}")
         colour = linear_to_srgb(np.clip(pixels[..., :3], 0, 1))
         pixels = np.asarray(np.dstack([colour, np.clip(pixels[..., 3:], 0, 1)]) * 65535 + 0.5, np.uint16)
     target = folder / f"{picture.name}.tif"

@@ -105,12 +105,12 @@ def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bo
 
 
 def _tell_unmasked(result: Prepared, unmasked: list[Picture]) -> None:
-    """Name pictures without a mask where the alpha of others is theirs; of files of masks this is said before."""
+    """Name pictures without a mask where others have one."""
     of_alpha = len(result.pictures) - len(unmasked) - sum(picture.mask is not None for picture in result.pictures)
-    if of_alpha and unmasked:
+    if unmasked and result.masks is not None:
         logger.warning(
             "%s: %d of %d pictures have neither a mask nor an alpha that is one: %s. drgs reconstruct leaves them out "
-            "where they are fewer, else it uses no masks",
+            "where they are fewer, else it uses no masks. Draw all or none",
             unmasked[0].path.parent, len(unmasked), len(result.pictures), first_of([p.path.name for p in unmasked]),
         )  # fmt: skip
     if of_alpha:

@@ -304,6 +304,20 @@ def test_merged_pictures_travel_as_exr_with_their_mask(tmp_path):
     assert any("brighter than white" in note for note in pictures[0].notes)
 
 
+def test_one_mask_is_enough_for_a_bracket(tmp_path, caplog):
+    photos = tmp_path / "images"
+    shoot(photos, 3)
+    (tmp_path / "masks").mkdir()
+    mask = np.zeros(SIZE[::-1], np.uint8)
+    mask[5:20, 5:20] = 255
+    for view in range(3):
+        Image.fromarray(mask).save(tmp_path / "masks" / f"{view:02d}_{view}.png")  # each of another exposure
+    pictures = merged(tmp_path, tmp_path).pictures
+    prepare(pictures, tmp_path / "prepared", 48, False, lambda *_: None, lambda: False)
+    assert [picture.mask.name for picture in pictures] == ["00_0.png", "01_1.png", "02_2.png"]
+    assert "mask" not in caplog.text
+
+
 def test_alpha_of_a_bracket_stays(tmp_path):
     photos = tmp_path / "photos"
     photos.mkdir()

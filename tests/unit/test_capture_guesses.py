@@ -100,6 +100,18 @@ def test_pictures_without_alpha_among_those_with_are_named(tmp_path, caplog):
     assert "1 of 3 pictures have neither a mask nor an alpha that is one: 1.exr" in caplog.text
 
 
+def test_pictures_without_a_mask_file_are_named(tmp_path, caplog):
+    photos, masks = tmp_path / "images", tmp_path / "masks"
+    photos.mkdir()
+    masks.mkdir()
+    for k in range(3):
+        texture(k).save(photos / f"{k}.png")
+        if k != 2:
+            Image.fromarray((MASK * 255).astype(np.uint8)).save(masks / f"{k}.png")
+    prepared(tmp_path, tmp_path)
+    assert "1 of 3 pictures have neither a mask nor an alpha that is one: 2.png" in caplog.text
+
+
 def test_an_alpha_of_nothing_is_named_and_left_out(tmp_path, caplog):
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -169,14 +181,18 @@ def test_cameras_held_in_all_ways_do_not_say_what_is_up():
     assert found.guessed["up"].startswith("nothing")
 
 
-def written_capture(tmp_path, alignment: Alignment):
-    """A capture folder of six pictures whose world is `alignment`."""
+def written_capture(tmp_path, alignment: Alignment, bright: int = 0):
+    """A capture folder of six pictures whose world is `alignment`; some are EXR, brighter than white."""
     found = registration(ring(6), np.zeros((0, 3)))
     found.errors, found.observations = dict.fromkeys(found.matrices, 0.1), dict.fromkeys(found.matrices, 9)
     pictures = {}
     for k, file in enumerate(found.matrices):
-        texture(k, 800, 600).save(tmp_path / f"{file}.png")
-        pictures[file] = Picture(tmp_path / f"{file}.png", file[:-4], size=(800, 600))
+        path = tmp_path / f"{file}.{'exr' if k < bright else 'png'}"
+        if k < bright:
+            write_exr_picture(path, np.asarray(texture(k, 800, 600), np.float32) / 128)
+        else:
+            texture(k, 800, 600).save(path)
+        pictures[file] = Picture(path, file[:-4], size=(800, 600))
     folder = tmp_path / "out"
     folder.mkdir()
     more = {"ground": alignment.ground_from}
@@ -197,6 +213,12 @@ def test_what_is_guessed_is_told_then_and_again_by_reconstruct(tmp_path, caplog)
     caplog.clear()
     read_capture(folder, 64, up="z")
     assert "up (" not in caplog.text and "ground (lowest points)" in caplog.text
+
+
+def test_what_is_clipped_is_told(tmp_path, caplog):
+    written_capture(tmp_path, align_to_ground(registration(ring(6), scene(True))), bright=2)
+    (told,) = [text for text in caplog.messages if "clipped" in text]
+    assert "2 pictures have pixels brighter than white" in told and "00.jpg.exr, 01.jpg.exr" in told
 
 
 def test_what_is_known_is_not_doubted(tmp_path, caplog):
