@@ -465,3 +465,15 @@ def test_no_linear_value_is_negative(tmp_path):
     write_exr_picture(photos / "a.exr", pixels)
     linear, weight = bracket_merge._linear_and_weight(decode(Picture(photos / "a.exr", "a")))
     assert (linear == 0).all() and (weight > 0).all()
+
+
+def test_a_curve_of_the_camera_is_named_and_no_other_view(tmp_path, caplog):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for view in range(2):
+        for k, stop in enumerate(STOPS):
+            z = linear_to_srgb(np.clip(larger(radiance(view)) * 2.0**stop, 0, 1))
+            image = Image.fromarray(np.asarray((3 * z**2 - 2 * z**3) * 255 + 0.5, np.uint8))
+            image.save(photos / f"{view}{k}.jpg", exif=tags(2.0**stop / 60, second=20 * view + k), quality=92)
+    assert all(len(picture.merged) == 3 for picture in merged(photos, tmp_path).pictures)
+    assert "2 brackets differ otherwise in brightness than EXIF says" in caplog.text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 
 import numpy as np
@@ -10,6 +11,7 @@ from PIL import ExifTags, Image
 from test_capture_pictures import exif, texture
 from test_capture_registration import moved, registration, ring, scene
 
+from drgs_blender.capture import pipeline
 from drgs_blender.capture.exif import read_exif
 from drgs_blender.capture.gravity import measured_up, up_of_maker_note
 from drgs_blender.capture.world_alignment import LOWEST, MEASURED, PLANE, align_to_ground
@@ -124,3 +126,26 @@ def test_gravity_of_few_pictures_is_not_used(caplog):
     found, ups, _ = tilted()
     assert measured_up(found, dict(list(ups.items())[:9]), "set") is None and not caplog.messages
     assert measured_up(found, dict(list(ups.items())[:10]), "set") is not None
+
+
+def test_a_capture_stands_upright_by_its_phone(tmp_path, monkeypatch, caplog):
+    """The whole command but for structure from motion, whose cameras are true ones in a turned world."""
+    photos, out = tmp_path / "photos", tmp_path / "out"
+    photos.mkdir()
+    cameras = dict(list(ring(24).items())[:8])  # from one side, and leaning
+    lean = np.array([[np.cos(0.3), -np.sin(0.3), 0], [np.sin(0.3), np.cos(0.3), 0], [0, 0, 1]])
+    for k, (name, matrix) in enumerate(cameras.items()):
+        matrix[:3, :3] = matrix[:3, :3] @ lean
+        found = exif(Orientation=1, Make="Apple")
+        found.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.MakerNote] = maker_note(acceleration(matrix, 1))
+        texture(k, 160, 120).save(photos / name, exif=found)
+
+    monkeypatch.setattr(pipeline, "register", lambda *_: moved(registration(cameras, np.zeros((0, 3))), 1.0, 7))
+    monkeypatch.setattr(pipeline.features, "extract", lambda *_: None)
+    monkeypatch.setattr(pipeline.features, "match", lambda *_: None)
+    made = pipeline.make_capture(photos, out, pipeline.Settings(poses="features"), lambda *_: None, lambda: False)
+    assert f"up: {MEASURED}; ground: what the cameras look at (guessed)" in made.lines
+    assert "the height of the ground is (what the cameras look at) guessed" in caplog.text
+    for frame in json.loads((out / "transforms.json").read_text())["frames"]:
+        level = np.array(frame["transform_matrix"])[2, :3]
+        np.testing.assert_allclose(level, cameras[frame["file_path"][7:]][2, :3], atol=1e-3)
