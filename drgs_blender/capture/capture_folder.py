@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 from functools import partial
 from pathlib import Path
@@ -12,11 +13,13 @@ import numpy as np
 from PIL import Image as Pillow
 
 from ..core.asset.archive import replace_by, replace_file
-from ..core.errors import UsageError, WriteError
+from ..core.errors import UsageError, WriteError, first_of
 from ..reconstruct.readers.layout import decode_mask
-from .pictures import Picture, write_picture
+from .pictures import CLIPPED, Picture, write_picture
 from .registration import Registration
 from .report import draw_cameras, write_report
+
+logger = logging.getLogger(__name__)
 
 #: Files of a finished capture; the last is written last.
 REPORT, DRAWING, POINTS, CAMERAS = "capture.json", "capture.png", "sparse_points.ply", "transforms.json"
@@ -66,8 +69,9 @@ def known_ground(folder: Path) -> str | None:
 
 
 def write_capture(
-    folder: Path, pictures: dict[str, Picture], found: Registration, said: list[str], more: dict[str, Any]
-) -> None:
+    folder: Path, pictures: dict[str, Picture], found: Registration, said: list[str], more: dict[str, Any],
+    guessed: dict[str, str],
+) -> None:  # fmt: skip
     """Write the pictures with their cameras, and the report; `transforms.json` comes last.
 
     Parameters
@@ -81,6 +85,8 @@ def write_capture(
         Lines of the report's drawing.
     more : dict
         Further entries of `capture.json`.
+    guessed : dict of str to str
+        `Alignment.guessed`, which readers of the capture say again.
 
     Raises
     ------
@@ -117,15 +123,23 @@ def write_capture(
             notes[picture.path.name] = "; ".join(picture.notes)
         if picture.exif.exposure is not None:
             frame["exposure_value"] = picture.exif.exposure
+    clipped = [name for name, note in notes.items() if CLIPPED in note]
+    if clipped:
+        logger.warning(
+            "%s: %d pictures have pixels brighter than white, which are clipped: %s. Scale them down if that is the "
+            "object; %s has how many", folder, len(clipped), first_of(clipped), REPORT,
+        )  # fmt: skip
     (folder / POINTS).unlink(missing_ok=True)
     if len(found.points):
         _write_points(folder / POINTS, found)
     draw_cameras(folder / DRAWING, found, said)
-    write_report(folder / REPORT, found, {"notes": notes, **more})
+    write_report(folder / REPORT, found, {"notes": notes, "guessed": guessed, **more})
     # nerfstudio's keys: the world stays as it is (Z up); the points that surfels begin at.
     text: dict[str, Any] = {"camera_model": "OPENCV", "orientation_override": "none", "frames": frames}
     if len(found.points):
         text["ply_file_path"] = POINTS
+    if guessed:
+        text["guessed"] = guessed
     replace_file(folder / CAMERAS, [json.dumps(text, indent=1).encode()])
 
 

@@ -19,11 +19,9 @@ from ..core.arrays import Array
 from ..core.asset.archive import replace_by
 from ..core.color import linear_to_srgb, to_unit
 from ..core.errors import AssetError, first_of
-from ..formats.exr import read_exr
-from ..formats.images import load_image
-from ..reconstruct.readers.layout import PICTURES, decode_mask, find_mask
+from ..reconstruct.readers.layout import PICTURES, decode_mask, find_mask, load_picture
 from . import libraries
-from .exif import Metadata, read_exif
+from .exif import Metadata, read_exif, read_exr_metadata
 
 logger = logging.getLogger(__name__)
 
@@ -31,12 +29,15 @@ logger = logging.getLogger(__name__)
 PHOTOGRAPHS = frozenset(end.lower() for end in PICTURES)
 RAW = frozenset((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"))
 LINEAR = frozenset((".exr",))
+_TIFF = frozenset((".tif", ".tiff"))
 VIDEOS = frozenset((".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts"))
 #: Of other programs' photographs: named, not read.
 UNREAD = frozenset((".heic", ".heif", ".avif", ".hdr", ".jxl"))
 #: Where the photographs of a folder are, the first that has some.
 _FOLDERS = ("images", "photos", "input", ".")
 _QUALITY = 97
+#: What the report says of pixels that are written as white.
+CLIPPED = "brighter than white and clipped"
 #: EXIF orientation -> (quarter turns counter-clockwise, mirrored left to right afterwards); EXIF 2.3 figure 19.
 _TURNS = {1: (0, 0), 2: (0, 1), 3: (2, 0), 4: (2, 1), 5: (3, 1), 6: (3, 0), 7: (1, 1), 8: (1, 0)}
 
@@ -58,6 +59,10 @@ class Picture:
         Width and height, pixels, upright.
     notes : list of str
         What is unusual about it, for the report.
+    alpha : bool
+        Whether its alpha says what is the object; else it is left out.
+    merged : tuple of str
+        Names of the files of the exposure bracket that it was merged from; it is EXR then, and stays EXR.
     """
 
     path: Path
@@ -66,6 +71,8 @@ class Picture:
     exif: Metadata = field(default_factory=Metadata)
     size: tuple[int, int] = (0, 0)
     notes: list[str] = field(default_factory=list)
+    alpha: bool = True
+    merged: tuple[str, ...] = ()
 
     @property
     def lens(self) -> tuple[int, int, str]:
@@ -155,14 +162,24 @@ def find_pictures(source: Path) -> list[Picture]:
                 str(source), f"has {len(broken)} of {len(paths)} pictures that cannot be read: {first_of(broken)}"
             )
         logger.warning("%s: %d pictures cannot be read and are left out: %s", source, len(broken), first_of(broken))
-    _check_masks(pictures, source)
+    if noted := [picture for picture in pictures if picture.notes]:
+        logger.warning(
+            "%s: %d pictures are not used as they are stored, the first is %s: %s",
+            source, len(noted), noted[0].path.name, "; ".join(noted[0].notes),
+        )  # fmt: skip
+    _check_masks(pictures)
     return pictures
 
 
 def _described(picture: Picture) -> Picture:
     """The picture with its metadata and size, from the header alone where that has them."""
     suffix = picture.path.suffix.lower()
-    if suffix in LINEAR or suffix in RAW:
+    if suffix in LINEAR:
+        pixels, picture.notes = load_picture(picture.path)
+        picture.exif = read_exr_metadata(picture.path)
+        picture.size = pixels.shape[1], pixels.shape[0]
+        return picture
+    if suffix in RAW:
         height, width = decode(picture).shape[:2]
         picture.size = width, height
         return picture
@@ -174,12 +191,16 @@ def _described(picture: Picture) -> Picture:
         height, width = decode(picture).shape[:2]
     except (OSError, ValueError, SyntaxError) as error:
         raise AssetError(str(picture.path), f"is no image that can be read ({error})") from error
+    if suffix in _TIFF and picture.exif.orientation != 1:
+        height, width = _stored(picture).shape[:2]  # versions of Pillow say one or the other
+        picture.size = width, height
+        return picture
     picture.size = (height, width) if picture.exif.orientation >= 5 else (width, height)
     return picture
 
 
-def _check_masks(pictures: list[Picture], source: Path) -> None:
-    """Raise AssetError where a mask has another shape than its photograph; name those without one."""
+def _check_masks(pictures: list[Picture]) -> None:
+    """Raise AssetError where a mask has another shape than its photograph."""
     masked = [picture for picture in pictures if picture.mask]
     for picture in masked:
         assert picture.mask is not None
@@ -190,30 +211,54 @@ def _check_masks(pictures: list[Picture], source: Path) -> None:
             problem = f"is {width} x {height} pixels, {picture.path.name} {w} x {h}"
             remedy = "Draw the mask over the turned picture" if turned else "Draw it over the whole photograph"
             raise AssetError(str(picture.mask), problem, remedy)
-    if masked and len(masked) < len(pictures):
-        without = [picture.path.name for picture in pictures if not picture.mask]
-        logger.warning("%s: %d of %d pictures have no mask: %s", source, len(without), len(pictures), first_of(without))
 
 
 def decode(picture: Picture) -> Array:
     """(h, w, 3 or 4) uint8, uint16 (sRGB-encoded) or float32 (linear Rec.709), upright, row 0 at the top.
+
+    Alpha is straight, and there only where it counts and is not opaque all over.
 
     Raises
     ------
     AssetError
         The file cannot be read.
     """
-    suffix = picture.path.suffix.lower()
-    if suffix in LINEAR:
-        pixels = read_exr(picture.path)[0]
-    elif suffix in RAW:
+    if picture.path.suffix.lower() in RAW:
         with libraries.load("rawpy").imread(str(picture.path)) as raw:
             return np.asarray(raw.postprocess(use_camera_wb=True, no_auto_bright=True))
-    else:
-        pixels = load_image(picture.path)
-    if pixels.dtype.kind == "f":
-        return pixels  # already turned where it is TIFF
+    pixels = _stored(picture)
+    if pixels.shape[2] == 4 and not (picture.alpha and _least_alpha(pixels) < 1):
+        pixels = np.ascontiguousarray(pixels[..., :3])
+    return pixels
+
+
+def _stored(picture: Picture) -> Array:
+    """Pixels of the file with all its channels, upright."""
+    pixels, _ = load_picture(picture.path)
+    if picture.path.suffix.lower() in (*LINEAR, *_TIFF):
+        return pixels  # Pillow and tifffile turn TIFF when they read it
     return upright(pixels, picture.exif.orientation)
+
+
+def _least_alpha(pixels: Array) -> float:
+    return float(pixels[..., 3].min()) / (np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0)
+
+
+def mask_of_alpha(pixels: Array, subject: str) -> Array | None:
+    """(h, w) float32 in 0..1: the alpha of `decode`; None without.
+
+    Raises
+    ------
+    AssetError
+        It is 0 everywhere.
+    """
+    if pixels.shape[2] < 4:
+        return None
+    alpha = np.clip(to_unit(pixels[..., 3]), 0, 1)
+    if not alpha.max() > 0:
+        remedy = "Take the alpha channel out, draw its mask, or give --masks none"
+        raise AssetError(subject, "has an alpha that is 0 everywhere: nothing of it is seen", remedy)
+    return alpha
 
 
 def upright(pixels: Array, orientation: int) -> Array:
@@ -248,11 +293,12 @@ def reduced(pixels: Array, longest: int) -> Array:
 def write_picture(picture: Picture, folder: Path) -> Path:
     """Write a photograph into `folder`, upright; the file's path.
 
-    A file that is upright already is copied as it is. Others stay JPEG, or become PNG, of more than 8 bits TIFF.
+    A file that is upright already is copied as it is, and so is one merged from brackets. Others stay JPEG, or become
+    PNG, of more than 8 bits TIFF. An alpha that does not count is left out.
     """
     suffix = picture.path.suffix.lower()
-    plain = suffix in PHOTOGRAPHS and picture.exif.orientation == 1
-    if plain:
+    plain = (suffix in PHOTOGRAPHS and picture.exif.orientation == 1) or bool(picture.merged)
+    if plain and (picture.alpha or suffix in (".jpg", ".jpeg") or _stored(picture).shape[2] == 3):
         target = folder / f"{picture.name}{suffix}"
         replace_by(target, lambda path: shutil.copyfile(picture.path, path))
         return target
@@ -270,11 +316,14 @@ def write_picture(picture: Picture, folder: Path) -> Path:
     if pixels.dtype.kind == "f":
         above = float((pixels[..., :3].max(axis=2) > 1).mean())
         if above > 1e-3:
-            picture.notes.append(f"{above:.1%} of its pixels are brighter than white and clipped")
+            picture.notes.append(f"{above:.1%} of its pixels are {CLIPPED}")
         colour = linear_to_srgb(np.clip(pixels[..., :3], 0, 1))
         pixels = np.asarray(np.dstack([colour, np.clip(pixels[..., 3:], 0, 1)]) * 65535 + 0.5, np.uint16)
     target = folder / f"{picture.name}.tif"
-    replace_by(target, lambda path: tifffile.imwrite(path, pixels, photometric="rgb", compression="zlib"))
+    extra = ["unassalpha"] if pixels.shape[2] == 4 else None
+    replace_by(
+        target, lambda path: tifffile.imwrite(path, pixels, photometric="rgb", compression="zlib", extrasamples=extra)
+    )
     return target
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import AssetError, UsageError, first_of
-from . import capture_folder, features, libraries, marker_poses, pictures, video
+from . import bracket_merge, brackets, capture_folder, features, gravity, libraries, marker_poses, pictures, video
 from .features import Photo, Tell
 from .inspection import inspect
 from .marker_sheet import MarkerSheet, recognise
@@ -46,6 +46,8 @@ class Settings:
     masks : str
         One of `masks.stage.MODES`: given: those that are there are used; auto: where there are none they are made;
         none: neither.
+    brackets : str
+        Exposure brackets that are merged: "auto", by EXIF; a number, of so many files each; "none".
     """
 
     frames: int = video.DEFAULT_FRAMES
@@ -54,6 +56,7 @@ class Settings:
     marker_length: float | None = None
     distance: float | None = None
     masks: str = "given"
+    brackets: str = brackets.AUTO
 
 
 @dataclass(slots=True)
@@ -107,7 +110,10 @@ def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, can
     given = pictures.find_pictures(source) if film is None else [Picture(film, film.stem)]
     if settings.masks == "none":
         for picture in given:
-            picture.mask = None
+            picture.mask, picture.alpha = None, False
+    if film is not None and settings.brackets not in (brackets.AUTO, brackets.NONE):
+        raise UsageError("brackets", f"is {settings.brackets}, and {film.name} a video", "Leave it out for videos")
+    bracketed = brackets.find_brackets(given, settings.brackets, source) if film is None else None
     digest = pictures.digest(given, settings)
     if capture_folder.complete(folder, digest):
         shutil.rmtree(work, ignore_errors=True)
@@ -115,24 +121,34 @@ def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, can
     _keep_work(work, digest)
     if film is not None:
         given = _frames(film, work, settings.frames, _part(tell, 0.0, 0.1), cancelled)
+    unread, bracket_lines = {}, []
+    if bracketed is not None:
+        merged = bracket_merge.merge_brackets(
+            given, bracketed, work / "brackets", str(source), _part(tell, 0.0, 0.1), cancelled
+        )
+        given, unread, bracket_lines = merged.pictures, merged.left_out, merged.lines
     seek = settings.poses != "features"
     ready = prepare(given, work, settings.size, seek, _part(tell, 0.1, 0.2), cancelled)
     fit, left_out = inspect(ready.pictures, ready.looks, str(source))
-    left_out |= ready.broken
+    left_out |= ready.broken | unread
     photos = [photo for photo, picture in zip(ready.photos, ready.pictures) if any(picture is one for one in fit)]
     by_file = {photo.file: picture for photo, picture in zip(ready.photos, ready.pictures)}
-    found, alignment = _cameras(ready, photos, film is not None, source, settings, _part(tell, 0.2, 0.85), cancelled)
+    ups = {photo.file: up for photo in photos if (up := by_file[photo.file].exif.up) is not None}
+    found, alignment = _cameras(
+        ready, photos, ups, film is not None, source, settings, _part(tell, 0.2, 0.85), cancelled
+    )
     alignment.apply(found)
     for photo in photos:
         if photo.file not in found.matrices:
             left_out[by_file[photo.file].path.name] = "not registered"
     made = Made(folder, len(found.matrices), len(given), left_out, found.method, 0.0, alignment)
     made.error = sum(found.errors.values()) / len(found.errors)
+    mode = mask_stage.mode_on_ground(settings.masks, ready.masks, alignment.ground_from, str(source))
     masked = mask_stage.make_or_check(
-        settings.masks, found, by_file, ready.folder, work / "object_masks", folder / mask_stage.CONTACT_SHEET,
+        mode, found, by_file, ready.folder, work / "object_masks", folder / mask_stage.CONTACT_SHEET,
         ready.masks, str(source), _part(tell, 0.85, 0.96), cancelled,
     )  # fmt: skip
-    made.lines = _lines(made) + masked.lines
+    made.lines = _lines(made) + bracket_lines + masked.lines
     _tell_left_out(found, photos, by_file, source)
     tell("writing the capture", 0.96)
     more = {
@@ -144,12 +160,14 @@ def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, can
         "ground": alignment.ground_from,
         "error": round(made.error, 4),
     }
+    if bracketed is not None:
+        more["brackets"] = {picture.name: picture.merged for picture in given if picture.merged}
     if masked.fits:
         more["masks"] = {
             fit.name: {"outside": round(fit.outside, 4), "missing": round(fit.missing, 4)} for fit in masked.fits
         }
     said = [f"{source.name}: {made.lines[0]}", *made.lines[1:]]
-    capture_folder.write_capture(folder, by_file, found, said, more)
+    capture_folder.write_capture(folder, by_file, found, said, more, alignment.guessed)
     shutil.rmtree(work, ignore_errors=True)
     return made
 
@@ -178,7 +196,8 @@ def _frames(film: Path, work: Path, count: int, tell: Tell, cancelled: Callable[
     return pictures.find_pictures(folder)
 
 
-def _cameras(ready: Prepared, photos: list[Photo], ordered: bool, source: Path, settings: Settings, tell: Tell,
+def _cameras(ready: Prepared, photos: list[Photo], ups: dict[str, gravity.Vector], ordered: bool, source: Path,
+             settings: Settings, tell: Tell,
              cancelled: Callable[[], bool]) -> tuple[Registration, Alignment]:  # fmt: skip
     """Cameras, from a marker sheet or from features, and the world they belong in."""
     sheet = None
@@ -227,13 +246,26 @@ def _cameras(ready: Prepared, photos: list[Photo], ordered: bool, source: Path, 
                 "%s: the marker sheet does not fit the other cameras; it may have moved. It is not used", source
             )
     if alignment is None:
-        alignment = align_to_ground(found, settings.distance)
-        if settings.distance is None:
-            logger.warning(
-                "%s: nothing says how large the object is: the cameras are taken to be 1 m from it. A marker sheet "
-                "(drgs markers) or --camera-distance gives the scale", source,
-            )  # fmt: skip
+        alignment = align_to_ground(found, settings.distance, gravity.measured_up(found, ups, str(source)))
+        _tell_guesses(alignment, source)
     return found, alignment
+
+
+def _tell_guesses(alignment: Alignment, source: Path) -> None:
+    """Warn of what is assumed of the world, and say what would tell it."""
+    guessed = alignment.guessed
+    if "scale" in guessed:
+        logger.warning(
+            "%s: nothing says how large the object is: the cameras are taken to be 1 m from it. A marker sheet "
+            "(drgs markers) or --camera-distance gives the scale", source,
+        )  # fmt: skip
+    if "ground" in guessed:
+        logger.warning(
+            "%s: no level plane is found under the object: %s (%s) guessed. Lay a marker sheet (drgs markers) or "
+            "something with texture under it, or turn and move the object where it is used",
+            source, "up and the height of the ground are" if "up" in guessed else "the height of the ground is",
+            "; ".join(why for name, why in guessed.items() if name != "scale"),
+        )  # fmt: skip
 
 
 def _of_sheet(sheet: MarkerSheet) -> Alignment:
@@ -261,10 +293,11 @@ def _tell_left_out(found: Registration, photos: list[Photo], by_file: dict[str, 
 def _lines(made: Made) -> list[str]:
     """What is said of a capture."""
     alignment: Any = made.alignment
+    doubt = {name: " (guessed)" for name in alignment.guessed}
     return [
         f"{made.pictures} of {made.of} pictures have cameras ({made.method}; reprojection error {made.error:.2f} px)",
         f"scale: {alignment.scale_from}",
-        f"up: {alignment.up_from}; ground: {alignment.ground_from}",
+        f"up: {alignment.up_from}{doubt.get('up', '')}; ground: {alignment.ground_from}{doubt.get('ground', '')}",
     ]
 
 
@@ -272,5 +305,6 @@ def check_settings(settings: Settings) -> None:
     """Raise UsageError for unknown settings."""
     if settings.poses not in POSES:
         raise UsageError("poses", f"is {settings.poses!r}", f"Choose from {', '.join(POSES)}")
+    brackets.check_setting(settings.brackets)
     if settings.masks not in mask_stage.MODES:
         raise UsageError("masks", f"is {settings.masks!r}", f"Choose from {', '.join(mask_stage.MODES)}")

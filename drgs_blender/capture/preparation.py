@@ -12,12 +12,12 @@ from PIL import Image as Pillow
 
 from ..core.arrays import Array
 from ..core.asset.archive import replace_by
-from ..core.errors import AssetError, Cancelled, DeviceError
+from ..core.errors import AssetError, Cancelled, DeviceError, first_of
 from ..reconstruct.readers.layout import decode_mask
 from .features import Photo, Tell
 from .inspection import SHARPNESS_SIZE, Look, look
 from .marker_sheet import detect
-from .pictures import Picture, decode, reduced, shown
+from .pictures import Picture, decode, mask_of_alpha, reduced, shown
 
 logger = logging.getLogger(__name__)
 
@@ -74,6 +74,7 @@ def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bo
     folder.mkdir(parents=True, exist_ok=True)
     masks.mkdir(parents=True, exist_ok=True)
     result = Prepared(folder)
+    unmasked = []
     for index, picture in enumerate(pictures):
         if cancelled():
             raise Cancelled
@@ -91,13 +92,29 @@ def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bo
         result.looks.append(_look(small, mask))
         if mask is not None:
             result.masks = masks
+        else:
+            unmasked.append(picture)
         if seek_markers:
             try:
                 result.markers[file] = detect(np.asarray(Pillow.fromarray(small).convert("L")))
             except DeviceError as error:
                 logger.info("markers are not looked for: %s", error)
                 seek_markers = False
+    _tell_unmasked(result, unmasked)
     return result
+
+
+def _tell_unmasked(result: Prepared, unmasked: list[Picture]) -> None:
+    """Name pictures without a mask where others have one."""
+    of_alpha = len(result.pictures) - len(unmasked) - sum(picture.mask is not None for picture in result.pictures)
+    if unmasked and result.masks is not None:
+        logger.warning(
+            "%s: %d of %d pictures have neither a mask nor an alpha that is one: %s. drgs reconstruct leaves them out "
+            "where they are fewer, else it uses no masks. Draw all or none",
+            unmasked[0].path.parent, len(unmasked), len(result.pictures), first_of([p.path.name for p in unmasked]),
+        )  # fmt: skip
+    if of_alpha:
+        logger.info("the alpha of %d pictures is their mask", of_alpha)
 
 
 def _small(picture: Picture, copy: Path, mask_copy: Path, size: int) -> tuple[Array, Array | None]:
@@ -105,11 +122,7 @@ def _small(picture: Picture, copy: Path, mask_copy: Path, size: int) -> tuple[Ar
     if not copy.is_file():
         pixels = decode(picture)
         colour = reduced(shown(pixels), size)
-        mask = None
-        if picture.mask is not None:
-            mask = decode_mask(picture.mask)
-        elif pixels.shape[2] == 4 and pixels[..., 3].min() < pixels[..., 3].max():
-            mask = pixels[..., 3] / (np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0)
+        mask = mask_of_alpha(pixels, str(picture.path)) if picture.mask is None else decode_mask(picture.mask)
         if mask is not None:
             drawn = Pillow.fromarray(np.asarray(mask > 0.5).astype(np.uint8) * 255)
             drawn = drawn.resize((colour.shape[1], colour.shape[0]), Pillow.Resampling.NEAREST)

@@ -7,19 +7,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.arrays import Array
-from ..reconstruct.readers.world_frame import turn_upright
+from ..reconstruct.readers.world_frame import direction_up
 from .registration import Registration
 
 #: Distance of the cameras from the object where nothing says how large it is, metres.
 UNKNOWN_DISTANCE = 1.0
+#: How the scale is called where nothing says it.
+_UNKNOWN = "unknown: "
 #: Least cosine between the ground's normal and up as the cameras were held: 40 degrees.
 _LEVEL = 0.766
 #: Trials of the plane's RANSAC; thickness of the ground, in parts of the cameras' distance.
 _TRIALS, _THICKNESS = 2000, 0.012
 #: Part of the points within a camera's distance that the ground must have; part that may lie below it.
 _GROUND, _BELOW = 0.12, 0.06
-#: What the ground rests on: points on it; nothing but the cameras.
-PLANE, GUESSED = "plane under the object", "what the cameras look at"
+#: What the ground rests on: points on it; the lower end of all points; nothing but the cameras.
+PLANE, LOWEST, GUESSED = "plane under the object", "lowest points", "what the cameras look at"
+#: What up rests on without a plane: phones' accelerometers; how people hold cameras; nothing.
+MEASURED = "gravity, as the phone measured it"
+HELD, UNKNOWN_UP = "how the cameras were held", "nothing: the cameras were held in all ways"
 
 
 @dataclass(slots=True)
@@ -42,6 +47,18 @@ class Alignment:
     scale_from: str
     up_from: str
     ground_from: str
+
+    @property
+    def guessed(self) -> dict[str, str]:
+        """What is assumed of the world, not found in the pictures ("scale", "up", "ground"), and what it rests on."""
+        found = {}
+        if self.scale_from.startswith(_UNKNOWN):
+            found["scale"] = self.scale_from
+        if self.up_from in (HELD, UNKNOWN_UP):
+            found["up"] = self.up_from
+        if self.ground_from in (LOWEST, GUESSED):
+            found["ground"] = self.ground_from
+        return found
 
     def points(self, points: Array) -> Array:
         """(n, 3) points in the new world."""
@@ -100,7 +117,7 @@ def align_to_markers(found: Registration, markers: Registration, sheet: str) -> 
     return Alignment(scale, rotation, shift, said, said, said)
 
 
-def align_to_ground(found: Registration, distance: float | None = None) -> Alignment:
+def align_to_ground(found: Registration, distance: float | None = None, up: Array | None = None) -> Alignment:
     """Up and ground of cameras and points: the plane under the object, else the points' lower end.
 
     Parameters
@@ -108,27 +125,35 @@ def align_to_ground(found: Registration, distance: float | None = None) -> Align
     found : Registration
     distance : float, optional
         True median distance of the cameras from the object, metres; None: not known.
+    up : (3,) array, optional
+        Up as it was measured, in the cameras' world; None: as they were held.
     """
     matrices = np.stack(list(found.matrices.values()))
     centres = matrices[:, :3, 3]
     centre = look_at(matrices)
     away = float(np.median(np.linalg.norm(centres - centre, axis=1)))
-    up = turn_upright(matrices)[2]
+    up_from = MEASURED
+    if up is None:
+        held = direction_up(matrices)
+        up_from = UNKNOWN_UP if held is None else HELD
+        up = np.array([0.0, 0.0, 1.0]) if held is None else held
     near = found.points[np.linalg.norm(found.points - centre, axis=1) < away] if len(found.points) else found.points
     plane = ground_plane(near, centres, up, away)
     if plane is not None:
         normal, offset = plane
         up_from = ground_from = PLANE
     else:
-        normal, up_from = up, "how the cameras were held"
+        normal = up
         heights = near @ normal
         offset = float(np.quantile(heights, 0.01)) if len(near) >= 20 else float(centre @ normal)
-        ground_from = "lowest points" if len(near) >= 20 else GUESSED
+        ground_from = LOWEST if len(near) >= 20 else GUESSED
     scale = (distance or UNKNOWN_DISTANCE) / max(away, 1e-12)
     rotation = _turn_to_z(normal)
     foot = centre - (centre @ normal - offset) * normal
     said = (
-        f"camera distance {distance:g} m, as given" if distance else f"unknown: cameras are {UNKNOWN_DISTANCE:g} m away"
+        f"camera distance {distance:g} m, as given"
+        if distance
+        else f"{_UNKNOWN}cameras are {UNKNOWN_DISTANCE:g} m away"
     )
     return Alignment(scale, rotation, -scale * rotation @ foot, said, up_from, ground_from)
 

@@ -18,6 +18,7 @@ EXAMPLES = """examples:
   drgs capture photographs --out statue
   drgs capture walk.mp4 --out statue --video-frames 120
   drgs capture photographs --out statue --poses markers --marker-length 29.4
+  drgs capture turntable --out cup --brackets 3
 """
 
 
@@ -59,12 +60,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="pixels of the longer side at which features and markers are sought; default 1600",
     )
     parser.add_argument(
+        "--brackets",
+        type=_brackets,
+        default="auto",
+        metavar="N",
+        help="merge exposure brackets to linear EXR pictures: auto: those that EXIF shows (default); a number: so many "
+        "files that follow each other are one; none",
+    )
+    parser.add_argument(
         "--masks",
         choices=("given", "auto", "none"),
         default="given",
         help="given: use and check masks that are there (default); auto: make them where there are none, of an object "
         "on a ground that shows texture, in about two minutes; none: neither make nor use any",
     )
+
+
+def _brackets(text: str) -> str:
+    """Parser of the setting of brackets."""
+    return text if text in ("auto", "none") else str(int_range(2, 9)(text))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -78,6 +92,7 @@ def run(args: argparse.Namespace) -> int:
         args.marker_length,
         args.camera_distance,
         args.masks,
+        args.brackets,
     )
     with interruptible() as cancelled, FractionBar(args, "capturing", every=WORK_SECONDS) as bar:
         made = make_capture(args.input, args.out, settings, bar, cancelled)

@@ -80,3 +80,26 @@ def test_a_world_that_is_to_stay_stays_and_brings_its_points(tmp_path, caplog):
     wanted = np.stack([tilt @ matrix for matrix in scene.cameras])
     for matrix in wanted:
         assert np.abs(found - matrix).max(axis=(1, 2)).min() < 2e-5
+
+
+def test_the_number_of_a_bracket_is_checked_and_handed_on(photographs, tmp_path, capsys, monkeypatch):
+    words = ["capture", str(photographs), "--out", str(tmp_path / "out"), "--no-progress"]
+    for wrong in ("1", "10", "some"):
+        assert main([*words, "--brackets", wrong]) == EXIT_USAGE
+    capsys.readouterr()
+    assert main([*words, "--brackets", "3"]) == EXIT_BAD_ASSET  # no EXIF
+    assert "has no 3 files that follow each other with different exposures" in capsys.readouterr().err
+    video = tmp_path / "walk.mp4"
+    video.write_bytes(b"")
+    assert main(["capture", str(video), "--out", str(tmp_path / "film"), "--brackets", "3"]) == EXIT_USAGE
+    assert "is 3, and walk.mp4 a video" in capsys.readouterr().err
+    asked = []
+
+    def refuse(source, folder, settings, *_):
+        asked.append(settings.brackets)
+        raise AssetError(str(source), "cannot be calibrated")
+
+    monkeypatch.setattr(pipeline, "make_capture", refuse)
+    for given in ([], ["--brackets", "none"], ["--brackets", "5"]):
+        assert main([*words, *given]) == EXIT_BAD_ASSET
+    assert asked == ["auto", "none", "5"]

@@ -415,6 +415,12 @@ def test_masks_need_to_know_the_ground(captures, caplog):
     captures.mask(captures.make(nothing, np.eye(4)), "auto")
     assert not caplog.messages
     np.testing.assert_array_equal(captures.asked[0][3].matrix, captures.views[3].matrix)
+    # a ground that is only the lowest points will do, but it is said; what only the cameras guess will not
+    report.write_text(json.dumps({"ground": "lowest points"}))
+    captures.mask(captures.make(nothing, np.eye(4)), "auto")
+    assert len(captures.asked) == 2 and "above the lowest points" in caplog.text
+    report.write_text(json.dumps({"ground": "what the cameras look at"}))
+    assert captures.mask(captures.make(nothing, np.eye(4)), "auto") == [None] * 6 and len(captures.asked) == 2
 
 
 def test_masks_are_not_learned_from_views_left_out(captures):

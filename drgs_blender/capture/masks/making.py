@@ -24,6 +24,7 @@ from .learned_scene import Effort, learn_scene
 from .mask_view import MaskView
 from .object_box import ObjectBox, find_box
 from .object_surfels import Cut, box_around, cut_object, share_of_object
+from .stage import REMEDY
 
 logger = logging.getLogger(__name__)
 
@@ -38,7 +39,6 @@ _FEWEST_SURFELS, _FEWEST_VIEWS = 30, 4
 _SMALL, _PINHOLE = 0.01, 1e-3
 #: Part of the masks that may be doubtful; with more none are used.
 _DOUBTED = 0.25
-REMEDY = "Draw the masks by hand (white on the object, folder masks), or give --masks none"
 
 
 @dataclass(slots=True)

@@ -17,10 +17,10 @@ from .. import libraries
 from ..capture_folder import known_ground
 from ..features import Tell
 from ..registration import Registration
-from ..world_alignment import GUESSED, PLANE, align_to_ground
-from .making import REMEDY, make_masks
+from ..world_alignment import GUESSED, LOWEST, PLANE, align_to_ground
+from .making import make_masks
 from .mask_view import MaskView
-from .stage import ONLY_SOME
+from .stage import GROUND_IS_GUESSED, NO_GROUND, ONLY_SOME, REMEDY
 
 logger = logging.getLogger(__name__)
 
@@ -64,12 +64,12 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
     points = np.zeros((0, 3)) if capture.points is None else np.asarray(capture.points, np.float64)
     matrices = {view.name: np.asarray(view.camera.matrix_world, np.float64) for view in capture.views}
     found = Registration(matrices, {}, {}, {}, points, np.zeros((len(points), 3), np.uint8), "")
-    if not _on_ground(found, capture.source):
-        logger.warning(
-            "%s: the plane on which the object stands is not known (no sparse points on it, nor a marker sheet): "
-            "no masks are made. %s", subject, REMEDY,
-        )  # fmt: skip
+    ground = _to_ground(found, capture.source)
+    if ground is None:
+        logger.warning(NO_GROUND, subject, REMEDY)
         return
+    if ground == LOWEST:
+        logger.warning(GROUND_IS_GUESSED, subject, sheet.name)
     views = [_mask_view(view, found.matrices[view.name]) for view in capture.training]
     made, _ = make_masks(cv2, views, found.points, sheet, subject, tell, cancelled)
     if made is None:
@@ -82,18 +82,19 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
             view.mask = made.seen_by(cv2, _mask_view(view, found.matrices[view.name])).astype(np.float32) / 255
 
 
-def _on_ground(found: Registration, source: Path) -> bool:
-    """Bring cameras and points onto the ground; False where it is not known.
+def _to_ground(found: Registration, source: Path) -> str | None:
+    """Bring cameras and points onto the ground; what it rests on, None where it is not known.
 
     Captures that `drgs capture` made say what their ground rests on, and are on it.
     """
     folder = source if source.is_dir() else source.parent
     above = all(matrix[2, 3] > 0 for matrix in found.matrices.values())  # not where the world has been turned
-    if above and known_ground(folder) not in (None, GUESSED):
-        return True
+    known = known_ground(folder)
+    if above and known not in (None, GUESSED):
+        return known
     aligned = align_to_ground(found)
     aligned.apply(found)
-    return aligned.ground_from == PLANE
+    return PLANE if aligned.ground_from == PLANE else None
 
 
 def _mask_view(view: View, matrix: np.ndarray) -> MaskView:

@@ -19,7 +19,7 @@ from .. import libraries
 from ..features import Tell
 from ..pictures import Picture
 from ..registration import Registration
-from ..world_alignment import look_at
+from ..world_alignment import GUESSED, LOWEST, look_at
 from .contact_sheet import draw_contact_sheet
 from .hull import Hull
 from .hull_check import Fit, check_masks
@@ -33,6 +33,15 @@ MODES = ("given", "auto", "none")
 #: Pixels of the longer side at which given masks are checked.
 _WHOLE = 560
 CONTACT_SHEET = "masks.png"
+NO_GROUND = (
+    "%s: the plane on which the object stands is not known (no sparse points on it, nor a marker sheet): no masks are "
+    "made. %s"
+)
+GROUND_IS_GUESSED = (
+    "%s: masks are made above the lowest points, as the plane on which the object stands is not found: they may hold "
+    "parts of it, or lack the object's foot. Look at %s"
+)
+REMEDY = "Draw the masks by hand (white on the object, folder masks), or give --masks none"
 ONLY_SOME = "%s: %d of %d pictures have masks: no others are made. Draw all, or remove these"
 
 
@@ -42,6 +51,30 @@ class Masked:
 
     fits: list[Fit] = field(default_factory=list)
     lines: list[str] = field(default_factory=list)
+
+
+def mode_on_ground(mode: str, given: Path | None, ground: str, subject: str) -> str:
+    """`mode`, or "none" where masks would be made on a ground that is nothing but the cameras' guess; warns of guesses.
+
+    Parameters
+    ----------
+    mode : str
+        One of `MODES`.
+    given : Path, optional
+        Folder of given masks.
+    ground : str
+        What the ground rests on, `Alignment.ground_from`.
+    subject : str
+        For messages.
+    """
+    if mode != "auto" or given is not None:
+        return mode
+    if ground == GUESSED:
+        logger.warning(NO_GROUND, subject, REMEDY)
+        return "none"
+    if ground == LOWEST:
+        logger.warning(GROUND_IS_GUESSED, subject, CONTACT_SHEET)
+    return mode
 
 
 def make_or_check(mode: str, found: Registration, by_file: dict[str, Picture], copies: Path, work: Path, sheet: Path,

@@ -107,6 +107,7 @@ def read_capture(
     for photograph, matrix in zip(photographs, matrices):
         photograph.matrix = turn @ matrix
     _check_memory(layout, resolution, path)
+    _tell_guesses(layout, path, up)
     known: dict[Lens, tuple[Lens, np.ndarray]] = {}
     views = usable([(p, load_photograph(p, layout, resolution, known)) for p in photographs], str(path))
     _tell_notes(layout, path)
@@ -128,6 +129,16 @@ def read_capture(
         check_overlap(learned, str(path))
     points = None if layout.points is None else (layout.points @ turn[:3, :3].T).astype(np.float32)
     return Capture(path, views, find_background(views), points)
+
+
+def _tell_guesses(layout: Layout, path: Path, up: str | None) -> None:
+    """Warn once of what `drgs capture` assumed of the world, but for an up that is given now."""
+    guessed = [f"{name} ({why})" for name, why in layout.guessed.items() if name != "up" or up is None]
+    if guessed:
+        logger.warning(
+            "%s: was made without knowing %s. Turn, move and scale the object where it is used, or capture it again "
+            "with a marker sheet (drgs markers)", path, ", ".join(guessed),
+        )  # fmt: skip
 
 
 def _tell_notes(layout: Layout, path: Path) -> None:

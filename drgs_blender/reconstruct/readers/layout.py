@@ -85,6 +85,8 @@ class Layout:
         Reads a mask file to (h, w) float32 in 0..1.
     notes : list of (Path, str)
         What was changed of photographs when they were read, filled as they are.
+    guessed : dict of str to str
+        What is assumed of the world, not found ("scale", "up", "ground"), and what it rests on, as the capture says.
     """
 
     photographs: list[Photograph]
@@ -92,6 +94,7 @@ class Layout:
     points: Array | None = None
     decode_mask: Callable[[Path], Array] = decode_mask
     notes: list[tuple[Path, str]] = field(default_factory=list)
+    guessed: dict[str, str] = field(default_factory=dict)
 
 
 def read_json(path: Path) -> dict[str, Any]:

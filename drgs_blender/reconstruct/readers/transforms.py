@@ -65,7 +65,7 @@ def read(path: Path) -> Layout:
     """Read a folder, or one file. Raises AssetError."""
     if path.is_file():
         photographs, synthetic = _read_file(path, False, prefix=False)
-        return Layout(photographs, synthetic, _points(path))
+        return Layout(photographs, synthetic, _points(path), guessed=_guessed(path))
     row = next(row for row in _FILES if any((path / name).is_file() for name, _ in row))
     photographs, synthetic = [], True
     present = [(path / name, test) for name, test in row if (path / name).is_file()]
@@ -73,7 +73,13 @@ def read(path: Path) -> Layout:
         found, of_blender = _read_file(file, test, prefix=len(present) > 1)
         photographs += found
         synthetic = synthetic and of_blender
-    return Layout(photographs, synthetic, _points(present[0][0]))
+    return Layout(photographs, synthetic, _points(present[0][0]), guessed=_guessed(present[0][0]))
+
+
+def _guessed(path: Path) -> dict[str, str]:
+    """What `drgs capture` assumed of the world of the file `path`."""
+    found = read_json(path).get("guessed")
+    return {str(name): str(why) for name, why in found.items()} if isinstance(found, dict) else {}
 
 
 def _points(path: Path) -> np.ndarray | None:

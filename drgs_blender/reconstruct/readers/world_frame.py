@@ -41,26 +41,35 @@ _SMALL, _LARGE = 2e-3, 5e5
 def turn_upright(matrices: Array) -> Array:
     """(3, 3) rotation of the world after which the cameras (n, 4, 4) stand upright: Z is up.
 
+    Where `direction_up` knows none, the world stays as it is.
+    """
+    z = direction_up(matrices)
+    if z is None:
+        return np.eye(3)
+    if z[2] > 1e-6:  # turn no further than needed
+        axis = np.cross(z, [0, 0, 1])
+        skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+        return np.eye(3) + skew + skew @ skew / (1 + z[2])
+    x = np.eye(3)[np.argmin(np.abs(z))]
+    x = x - z * (x @ z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def direction_up(matrices: Array) -> Array | None:
+    """(3,) up as the cameras (n, 4, 4) were held; None where they leave it open, as when they were held in all ways.
+
     People hold cameras level: up is the direction to which the cameras' horizontal axes are most nearly orthogonal.
-    Where these leave it open, as with few views, it is the mean of the cameras' own up axes; where this does as well,
-    the world stays as it is.
+    Where these leave it open, as with few views, it is the mean of the cameras' own up axes.
     """
     across, up = matrices[:, :3, 0], matrices[:, :3, 1]
     values, vectors = np.linalg.eigh(across.T @ across / len(across))
     mean = up.mean(axis=0)
     direction = vectors[:, 0] if values[0] < 0.2 * values[1] else mean
     if np.linalg.norm(mean) < 0.1 or np.linalg.norm(direction) < 0.1:
-        return np.eye(3)
+        return None
     z = direction / np.linalg.norm(direction)
-    z = z if z @ mean > 0 else -z
-    x = np.eye(3)[np.argmin(np.abs(z))]
-    x = x - z * (x @ z)
-    if z[2] > 1e-6:  # turn no further than needed
-        axis = np.cross(z, [0, 0, 1])
-        skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-        return np.eye(3) + skew + skew @ skew / (1 + z[2])
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z])
+    return z if z @ mean > 0 else -z
 
 
 def check_positions(matrices: Array, subject: str, axes: str) -> None:
