@@ -2,6 +2,8 @@
 
 python bench/bench_materials.py [--size 192] [--seeds 2] [--spp 512] [--samples 1024] [--scenes NAME ...]
 
+With --scenes the other rows of the section stay as they are.
+
 Both pictures come out of Blender, ours through the extension, from one file (`composed_job.py`, `material_scenes.py`).
 """
 
@@ -12,7 +14,7 @@ import argparse
 import numpy as np
 from bench_composed import BOUNCES, compare, options_of
 from judge import psnr, systematic_error, without_noise
-from report import table, write_section
+from report import DOCUMENT, section_pattern, table, write_section
 from scipy.ndimage import binary_erosion
 
 SCENES = {
@@ -41,6 +43,7 @@ SCENES = {
     "translucent": "Translucent BSDF, mixed with Diffuse",
     "mixes": "Mix and Add of unlike BSDFs",
 }
+TITLE = "Materials and worlds against Cycles"
 
 
 def main() -> None:
@@ -48,7 +51,9 @@ def main() -> None:
     options = options_of(__doc__ or "", SCENES, seeds=2, spp=512, samples=1024)
     rows = compare(options, row, "materials", "material_scenes")
     if options.scenes == list(SCENES):
-        write_section("materials", "Materials and worlds against Cycles", report(options, rows))
+        write_section("materials", TITLE, report(options, rows))
+    elif section := section_pattern("materials").search(DOCUMENT.read_text(encoding="utf-8")):
+        write_section("materials", TITLE, replaced(section[0], rows, options.spp))
 
 
 def row(name: str, ours: np.ndarray, theirs: np.ndarray) -> tuple[str, ...]:
@@ -65,6 +70,15 @@ def row(name: str, ours: np.ndarray, theirs: np.ndarray) -> tuple[str, ...]:
         f"{light:+.2%}",
         f"{psnr(theirs[0], theirs[1], mask):.1f}",
     )
+
+
+def replaced(section: str, rows: list[tuple[str, ...]], samples: int) -> str:
+    """The text of a section with these rows, measured again with other numbers of samples, in place of its own."""
+    lines = section.splitlines()[2:-1]  # neither its marks nor its title
+    for name, what, *cells in rows:
+        line = "| " + " | ".join([name, f"{what} ({samples} samples)", *cells]) + " |"
+        lines = [line if old.startswith(f"| {name} |") else old for old in lines]
+    return "\n".join(lines) + f"\n\nRows that name {samples} samples:"
 
 
 def report(options: argparse.Namespace, rows: list[tuple[str, ...]]) -> str:
