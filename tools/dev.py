@@ -24,6 +24,7 @@ import tomllib
 import venv
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import job_runner
@@ -57,8 +58,8 @@ APT_PACKAGES = {
     "libgomp.so.1": "libgomp1",
     "libxkbcommon.so.0": "libxkbcommon0",
 }
-#: The group of dependencies in pyproject.toml that the site takes.
-DOCS = "docs"
+#: The groups of dependencies in pyproject.toml that the site takes, and that tests of `drgs capture` do.
+DOCS, CAPTURE = "docs", "capture"
 #: The suite of the oldest Blender, which `make check` runs, and that of the LTS, which runs when asked for.
 FLOOR, LTS = "floor", "lts"
 SUITES = {
@@ -157,7 +158,7 @@ def ensure_engine() -> Path:
 
 def about_engine() -> tuple[Path, dict[str, object], list[list[str]]]:
     """Folder of the engine's environment, what is wanted in it, what pip installs."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = project_table()
     torch = shlex.split(os.environ.get("DRGS_TORCH", TORCH))
     wanted = {
         "torch": torch,
@@ -219,26 +220,50 @@ def ensure(
 
 def ensure_docs() -> Path:
     """Make ``.venv-docs`` when needed and return its interpreter."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    packages = project["optional-dependencies"][DOCS]
+    packages = project_table()["optional-dependencies"][DOCS]
     probe = "import furo, griffe, mermaidx, myst_parser, sphinx"
     return ensure(ROOT / ".venv-docs", {"packages": packages}, [packages], probe)
 
 
+def project_table() -> dict[str, Any]:
+    """The table `project` of pyproject.toml."""
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
 def ensure_node() -> None:
-    """Fetch the programs of npm that tests compare with, where npm is there; without them those tests are skipped."""
-    folder, npm, text = ROOT / ".venv-node", shutil.which("npm"), json.dumps(NODE_PACKAGES)
-    stamp = folder / "drgs-stamp.json"
-    if npm is None or (stamp.exists() and stamp.read_text(encoding="utf-8") == text):
+    """Fetch the programs of npm that tests compare with, where npm is there."""
+    folder, npm = ROOT / ".venv-node", shutil.which("npm")
+    if npm is None:
         return
     folder.mkdir(exist_ok=True)
-    print("Fetching the programs of npm that tests compare with (once) ...", flush=True)
     quiet = ["--no-audit", "--no-fund", "--no-update-notifier", "--no-progress", "--loglevel=error"]
-    command = [npm, "install", "--prefix", str(folder), "--no-save", *quiet]
-    if subprocess.run([*command, *NODE_PACKAGES], cwd=folder).returncode:
-        print("npm could not fetch what some tests compare with: they are skipped", flush=True)
+    command = [npm, "install", "--prefix", str(folder), "--no-save", *quiet, *NODE_PACKAGES]
+    fetch(folder, "drgs-stamp.json", NODE_PACKAGES, command, "the programs of npm that tests compare with")
+
+
+def ensure_capture(engine: Path) -> None:
+    """Fetch the libraries of `drgs capture` into the engine's environment.
+
+    They come after it and may be missing: no demo waits for their 135 MB, and not every system has wheels of pycolmap.
+    """
+    packages = project_table()["optional-dependencies"][CAPTURE]
+    pip = [str(engine), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--only-binary", ":all:"]
+    fetch(ROOT / ".venv", "drgs-stamp-capture.json", packages, [*pip, *packages], "the libraries of drgs capture")
+
+
+def fetch(folder: Path, stamp: str, packages: Sequence[str], command: list[str], what: str) -> None:
+    """Run the command that fetches packages which tests alone need, once; where it fails, say that these are skipped.
+
+    A stamp in the folder remembers the packages.
+    """
+    path, text = folder / stamp, json.dumps(packages)
+    if path.exists() and path.read_text(encoding="utf-8") == text:
         return
-    stamp.write_text(text, encoding="utf-8")
+    print(f"Fetching {what} (once) ...", flush=True)
+    if subprocess.run(command, cwd=folder).returncode:
+        print(f"Could not fetch {what}, see above: tests that need them are skipped", flush=True)
+        return
+    path.write_text(text, encoding="utf-8")
 
 
 def python311() -> Path:
@@ -279,6 +304,7 @@ def run_env(args: argparse.Namespace) -> int:
         print(ensure_blender(args.blender))
     else:
         both()
+        ensure_capture(python_of(ROOT / ".venv"))
         print(python_of(ROOT / ".venv"), python_of(blender_folder(BLENDER)), sep="\n")
     return 0
 
@@ -339,6 +365,7 @@ def run_suites(args: argparse.Namespace, part: str, names: list[str]) -> int:
         ensure_blender()  # they run `drgs render` through it
     if "engine" in plan.suites:
         ensure_node()
+        ensure_capture(engine)
     pythons = {name: ensure_engine for name in SUITES} | {
         "blender": ensure_blender,
         FLOOR: lambda: ensure_blender(BLENDER_FLOOR),

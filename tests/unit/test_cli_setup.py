@@ -67,6 +67,57 @@ def fake_environment(dev, folder: Path, calls: list, broken: str = "never") -> N
 
 
 @pytest.fixture
+def extras(dev):
+    """Function that says what the extra `capture` is, in a checkout of its own with an environment."""
+    fake_environment(dev, dev.ROOT / ".venv", [], "too-new")
+
+    def write(*packages: str) -> None:
+        text = f"[project]\n[project.optional-dependencies]\ncapture = {list(packages)}\n"
+        (dev.ROOT / "pyproject.toml").write_text(text)
+
+    return write
+
+
+def fetched(dev) -> list[str]:
+    """What pip of the environment was asked for, and the list emptied."""
+    log = dev.ROOT / "log"
+    lines = log.read_text().splitlines() if log.exists() else []
+    log.unlink(missing_ok=True)
+    return lines
+
+
+@pytest.mark.skipif(os.name == "nt", reason="uses a shell script as an interpreter")
+def test_libraries_of_capture_are_fetched_once_and_when_they_change(dev, extras):
+    python = dev.python_of(dev.ROOT / ".venv")
+    for packages, times in ((["one>=1", "two"], 1), (["one>=1", "two"], 0), (["one>=2", "two"], 1)):
+        extras(*packages)
+        dev.ensure_capture(python)
+        lines = fetched(dev)
+        assert len(lines) == times and all(line.endswith(" ".join(packages)) for line in lines)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="uses a shell script as an interpreter")
+def test_where_capture_has_no_wheels_it_is_said_and_tried_again(dev, extras, capfd):
+    extras("too-new>=9")
+    for _ in range(2):
+        dev.ensure_capture(dev.python_of(dev.ROOT / ".venv"))
+        assert len(fetched(dev)) == 1
+        assert "Could not fetch the libraries of drgs capture" in capfd.readouterr().out
+
+
+def test_suites_of_the_engine_and_make_env_fetch_the_libraries_of_capture_and_no_demo_waits(dev, plans, monkeypatch):
+    asked = []
+    monkeypatch.setattr(dev, "ensure_capture", asked.append)
+    monkeypatch.setattr(dev, "both", lambda: None)
+    for words, times in ((["test"], 1), (["check", "engine"], 1), (["test", "blender"], 0), (["check", "floor"], 0)):
+        plans(*words)
+        assert len(asked) == times, words
+        asked.clear()
+    assert dev.main(["env", "--engine"]) == 0 and not asked  # a step of the demo
+    assert dev.main(["env"]) == 0 and asked == [dev.python_of(dev.ROOT / ".venv")]
+
+
+@pytest.fixture
 def plans(dev, monkeypatch):
     """Function that runs a command of the script; returns the plan that it made."""
     made = []
@@ -74,6 +125,7 @@ def plans(dev, monkeypatch):
     monkeypatch.setattr(dev, "ensure_engine", lambda: Path("python"))
     monkeypatch.setattr(dev, "ensure_blender", lambda version="": Path("python"))
     monkeypatch.setattr(dev, "ensure_node", lambda: None)
+    monkeypatch.setattr(dev, "ensure_capture", lambda engine: None)
     monkeypatch.setattr(dev.suites, "run", lambda plan, *_: made.append(plan) or 0)
     shutil.copytree(ROOT / "tests", dev.ROOT / "tests", ignore=shutil.ignore_patterns("__pycache__"))
 
