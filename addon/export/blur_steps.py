@@ -58,6 +58,8 @@ def steps(
     shutter = render.motion_blur_shutter if moving else 0.0
     if not (radius or shutter):
         return []
+    if shutter:
+        _warn_of_cycles_own(scene, layer, warn)
     count = Limited(scene.drgs, f'Scene "{scene.name}"', warn).blur_steps
     start = -shutter * _BEFORE[render.motion_blur_position]
     # Times are even; places on the lens are of a low-discrepancy sequence (Roberts 2018, R2), new at each time.
@@ -66,6 +68,18 @@ def steps(
     if camera is not None and radius:
         lens = radius * np.array([on_lens(u, v, camera.data.dof) for u, v in square])
     return [Step(start + shutter * (i + 0.5) / count, (float(lens[i, 0]), float(lens[i, 1]))) for i in range(count)]
+
+
+def _warn_of_cycles_own(scene: bpy.types.Scene, layer: bpy.types.ViewLayer, warn: Warn) -> None:
+    """What Cycles blurs otherwise: every moment of the open shutter counts the same here, and everything is blurred."""
+    if any(
+        point.location.y < 0.99 for curve in scene.render.motion_blur_shutter_curve.curves for point in curve.points
+    ):
+        warn("Shutter Curve is not rendered: the shutter opens and shuts at once")
+    own = [obj.name for obj in layer.objects if not getattr(getattr(obj, "cycles", None), "use_motion_blur", True)]
+    if own:
+        names = ", ".join(f'"{name}"' for name in own[:3]) + (", ..." if len(own) > 3 else "")
+        warn(f"Motion Blur cannot be off for single objects in DR-GS; blurred like all: {names}")
 
 
 def _radius(camera: bpy.types.Camera) -> float:

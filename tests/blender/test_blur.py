@@ -152,3 +152,20 @@ def test_the_line_above_the_picture_says_what_it_is_made_of(white, captured):
     text = engine.summary(captured[0], {"surfels": 1234.0, "seconds.total": 2.0, "samples": 6e6})
     assert text == "48 samples | 1,234 surfels | 2.00 s in the engine, 3.0 million samples/s"
     assert engine.summary(captured[0], {}) == "48 samples"
+
+
+def test_what_of_motion_blur_is_left_out_is_told_by_name(scene, ball):
+    """Only while there is motion blur, and no longer than it holds."""
+    steps = part("addon.export.blur_steps").steps
+    scene.render.use_motion_blur, said = True, []
+    layer = scene.view_layers[0]
+    steps(scene, layer, None, said.append)
+    assert not said
+    ball.cycles.use_motion_blur = False
+    scene.render.motion_blur_shutter_curve.curves[0].points[0].location.y = 0.0
+    steps(scene, layer, None, said.append)
+    curve, objects = said
+    assert "Shutter Curve" in curve and f'"{ball.name}"' in objects
+    scene.render.use_motion_blur = False
+    steps(scene, layer, None, said.append)
+    assert len(said) == 2
