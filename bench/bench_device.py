@@ -143,7 +143,8 @@ def main() -> None:
         f"Light of {len(points)} points ({options.size}x{options.size}, 4 positions a pixel, 82k triangles, city HDRI, "
         f"{settings.samples} samples, one bounce), the same samples and seeds everywhere; medians of {options.runs} "
         f"runs, "
-        "copies to and from the device included. Held to: 60 dB between devices."
+        "copies to and from the device included. The first time includes compiling what the folder of kernels lacks. "
+        "Held to: 60 dB between devices."
         + ("" if options.pair else WARP_ON_A_PROCESSOR)
         + "\n\n"
         + table(["Where", "First time", "Seconds", "Speed", "PSNR of the light", "Points alike to the last bit"], rows)

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from checkouts import Checkout
-from report import DOCUMENT, section_pattern, table, write_section
+from report import DOCUMENT, ROOT, section_pattern, table, write_section
 
 PROGRAMS = ("frame", "deform", "simulate --part throughput")
 COLUMNS = ["benchmark", "line", "column", "earlier", "now", "now / earlier", "quartiles"]
@@ -86,6 +86,8 @@ def main() -> None:
     parser.add_argument("programs", nargs="*", metavar="PROGRAM", help=f"by default: {', '.join(PROGRAMS)}")
     parser.add_argument("--pairs", type=int, default=3, help="runs of either that count")
     options = parser.parse_intermixed_args()
+    asked = ["git", "rev-parse", "--short", options.commit]
+    options.commit = subprocess.run(asked, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
     programs = options.programs or PROGRAMS
     before = measured_before(options.commit, DOCUMENT.read_text(encoding="utf-8"))
     rows = [row for row in before if row[0] not in programs]

@@ -53,7 +53,9 @@ def main() -> None:
     if options.scenes == list(SCENES):
         write_section("materials", TITLE, report(options, rows))
     elif section := section_pattern("materials").search(DOCUMENT.read_text(encoding="utf-8")):
-        write_section("materials", TITLE, replaced(section[0], rows, options.spp))
+        if f"{options.size} x {options.size}" not in section[0] or f"mean of {options.seeds} with" not in section[0]:
+            raise SystemExit("the section was measured with another --size or --seeds: its rows are kept")
+        write_section("materials", TITLE, replaced(section[0], rows, f"{options.spp} and {options.samples} samples"))
 
 
 def row(name: str, ours: np.ndarray, theirs: np.ndarray) -> tuple[str, ...]:
@@ -72,13 +74,13 @@ def row(name: str, ours: np.ndarray, theirs: np.ndarray) -> tuple[str, ...]:
     )
 
 
-def replaced(section: str, rows: list[tuple[str, ...]], samples: int) -> str:
+def replaced(section: str, rows: list[tuple[str, ...]], samples: str) -> str:
     """The text of a section with these rows, measured again with other numbers of samples, in place of its own."""
     lines = section.splitlines()[2:-1]  # neither its marks nor its title
     for name, what, *cells in rows:
-        line = "| " + " | ".join([name, f"{what} ({samples} samples)", *cells]) + " |"
+        line = "| " + " | ".join([name, f"{what} ({samples})", *cells]) + " |"
         lines = [line if old.startswith(f"| {name} |") else old for old in lines]
-    return "\n".join(lines) + f"\n\nRows that name {samples} samples:"
+    return "\n".join(lines) + f"\n\nRows that name {samples}:"
 
 
 def report(options: argparse.Namespace, rows: list[tuple[str, ...]]) -> str:

@@ -48,14 +48,14 @@ class RenderBackend:
         How many frames it failed for.
     launcher : Launcher, optional
         Of a device: what launches its kernels.
-    strips : int
+    strip_factor : int
         How many strips of a picture, as `pipeline.strip_height` has them, are made at once: a card needs many samples.
     """
 
     failed = ""
     failures = 0
     launcher: Launcher | None = None
-    strips = 1
+    strip_factor = 1
 
     def with_fallback(self, on_device: Callable[[], T], on_cpu: Callable[[], T]) -> T:
         """The result of `on_device`, or that of `on_cpu` where there is no device or it has failed."""

@@ -127,7 +127,7 @@ def render(
     ]
     end = 1.0 if settings.denoise == "none" else 0.9
     batches = Batches(prepared, frame, check, backend)
-    height = backend.strips * strip_height(right - left, settings.subpixel_count)
+    height = backend.strip_factor * strip_height(right - left, settings.subpixel_count)
     for y0 in range(top, bottom, height):
         report(end * (y0 - top) / (bottom - top), "Rendering")
         y1 = min(y0 + height, bottom)

@@ -184,7 +184,7 @@ class Progressive:
         self._next = 0
         self._parameters = camera_parameters(frame.camera, frame.settings, frame.noise_index)
         left, top, right, bottom = frame.camera.window
-        height = backend.strips * strip_height(right - left, frame.settings.subpixel_count)
+        height = backend.strip_factor * strip_height(right - left, frame.settings.subpixel_count)
         self._strips = [_Strip((y, min(y + height, bottom))) for y in range(top, bottom, height)]
         self._visible: VisibleSurfaces | None = None
         self._left = KEPT_BYTES

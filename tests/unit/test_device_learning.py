@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -79,6 +81,21 @@ def test_attributes(on_device: WarpLearningBackend, bands: int, reflections: boo
     assert_alike(work, list(raw.values()), on_device)
 
 
+def test_a_step_leaves_nothing_behind(on_device: WarpLearningBackend) -> None:
+    """What backward needs goes with the graph, and not when the garbage collector finds a cycle, if it can."""
+    raw, centre = surfels()
+    gc.disable()
+    try:
+        values = {name: value.clone().to(on_device.device).requires_grad_() for name, value in raw.items()}
+        found = on_device.attributes(values, *at(on_device, centre), EYE, 1, True)
+        kept = [weakref.ref(tensor) for tensor in found]
+        sum(tensor.sum() for tensor in found).backward()
+        del found
+        assert [tensor() for tensor in kept] == [None] * 4
+    finally:
+        gc.enable()
+
+
 def test_what_is_mirrored(on_device: WarpLearningBackend) -> None:
     """Pixels hardly covered among them, and one without a normal."""
     features, alpha = random(HEIGHT, WIDTH, 10, low=-1), random(HEIGHT, WIDTH, seed=1)
@@ -89,11 +106,12 @@ def test_what_is_mirrored(on_device: WarpLearningBackend) -> None:
     assert_alike(lambda by, f, a, c: by.mirrored(f, a, *at(by, rays), pyramid(c)), [features, alpha, cube], on_device)
 
 
-def test_gradients_of_shared_texels_do_not_depend_on_the_order() -> None:
-    index, pull = torch.randint(0, 50, (4000,)), random(4000, 3, seed=1, low=-1e3, high=1e3)
+def test_gradients_of_shared_texels_do_not_depend_on_the_order(on_device: WarpLearningBackend) -> None:
+    index, pull = at(on_device, torch.randint(0, 50, (4000,)), random(4000, 3, seed=1, low=-1e3, high=1e3))
     pull[7] = float("nan")  # of a surfel that is damaged: it must not spoil the others
-    orders = torch.arange(4000), torch.randperm(4000)
-    found = [appearance.sum_rows(index[order], pull[order], 50) for order in orders]
+    orders = at(on_device, torch.arange(4000), torch.randperm(4000))
+    found = [appearance.sum_rows(index[order], pull[order], 50).cpu() for order in orders]
+    index, pull = at(CPU, index, pull)
     assert torch.equal(*found)
     exact = torch.zeros(50, 3, dtype=torch.float64).index_add(0, index, torch.nan_to_num(pull).double())
     torch.testing.assert_close(found[0].double(), exact, rtol=1e-6, atol=1e-6)

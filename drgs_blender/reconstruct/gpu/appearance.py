@@ -75,29 +75,29 @@ def look_up_pixels(thread, stride, scratch, features, alpha, rays, texels, out):
             look_up(features[y, x], alpha[y, x], rays[y, x], texels, seen[y, x])
 
 
-def pixel_gradient_rows(thread, stride, scratch, maps, texels, seen, incoming, out):  # type: ignore[no-untyped-def]
+def pixel_gradient_rows(thread, stride, scratch, rows, maps, texels, seen, incoming, out):  # type: ignore[no-untyped-def]
     """`reflection_probe.pixel_gradients` and `reflection_probe.texel_shares`.
 
     Parameters
     ----------
     thread, stride, scratch : int64 or tuple
+    rows : (m,) int64 array
+        Numbers of the pixels that mirror something.
     maps : tuple of array
         Features, coverage and rays, as of `reflection_probe.mirrored`.
     texels, seen, incoming : array
         As of `reflection_probe.pixel_gradients`.
     out : tuple of array
-        Gradients of features and coverage, rows of the texels (h * w, 8) and their gradients (h * w, 8, 3); all
-        but the rows of zeros; written.
+        Gradients of features and coverage, of zeros; rows of the texels (m, 8) and their gradients (m, 8, 3); written.
     """
     features, alpha, rays = maps
     to_features, to_alpha, places, shares = out
-    h, w = alpha.shape
-    for number in range(thread, h * w, stride):
-        y, x = number // w, number % w
-        if alpha[y, x] > BARE:
-            pixel = features[y, x], alpha[y, x], rays[y, x], seen[y, x], incoming[y, x]
-            pixel_gradients(pixel, texels, False, (to_features[y, x], to_alpha[y], x, shares[number]))
-            texel_shares(features[y, x], alpha[y, x], rays[y, x], incoming[y, x], places[number], shares[number])
+    w = alpha.shape[1]
+    for number in range(thread, len(rows), stride):
+        y, x = rows[number] // w, rows[number] % w
+        pixel = features[y, x], alpha[y, x], rays[y, x], seen[y, x], incoming[y, x]
+        pixel_gradients(pixel, texels, False, (to_features[y, x], to_alpha[y], x, shares[number]))
+        texel_shares(features[y, x], alpha[y, x], rays[y, x], incoming[y, x], places[number], shares[number])
 
 
 ATTRIBUTES, ATTRIBUTE_GRADIENTS = WarpKernel(attribute_rows, (), {}), WarpKernel(attribute_gradient_rows, (), {})
@@ -125,7 +125,8 @@ class _Attributes(torch.autograd.Function):
         found = Attributes(new(n, 3), new(n, 3), new(n), new(n, BLUR + 1 if reflections else TINT))
         normal = new(n, 3)
         launcher.launch(ATTRIBUTES, n, (raw, away, values), (*found, normal))
-        ctx.save = (launcher, raw, values, normal, found)
+        # Detached: what is returned leads to `ctx`, and a cycle through it would keep each step's memory for good.
+        ctx.save = (launcher, raw, values, normal, Attributes(*(t.detach() for t in found)))
         return tuple(found)
 
     @staticmethod
@@ -159,12 +160,11 @@ class _Mirrored(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Any, ...]:
         launcher, blended, cover, rays, light, seen = ctx.save
         to_features, to_alpha = torch.zeros_like(blended), torch.zeros_like(cover)
-        # Pixels that mirror nothing add zeros: to all rows, for a card adds to one row one after the other.
-        number = torch.arange(cover.numel() * _TEXELS, device=cover.device)
-        places = (number % len(light)).reshape(-1, _TEXELS)
-        shares = blended.new_zeros(cover.numel(), _TEXELS, 3)
-        given = (blended, cover, rays), light, seen, gradients[0].contiguous()
-        launcher.launch(PIXEL_GRADIENTS, cover.numel(), given, (to_features, to_alpha, places, shares))
+        rows = torch.nonzero(cover.flatten() > float(BARE))[:, 0]
+        places = torch.empty((len(rows), _TEXELS), dtype=torch.int64, device=cover.device)
+        shares = blended.new_empty(len(rows), _TEXELS, 3)
+        given = rows, (blended, cover, rays), light, seen, gradients[0].contiguous()
+        launcher.launch(PIXEL_GRADIENTS, len(rows), given, (to_features, to_alpha, places, shares))
         return to_features, to_alpha, None, sum_rows(places.flatten(), shares.flatten(0, 1), len(light)), None
 
 

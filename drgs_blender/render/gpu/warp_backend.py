@@ -46,7 +46,7 @@ class WarpRenderBackend(RenderBackend):
 
     def __init__(self, device: str) -> None:
         self.launcher: Launcher = Launcher(device)
-        self.strips = 4 if self.launcher.apart else 1
+        self.strip_factor = 4 if self.launcher.apart else 1
         self.mirror = Mirror(self.launcher)
         self._samples: DeviceSamples | None = None
         self._kernel = DeviceShadingKernel(self.launcher, self.mirror)

@@ -43,7 +43,7 @@ WC, WG, WE, WL, SIZE = (LANES * i for i in range(46, 51))
 UX, UY, UZ = (LANES * i for i in range(51, 54))
 # where smooth meshes have a terminator offset: see `scene.terminator`, and the part of it that a shadow ray gets
 HX, HY, HZ, LIMIT, MOVED = (LANES * i for i in range(54, 59))
-#: Four fields, 256 bytes, divide it: at 51 or 59 fields the kernel takes a tenth longer (bench/bench_earlier.py).
+#: Four fields, 256 bytes, divide it: at 51 or 59 fields the kernel took a tenth longer than at 48, 56, 60, 64 or 72.
 PACKET_FLOATS = 60 * LANES
 #: Where lights are linked, the set of the surface: of a point's samples, which have no throughput, and of paths.
 POINT_SET, PATH_SET = TR, WL
