@@ -122,12 +122,12 @@ class _Attributes(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         raw = Learned(*(p.detach().contiguous() for p in parameters))
         n, new = len(away), away.new_empty
-        found = Attributes(new(n, 3), new(n, 3), new(n), new(n, BLUR + 1 if reflections else TINT))
+        found = new(n, 3), new(n, 3), new(n), new(n, BLUR + 1 if reflections else TINT)
         normal = new(n, 3)
         launcher.launch(ATTRIBUTES, n, (raw, away, values), (*found, normal))
         # Detached: what is returned leads to `ctx`, and a cycle through it would keep each step's memory for good.
-        ctx.save = (launcher, raw, values, normal, Attributes(*(t.detach() for t in found)))
-        return tuple(found)
+        ctx.save = (launcher, raw, values, normal, tuple(t.detach() for t in found))
+        return found
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Any, ...]:
@@ -136,7 +136,7 @@ class _Attributes(torch.autograd.Function):
             torch.zeros_like(a) if g is None else g.contiguous() for g, a in zip(gradients, found, strict=True)
         )
         to = tuple(map(torch.zeros_like, raw))
-        launcher.launch(ATTRIBUTE_GRADIENTS, len(normal), (raw.rotation, values, normal, tuple(found), incoming), to)
+        launcher.launch(ATTRIBUTE_GRADIENTS, len(normal), (raw.rotation, values, normal, found, incoming), to)
         return None, None, None, None, *to
 
 
