@@ -491,7 +491,7 @@ def test_workers_compile_the_package_of_the_process_that_started_them(tmp_path):
 @pytest.mark.slow
 def test_processes_that_compile_at_once_share_the_work(tmp_path):
     """Each kernel is compiled once, by whichever comes first, and both end when all are there."""
-    names = "{'mix', '_look_up_rows', '_number', '_copy_vertices', '_move_vertices', '_spread', '_modulate'}"
+    names = "{'mix', '_look_up', '_look_up_rows', '_number', '_spread', '_modulate'}"
     code = "from drgs_blender.compute import prepare, manifest\n"
     code += f"kernels = [k for ks in manifest.jobs().values() for k in ks if k.name in {names}]\n"
     code += "kernels = sorted(set(kernels), key=lambda k: k.name)\n"
