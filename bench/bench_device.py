@@ -150,8 +150,8 @@ def main() -> None:
         + table(["Where", "First time", "Seconds", "Speed", "PSNR of the light", "Points alike to the last bit"], rows)
     )
     body += (
-        f"\n\nWhole pictures of the same view: {options.size}x{options.size}, surfels, 32 samples, one bounce, SVGF, by "
-        "the session that Blender talks to, every vertex moved before each. Held to: 60 a second on a data-centre "
+        f"\n\nWhole pictures of the same view: {options.size}x{options.size}, surfels, 32 samples, one bounce, SVGF, "
+        "by the session that Blender talks to, every vertex moved before each. Held to: 60 a second on a data-centre "
         "card, a viewport's first picture after 33 ms.\n\n"
     )
     body += frames(options, cards)

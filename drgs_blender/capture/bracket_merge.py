@@ -37,6 +37,9 @@ _AGREE, _ROUNDED, _MEASURED = 0.5, 0.12, 50
 _ROWS = 256
 #: Part of the pixels above white from which the report says so.
 _ABOVE = 1e-3
+#: A picture whose exposures are all longer than that of white by so many stops is left out where more than this part of
+#: its pixels is saturated in each: what is lost there is darker than white, and would look grey.
+_BELOW, _DARKENED = 0.5, 0.02
 
 
 @dataclass(slots=True)
@@ -122,16 +125,31 @@ def merge_brackets(pictures: Sequence[Picture], found: Brackets, folder: Path, s
     made: dict[int, Picture] = {}
     alone = {id(picture) for picture in found.others}
     for group, outcome in zip(found.groups, outcomes, strict=True):
-        if outcome.used:
+        names = [picture.path.name for picture in group.pictures if picture.path.name not in left_out]
+        if outcome.views:
+            unlike = [name for name in names if name not in outcome.used]
+            left_out |= {name: "its bracket shows no one view: the middle exposure is used alone" for name in unlike}
+        if _is_darkened(group, outcome, white_of(group, references)):
+            left_out |= {name: "is saturated below white, and shorter exposures are missing" for name in outcome.used}
+        elif outcome.used:
             made[id(group.pictures[0])] = _picture(group, folder, white_of(group, references), outcome)
-        else:
-            alone |= {id(picture) for picture in group.pictures if picture.path.name not in left_out}
     result = [made.get(id(one), one) for one in pictures if id(one) in made or id(one) in alone]
     if not result:
         problem = f"has only pictures that cannot be read: {first_of(list(left_out))}"
         raise AssetError(subject, problem, "Copy them again")
     _tell(found.groups, outcomes, subject)
+    if dark := [name for name, why in left_out.items() if why.startswith("is saturated")]:
+        logger.warning(
+            "%s: %d pictures are left out: saturated below white, and shorter exposures of them are missing: %s",
+            subject, len(dark), first_of(dark),
+        )  # fmt: skip
     return Merged(result, left_out, _lines(found, outcomes))
+
+
+def _is_darkened(group: Bracket, outcome: _Outcome, white: float) -> bool:
+    """Whether what is saturated in every exposure is darker than white."""
+    used = [stops_of(picture) for picture in group.pictures if picture.path.name in outcome.used]
+    return bool(used) and outcome.lost > _DARKENED and max(used) < white - _BELOW
 
 
 def _picture(group: Bracket, folder: Path, white: float, outcome: _Outcome) -> Picture:
@@ -152,9 +170,12 @@ def _outcome(group: Bracket, target: Path, white: float) -> _Outcome:
     """A bracket merged into `target`, or what a run before this says of it."""
     kept = target.with_suffix(".json")
     try:
-        return _Outcome(**json.loads(kept.read_text(encoding="utf-8")))
+        before = _Outcome(**json.loads(kept.read_text(encoding="utf-8")))
+        if not before.unread and target.is_file():  # what could not be read then may be there now
+            return before
     except (OSError, ValueError, TypeError):
-        outcome = _merge(group, target, white)
+        pass
+    outcome = _merge(group, target, white)
     replace_file(kept, [json.dumps(asdict(outcome)).encode()])  # after the picture: then that is whole
     return outcome
 
@@ -169,7 +190,8 @@ def _merge(group: Bracket, target: Path, white: float) -> _Outcome:
             outcome.unread[one.path.name] = error.problem
             continue
         if not radiance.add(pixels, stops_of(one), one is group.middle):
-            return _Outcome(unread=outcome.unread, views=True)
+            alone = _merge(Bracket([group.middle]), target, white)
+            return replace(alone, unread=alone.unread | outcome.unread, views=True)
     outcome.used = [one.path.name for one in group.pictures if one.path.name not in outcome.unread]
     if outcome.used:
         merged = radiance.result()
@@ -301,7 +323,7 @@ def _tell(groups: Sequence[Bracket], outcomes: Sequence[_Outcome], subject: str)
         )  # fmt: skip
     if views := [str(group) for group, one in pairs if one.views]:
         logger.warning(
-            "%s: %d brackets by EXIF show no one view and are not merged; each of their pictures is used as it is: %s",
+            "%s: %d brackets by EXIF show no one view and are not merged; their middle exposures are used alone: %s",
             subject, len(views), first_of(views),
         )  # fmt: skip
     if disagree := [f"{group} ({one.error:.1f} stops)" for group, one in pairs if one.error > _AGREE]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +101,7 @@ def find_brackets(pictures: Sequence[Picture], setting: str, source: Path) -> Br
 
     Files that follow each other are a bracket where they have the same size, camera, lens and known exposure settings,
     each another exposure, and, as far as they say when they were taken, no more than `_PAUSE` seconds between them.
+    Where all say when they were taken and the pauses divide them into brackets, the pauses decide (`_by_pauses`).
     The most common pattern of exposures counts; it must span a stop, be there twice and be that of half of the
     pictures. What fits in with some of its exposures left out is an incomplete bracket.
 
@@ -125,7 +126,8 @@ def find_brackets(pictures: Sequence[Picture], setting: str, source: Path) -> Br
     count = None if setting == AUTO else int(setting)
     known = [picture for picture in pictures if picture.exif.stops is not None]
     others = [picture for picture in pictures if picture.exif.stops is None]
-    pattern = _pattern(known, pictures, count)
+    groups = _by_pauses(pictures, count)
+    pattern = groups[0].steps if groups else _pattern(known, pictures, count)
     if pattern is None:
         if count is not None:
             problem = f"has no {count} files that follow each other with different exposures and the same size and lens"
@@ -135,11 +137,73 @@ def find_brackets(pictures: Sequence[Picture], setting: str, source: Path) -> Br
             raise AssetError(
                 str(source), problem, "Check that their EXIF has the exposure time, or give --brackets none"
             )
+        _hint(known, source)
         return None
-    groups = _split(pictures, pattern, count is None)
-    found = Brackets(groups, others, len(pattern))
+    size = len(pattern) if not groups else max(len(group.pictures) for group in groups)
+    found = Brackets(groups or _split(pictures, pattern, count is None), others, size)
     _tell(found, source)
     return found
+
+
+def _by_pauses(pictures: Sequence[Picture], count: int | None) -> list[Bracket]:
+    """Brackets by the pauses between their files, where these tell; else none.
+
+    Pictures of a bracket follow each other at once, brackets do not: of all pauses that may divide them, the one after
+    which most have the same number of different exposures. A file that is missing or exposed otherwise moves no other.
+    """
+    if any(picture.exif.taken is None or picture.exif.stops is None for picture in pictures):
+        return []
+    pauses = [_pause(one, other) for one, other in pairwise(pictures)]
+    best: tuple[int, list[Bracket]] = 0, []
+    for longest in sorted(set(pauses))[:-1]:
+        if count is None and longest > _PAUSE:
+            break
+        groups = [Bracket([pictures[0]])] if pictures else []
+        for picture, pause in zip(pictures[1:], pauses):
+            if pause <= longest:
+                groups[-1].pictures.append(picture)
+            else:
+                groups.append(Bracket([picture]))
+        if not all(_differ(group) for group in groups):
+            continue
+        sizes = [len(group.pictures) for group in groups]
+        size = count or max(set(sizes), key=sizes.count)
+        whole = [group for group in groups if len(group.pictures) == size]
+        if size < FEWEST or max(sizes) > size or 2 * size * len(whole) < len(pictures):
+            continue
+        if count is None and (len(whole) < 2 or not _alike(whole)):
+            continue
+        best = max(best, (size * len(whole), groups), key=lambda one: (one[0], -len(one[1])))
+    return best[1]
+
+
+def _pause(one: Picture, other: Picture) -> float:
+    """Whole seconds, as EXIF has them, between two pictures, beside the exposure; without end for another camera."""
+    assert one.exif.taken is not None and other.exif.taken is not None
+    if _kind(one) != _kind(other):
+        return float("inf")
+    return float(round(max(0.0, abs(other.exif.taken - one.exif.taken) - (one.exif.seconds or 0.0))))
+
+
+def _differ(group: Bracket) -> bool:
+    return all(abs(a - b) >= _STEP for a, b in combinations(group.stops, 2))
+
+
+def _alike(groups: Sequence[Bracket]) -> bool:
+    """Whether most have the same steps, which span enough to be no accident."""
+    steps = groups[len(groups) // 2].steps
+    same = sum(_equal(steps, group.steps) for group in groups)
+    return max(steps) - min(steps) >= _SPAN and 2 * same > len(groups)
+
+
+def _hint(known: Sequence[Picture], source: Path) -> None:
+    """Say that there may be brackets where exposures differ as in some."""
+    stops = [stops_of(picture) for picture in known]
+    if stops and max(stops) - min(stops) >= 2.0:
+        logger.warning(
+            "%s: exposures differ by %.1f stops, and no brackets are recognised. If files that follow each other are "
+            "brackets of n exposures, give --brackets n", source, max(stops) - min(stops),
+        )  # fmt: skip
 
 
 def _pattern(known: Sequence[Picture], pictures: Sequence[Picture], count: int | None) -> list[float] | None:

@@ -253,7 +253,9 @@ def test_another_size_in_a_bracket_is_named(tmp_path, caplog):
         small.save(photos / "01_2.png", exif=image.getexif())
     done = merged(photos, tmp_path)
     assert "01_2.png (24 x 18, not 48 x 36)" in caplog.text
-    assert [picture.merged for picture in done.pictures][1:3] == [("01_0.png", "01_1.png"), ("01_2.png",)]
+    assert [picture.merged for picture in done.pictures][1] == ("01_0.png", "01_1.png") and len(done.pictures) == 3
+    # Alone, it is saturated where the others are not yet white: no grey may stand for that.
+    assert list(done.left_out) == ["01_2.png"] and "shorter exposures of them are missing: 01_2.png" in caplog.text
 
 
 def test_a_truncated_exposure_is_named_and_the_others_are_merged(tmp_path, caplog):
@@ -272,9 +274,9 @@ def test_views_that_moved_between_exposures_are_not_merged(tmp_path, caplog):
     image = Image.fromarray(expose(radiance(7) / 8))
     image.save(photos / "01_1.png", exif=tags(1 / 480, second=21))
     done = merged(photos, tmp_path)
-    assert [picture.path.name for picture in done.pictures] == [
-        "00_0.exr", "01_0.png", "01_1.png", "01_2.png", "02_0.exr"
-    ]  # fmt: skip
+    assert [picture.path.name for picture in done.pictures] == ["00_0.exr", "01_0.exr", "02_0.exr"]
+    assert set(done.left_out) == {"01_1.png", "01_2.png"}
+    np.testing.assert_allclose(decode(done.pictures[1]), np.clip(radiance(1), 0, 1), atol=0.01)  # of the common scale
     assert "show no one view and are not merged" in caplog.text and "01_0.png + 01_1.png + 01_2.png" in caplog.text
 
 
@@ -381,7 +383,7 @@ def test_a_run_that_goes_on_keeps_what_is_merged_and_says_it_again(tmp_path, cap
     before = (work / "00_0.exr").stat().st_mtime_ns
     assert not caplog.messages
     done = merged(photos, tmp_path)
-    assert (work / "00_0.exr").stat().st_mtime_ns == before and len(done.pictures) == 5
+    assert (work / "00_0.exr").stat().st_mtime_ns == before and len(done.pictures) == 3
     told, notes = caplog.messages, [picture.notes for picture in done.pictures]
     caplog.clear()
     again = merged(photos, tmp_path)
@@ -477,3 +479,48 @@ def test_a_curve_of_the_camera_is_named_and_no_other_view(tmp_path, caplog):
             image.save(photos / f"{view}{k}.jpg", exif=tags(2.0**stop / 60, second=20 * view + k), quality=92)
     assert all(len(picture.merged) == 3 for picture in merged(photos, tmp_path).pictures)
     assert "2 brackets differ otherwise in brightness than EXIF says" in caplog.text
+
+
+@pytest.mark.parametrize("setting", ["auto", "3"])
+@pytest.mark.parametrize("gone", [((0, 0),), ((0, 0), (0, 1)), ((2, 1),)])
+def test_missing_files_shift_no_bracket_whose_files_say_when_they_were_taken(tmp_path, setting, gone):
+    photos = tmp_path / "photos"
+    shoot(photos, 5, left_out=gone)
+    found = found_in(photos, setting)
+    assert found is not None and found.size == 3
+    assert all(len({picture.path.name[:2] for picture in group.pictures}) == 1 for group in found.groups)
+    assert len(found.groups) == 5 and len(found.complete) == 4
+
+
+@pytest.mark.parametrize("setting", ["auto", "3"])
+def test_one_exposure_that_is_another_tears_no_bracket(tmp_path, setting):
+    photos = tmp_path / "photos"
+    shoot(photos, 4)
+    image = Image.fromarray(expose(radiance(1) * 2.0**-1.5))
+    image.save(photos / "01_1.png", exif=tags(2.0**-1.5 / 60, second=21))
+    found = found_in(photos, setting)
+    assert found is not None and [len(group.pictures) for group in found.groups] == [3] * 4
+
+
+def test_views_whose_exposure_drifts_are_brackets_of_their_own(tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for view in range(5):
+        for k, stop in enumerate(STOPS):
+            image = Image.fromarray(expose(radiance(view) * 2.0 ** (stop + 0.5 * view)))
+            taken = tags(2.0 ** (stop + 0.5 * view) / 240, second=4 * view + (k > 1))
+            image.save(photos / f"{view}{k}.png", exif=taken)
+    found = found_in(photos)
+    assert found is not None and [len(group.pictures) for group in found.groups] == [3] * 5
+
+
+def test_exposures_far_apart_without_brackets_bring_a_hint(tmp_path, caplog):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for k in range(4):
+        image = Image.fromarray(expose(radiance(k)))
+        image.save(photos / f"{k}.png", exif=tags(2.0 ** -(3 * (k % 2)) / 60, second=60 * k))
+    assert found_in(photos) is None
+    assert (
+        "exposures differ by 3.0 stops, and no brackets are recognised" in caplog.text and "--brackets n" in caplog.text
+    )
