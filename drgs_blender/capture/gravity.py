@@ -101,10 +101,16 @@ def measured_up(found: Registration, ups: Mapping[str, Vector], subject: str) ->
     up = up / max(length, 1e-9)
     apart = np.degrees(np.arccos(np.clip(each @ up, -1, 1)))
     held = direction_up(np.stack(list(found.matrices.values())))
-    if float(np.median(apart)) > _AGREE or (held is not None and held @ up < math.cos(math.radians(_HELD_WITHIN))):
+    if float(np.median(apart)) > _AGREE:
         logger.warning(
             "%s: gravity in the metadata of %d pictures does not fit their cameras (%.0f degrees apart): not used",
             subject, len(files), float(np.median(apart)),
+        )  # fmt: skip
+        return None
+    if held is not None and held @ up < math.cos(math.radians(_HELD_WITHIN)):
+        logger.warning(
+            "%s: gravity in the metadata of %d pictures is %.0f degrees from how the cameras were held: not used",
+            subject, len(files), math.degrees(math.acos(max(-1.0, min(1.0, float(held @ up))))),
         )  # fmt: skip
         return None
     return up
