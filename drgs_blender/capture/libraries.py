@@ -6,7 +6,9 @@ import importlib
 import sys
 from typing import Any, NamedTuple
 
-import PIL.Image  # noqa: F401 - before pycolmap: loaded after it, Pillow waits for a lock of its own libraries forever
+# Before pycolmap, because it loads the system's zlib: if pycolmap is the first to do so, that zlib calls functions of
+# the other zlib that pycolmap exports, and whoever compresses by it, as Pillow does, crashes or hangs.
+import PIL.Image  # noqa: F401
 
 from ..core.errors import DeviceError
 

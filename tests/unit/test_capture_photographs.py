@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from drgs_blender.core.materials import Image, Material, Texture
 from drgs_blender.engine.session import Session
 from drgs_blender.reconstruct.readers import read_capture
 
+ROOT = Path(__file__).resolve().parents[2]
 #: Metres: half a table, half a box in X and Y, its height.
 TABLE, BOX, HEIGHT = 0.5, 0.07, 0.12
 DISTANCE = 0.6
@@ -111,3 +115,21 @@ def test_cameras_of_rendered_photographs_are_found(photographs, tmp_path):
     assert rotation[2, 2] > math.cos(math.radians(1.0))
     assert scale == pytest.approx(1.0, rel=0.02)
     assert shift[2] == pytest.approx(0.0, abs=0.01 * DISTANCE)
+
+
+def test_pillow_works_after_structure_from_motion_was_loaded_first():
+    """Without what `libraries` imports before it, the system's zlib mixes with pycolmap's own: a crash or a hang."""
+    pytest.importorskip("pycolmap", reason="structure from motion needs pycolmap")
+    program = (
+        "from drgs_blender.capture import libraries\n"
+        "libraries.load('pycolmap')\n"
+        "import io\n"
+        "from PIL import Image\n"
+        "noise = bytes(k * k % 251 for k in range(64 * 64 * 3))\n"
+        "for kind, more in (('PNG', {}), ('TIFF', {'compression': 'tiff_adobe_deflate'})):\n"
+        "    file = io.BytesIO()\n"
+        "    Image.frombytes('RGB', (64, 64), noise).save(file, kind, **more)\n"
+        "    assert Image.open(io.BytesIO(file.getvalue())).tobytes() == noise\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, cwd=ROOT)
+    assert done.returncode == 0, done.stderr[-2000:]
