@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core.arrays import Array
 from ..core.asset.archive import replace_file
-from ..core.color import linear_to_srgb, srgb_to_linear
+from ..core.color import linear_to_srgb, srgb_to_linear, to_unit
 from ..core.errors import AssetError, Cancelled, first_of
 from ..formats.exr import write_exr_picture
 from .brackets import Bracket, Brackets, reference, stops_of, white_of
@@ -58,7 +58,7 @@ class _Outcome:
     Attributes
     ----------
     used : list of str
-        Names of the merged files; none where they show several views, or none can be read.
+        Names of the merged files: of several views the middle exposure alone; none where none can be read.
     unread : dict of str to str
         Name -> what is wrong.
     views : bool
@@ -124,25 +124,22 @@ def merge_brackets(pictures: Sequence[Picture], found: Brackets, folder: Path, s
     left_out = {name: f"cannot be read ({why})" for one in outcomes for name, why in one.unread.items()}
     made: dict[int, Picture] = {}
     alone = {id(picture) for picture in found.others}
+    dark: list[str] = []
     for group, outcome in zip(found.groups, outcomes, strict=True):
         names = [picture.path.name for picture in group.pictures if picture.path.name not in left_out]
         if outcome.views:
             unlike = [name for name in names if name not in outcome.used]
             left_out |= {name: "its bracket shows no one view: the middle exposure is used alone" for name in unlike}
         if _is_darkened(group, outcome, white_of(group, references)):
-            left_out |= {name: "is saturated below white, and shorter exposures are missing" for name in outcome.used}
+            dark += outcome.used
         elif outcome.used:
             made[id(group.pictures[0])] = _picture(group, folder, white_of(group, references), outcome)
+    left_out |= {name: "is saturated below white, and shorter exposures are missing" for name in dark}
     result = [made.get(id(one), one) for one in pictures if id(one) in made or id(one) in alone]
     if not result:
         problem = f"has only pictures that cannot be read: {first_of(list(left_out))}"
         raise AssetError(subject, problem, "Copy them again")
-    _tell(found.groups, outcomes, subject)
-    if dark := [name for name, why in left_out.items() if why.startswith("is saturated")]:
-        logger.warning(
-            "%s: %d pictures are left out: saturated below white, and shorter exposures of them are missing: %s",
-            subject, len(dark), first_of(dark),
-        )  # fmt: skip
+    _tell(found.groups, outcomes, dark, subject)
     return Merged(result, left_out, _lines(found, outcomes))
 
 
@@ -212,7 +209,6 @@ class _Radiance:
         self._alpha: Array | None = None
         self._cells: tuple[Array, Array] | None = None
         self._shift = self._middle_shift = 0.0
-        self.count = 0
         self.error = 0.0
         self.lost = 0.0
 
@@ -226,7 +222,7 @@ class _Radiance:
             self._middle_shift = self._shift
         scale = np.float32(2.0 ** (stops + self._shift - self._white))
         if pixels.shape[2] == 4 and (self._alpha is None or middle):
-            self._alpha = np.asarray(np.clip(pixels[..., 3:] / _most(pixels), 0, 1), np.float32)
+            self._alpha = np.clip(to_unit(pixels[..., 3:]), 0, 1)
         first = self._total is None
         if first:
             self._total, self._weight, self._shortest = (np.zeros((*pixels.shape[:2], 3), np.float32) for _ in range(3))
@@ -240,7 +236,6 @@ class _Radiance:
             if first:
                 self._shortest[rows] = linear
             self._total[rows] += linear * weight
-        self.count += 1
         return True
 
     def _same_view(self, cells: tuple[Array, Array]) -> bool:
@@ -313,7 +308,7 @@ def _compared(pixels: Array, scale: np.float32) -> tuple[Array, Array]:
     return mean * scale, (part >= 1 - 1e-6) & (mean > dark)
 
 
-def _tell(groups: Sequence[Bracket], outcomes: Sequence[_Outcome], subject: str) -> None:
+def _tell(groups: Sequence[Bracket], outcomes: Sequence[_Outcome], dark: Sequence[str], subject: str) -> None:
     """Warnings, one for each kind of doubt."""
     pairs = list(zip(groups, outcomes, strict=True))
     if unread := [f"{name} ({why})" for one in outcomes for name, why in one.unread.items()]:
@@ -325,6 +320,11 @@ def _tell(groups: Sequence[Bracket], outcomes: Sequence[_Outcome], subject: str)
         logger.warning(
             "%s: %d brackets by EXIF show no one view and are not merged; their middle exposures are used alone: %s",
             subject, len(views), first_of(views),
+        )  # fmt: skip
+    if dark:
+        logger.warning(
+            "%s: %d pictures are left out: saturated below white, and shorter exposures of them are missing: %s",
+            subject, len(dark), first_of(dark),
         )  # fmt: skip
     if disagree := [f"{group} ({one.error:.1f} stops)" for group, one in pairs if one.error > _AGREE]:
         logger.warning(

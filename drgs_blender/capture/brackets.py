@@ -127,8 +127,10 @@ def find_brackets(pictures: Sequence[Picture], setting: str, source: Path) -> Br
     known = [picture for picture in pictures if picture.exif.stops is not None]
     others = [picture for picture in pictures if picture.exif.stops is None]
     groups = _by_pauses(pictures, count)
-    pattern = groups[0].steps if groups else _pattern(known, pictures, count)
-    if pattern is None:
+    size = max((len(group.pictures) for group in groups), default=0)
+    if not groups and (pattern := _pattern(known, pictures, count)) is not None:
+        groups, size = _split(pictures, pattern, count is None), len(pattern)
+    if not groups:
         if count is not None:
             problem = f"has no {count} files that follow each other with different exposures and the same size and lens"
             if others:
@@ -139,8 +141,7 @@ def find_brackets(pictures: Sequence[Picture], setting: str, source: Path) -> Br
             )
         _hint(known, source)
         return None
-    size = len(pattern) if not groups else max(len(group.pictures) for group in groups)
-    found = Brackets(groups or _split(pictures, pattern, count is None), others, size)
+    found = Brackets(groups, others, size)
     _tell(found, source)
     return found
 

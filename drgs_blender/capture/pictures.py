@@ -227,7 +227,7 @@ def decode(picture: Picture) -> Array:
         with libraries.load("rawpy").imread(str(picture.path)) as raw:
             return np.asarray(raw.postprocess(use_camera_wb=True, no_auto_bright=True))
     pixels = _stored(picture)
-    if pixels.shape[2] == 4 and not (picture.alpha and _least_alpha(pixels) < 1):
+    if pixels.shape[2] == 4 and not (picture.alpha and to_unit(pixels[..., 3].min()) < 1):
         pixels = np.ascontiguousarray(pixels[..., :3])
     return pixels
 
@@ -238,10 +238,6 @@ def _stored(picture: Picture) -> Array:
     if picture.path.suffix.lower() in (*LINEAR, *_TIFF):
         return pixels  # Pillow and tifffile turn TIFF when they read it
     return upright(pixels, picture.exif.orientation)
-
-
-def _least_alpha(pixels: Array) -> float:
-    return float(pixels[..., 3].min()) / (np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0)
 
 
 def mask_of_alpha(pixels: Array, subject: str) -> Array | None:
