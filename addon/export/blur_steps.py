@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ...drgs_blender.core.errors import first_of
 from ..property_limits import Limited
 from .camera import is_panoramic
 
@@ -76,10 +77,11 @@ def _warn_of_cycles_own(scene: bpy.types.Scene, layer: bpy.types.ViewLayer, warn
         point.location.y < 0.99 for curve in scene.render.motion_blur_shutter_curve.curves for point in curve.points
     ):
         warn("Shutter Curve is not rendered: the shutter opens and shuts at once")
-    own = [obj.name for obj in layer.objects if not getattr(getattr(obj, "cycles", None), "use_motion_blur", True)]
+    own = [
+        f'"{obj.name}"' for obj in layer.objects if not getattr(getattr(obj, "cycles", None), "use_motion_blur", True)
+    ]
     if own:
-        names = ", ".join(f'"{name}"' for name in own[:3]) + (", ..." if len(own) > 3 else "")
-        warn(f"Motion Blur cannot be off for single objects in DR-GS; blurred like all: {names}")
+        warn(f"Motion Blur cannot be off for single objects in DR-GS; blurred like all: {first_of(own)}")
 
 
 def _radius(camera: bpy.types.Camera) -> float:

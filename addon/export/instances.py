@@ -9,7 +9,7 @@ from typing import TypeVar
 import bpy
 import numpy as np
 
-from ...drgs_blender.core.errors import Cancelled
+from ...drgs_blender.core.errors import Cancelled, first_of
 from ...drgs_blender.core.frame import Visibility
 
 T = TypeVar("T")
@@ -122,6 +122,5 @@ class Unrendered:
     def report(self, warn: Warn) -> None:
         """One warning per kind."""
         for kind, found in self._names.items():
-            names = ", ".join(sorted(found)[:3]) + (", ..." if len(found) > 3 else "")
             objects = "object is" if len(found) == 1 else "objects are"
-            warn(f"{len(found)} {kind} {objects} not rendered by DR-GS: {names}")
+            warn(f"{len(found)} {kind} {objects} not rendered by DR-GS: {first_of(sorted(found))}")
