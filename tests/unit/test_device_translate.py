@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
-from cards import DEVICE, IS_CARD
+from cards import DEVICE, IS_CARD, assert_same
 
 from drgs_blender.compute.jit import njit
 from drgs_blender.compute.warp.kernels import Launcher, ScratchArray, WarpKernel
@@ -274,7 +274,7 @@ def test_records_hold_arrays_and_tuples_by_name() -> None:
         expected, found = np.zeros((2, 40), np.float32), np.zeros((2, 40), np.float32)
         records(0, 1, Own(np.zeros(1, np.int64)), spans, expected)
         Launcher(DEVICE).launch(WarpKernel(records, Own(ScratchArray("int64", (1,))), {}), 40, [spans], list(found))
-        np.testing.assert_array_equal(found, expected)
+        assert_same(found, expected, 1e-7)
 
 
 def powers(a, b, n):  # type: ignore[no-untyped-def]
