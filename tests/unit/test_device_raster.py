@@ -24,6 +24,7 @@ SCENES = {
     "cloud": (random_surfels(3000), {}),
     "layers": (join(*(plane_of_surfels(y, 0.5, 0.05, 0.04, opacity=0.6) for y in (-0.4, 0.0, 0.02, 0.4))), {}),
     "orthographic": (random_surfels(800, seed=3, size=0.1), {"orthographic": True, "focal": 20.0}),
+    "far": (plane_of_surfels(0.0, 0.5, 0.01, 0.008, opacity=0.9), {"orthographic": True, "focal": 20.0}),
     "near": (random_surfels(500, seed=4, size=0.3), {"distance": 0.9}),
 }
 

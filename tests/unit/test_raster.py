@@ -154,6 +154,26 @@ def plane_of_surfels(y: float, half: float, spacing: float, sigma: float, **valu
     return surfels(np.stack([x, np.full_like(x, y), z], -1), [sigma, 0, 0], [0, 0, sigma], **values)
 
 
+@pytest.mark.parametrize("subpixels", [1, 4, 16])
+def test_small_surfels_count_by_their_area(subpixels: int) -> None:
+    """Stripes of coarse black and of fine white surfels, all smaller than the filter, are grey and opaque."""
+    stripes = []
+    for k in range(-20, 20):
+        spacing, white = (0.01, 1.0) if k % 2 else (0.05, 0.0)
+        across = 0.05 * k + np.arange(0, 0.05 - 1e-9, spacing) + spacing / 2
+        x, z = (a.ravel() for a in np.meshgrid(across, np.arange(-1, 1, spacing) + spacing / 2))
+        sigma = 0.8 * spacing
+        stripes.append(
+            surfels(np.stack([x, 0 * x, z], -1), [sigma, 0, 0], [0, 0, sigma], opacity=0.99, albedo=(white,) * 3)
+        )
+    camera = look_along_y(24, 24, focal=8 / subpixels**0.5, orthographic=True)
+    got = render(join(*stripes), camera, subpixels)
+    half = int(4 / subpixels**0.5)
+    inside = slice(12 - half, 12 + half)
+    assert got.alpha[inside, inside].min() > 0.99
+    assert abs(got.surface[inside, inside, :, 3].mean() - 0.5) < 0.04
+
+
 @pytest.mark.slow
 def test_a_front_edge_does_not_bleed_into_the_back_surface() -> None:
     camera = look_along_y(64, 64, distance=4)

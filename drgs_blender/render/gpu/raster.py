@@ -18,7 +18,7 @@ from ..sampling import ONE, ZERO, F
 from ..surfel_columns import ALBEDO, METALLIC, NORMAL, OPACITY, ROUGHNESS, SAMPLE, SIZE
 from ..surfels.blending import GAP, MIN_TRANSMITTANCE
 from ..surfels.raster import SurfelSamples, gaussian
-from ..surfels.splats import CUT, DIM, LOW, MAX_ALPHA, RX, RY, TILE, ZC, A, B, D, N, Splats
+from ..surfels.splats import CUT, DIM, LOW, MAX_ALPHA, RX, RY, SHARE, TILE, ZC, A, B, D, N, Splats
 
 #: Contributions that a thread gathers at once.
 MOST = 64
@@ -70,7 +70,7 @@ class PixelPosition(NamedTuple):
 
 
 def meet(screen: Any, i: Any, opacity: Any, near: Any, far: Any, x: Any, y: Any) -> Any:
-    """Strength (0 where it has no part) and depth of splat i at a place on the screen, as `raster._meet` has it."""
+    """Coverage, strength (0 where it has no part) and depth of splat i on the screen, as `raster._meet` has them."""
     big = F(1e30)
     ex, ey = x - screen[i, RX], y - screen[i, RY]
     inverse = ONE / (screen[i, N] + screen[i, N + 1] * ex + screen[i, N + 2] * ey)
@@ -82,8 +82,9 @@ def meet(screen: Any, i: Any, opacity: Any, near: Any, far: Any, x: Any, y: Any)
     q = exact if exact <= filtered else filtered
     depth = z if exact <= filtered else screen[i, ZC]
     if not (q < screen[i, CUT] and depth > near and depth < far):
-        return ZERO, depth
-    return min(opacity * gaussian(q), F(MAX_ALPHA)), depth
+        return ZERO, ZERO, depth
+    cover = min(opacity * gaussian(q), F(MAX_ALPHA))
+    return cover, cover if exact <= filtered else screen[i, SHARE] * cover, depth
 
 
 def insert(lists_z: Any, lists_a: Any, lists_i: Any, n: Any, z: Any, alpha: Any, splat: Any) -> None:
@@ -129,20 +130,20 @@ def gather(lists: Any, splats: Any, first: Any, last: Any, position: PixelPositi
     """List the nearest contributions of the entries first .. last of the tiles' list to a sample.
 
     `passed` is the light that is left, the depth and the splat behind which to look; how many there are, those left out
-    included.
+    included, and the transmittance by their coverage.
     """
     lists_z, lists_a, lists_i = lists
     screen, surface, box, nearest, _, _, tile_list = splats
     t, after, after_splat = passed
     stop = F(MIN_TRANSMITTANCE)
-    n, left, farthest = 0, t, F(-1e30)
+    n, left, clear, farthest = 0, t, ONE, F(-1e30)
     for entry in range(first, last):
         i = np.int64(tile_list[entry])
         if position.x < box[i, 0] or position.x >= box[i, 2] or position.y < box[i, 1] or position.y >= box[i, 3]:
             continue
         if left < stop and nearest[i] >= farthest:
             continue
-        alpha, z = meet(screen, i, surface[i, OPACITY], position.near, position.far, position.px, position.py)
+        cover, alpha, z = meet(screen, i, surface[i, OPACITY], position.near, position.far, position.px, position.py)
         if not alpha > ZERO or (left < stop and not z < farthest):
             continue
         if z < after or (z == after and i <= after_splat):
@@ -151,8 +152,9 @@ def gather(lists: Any, splats: Any, first: Any, last: Any, position: PixelPositi
             insert(lists_z, lists_a, lists_i, n, z, alpha, i)
         n += 1
         left = left * (ONE - alpha)
+        clear = clear * (ONE - cover)
         farthest = max(farthest, z)
-    return n
+    return n, clear
 
 
 def blend_samples(thread: Any, stride: Any, scratch: Any, splats: Any, p: Any, rows: Rows, out: Any) -> None:
@@ -180,12 +182,14 @@ def blend_samples(thread: Any, stride: Any, scratch: Any, splats: Any, p: Any, r
         jx, jy = lattice(shift_x, shift_y, number, p)
         for c in range(_SUMS):
             sums[0, c], sums[1, c] = ZERO, ZERO
-        t, before, before_size = ONE, ZERO, F(1e30)
+        t, clear, before, before_size = ONE, ONE, ZERO, F(1e30)
         after, after_splat = F(-1e30), np.int64(-1)
         position = PixelPosition(x, y, F(x + jx), F(y + jy), near, far)
         more: Any = True
         while more:
-            n = gather(lists, splats, tile_start[tile], tile_start[tile + 1], position, (t, after, after_splat))
+            first = after_splat < 0
+            n, among = gather(lists, splats, tile_start[tile], tile_start[tile + 1], position, (t, after, after_splat))
+            clear = among if first else clear
             k = 0
             while k < min(n, MOST) and t >= stop:
                 z, alpha, i = lists_z[k], lists_a[k], np.int64(lists_i[k])
@@ -206,7 +210,8 @@ def blend_samples(thread: Any, stride: Any, scratch: Any, splats: Any, p: Any, r
         nx, ny, nz = sums[1, _NORMAL], sums[1, _NORMAL + 1], sums[1, _NORMAL + 2]
         length = F(math.sqrt(nx * nx + ny * ny + nz * nz))
         f = ONE / length if length > F(1e-6) * total else ZERO
-        out_alpha[row, column, number], out_depth[row, column, number] = ONE - t, sums[1, _DEPTH] * g
+        out_alpha[row, column, number] = ONE - (t if t < stop else min(t, clear))
+        out_depth[row, column, number] = sums[1, _DEPTH] * g
         for c in range(3):
             out_surface[row, column, number, NORMAL + c] = f * sums[1, _NORMAL + c]
         for c in range(SAMPLE - ALBEDO):

@@ -40,6 +40,7 @@ from .splats import (
     RECORD,
     RX,
     RY,
+    SHARE,
     ZC,
     A,
     B,
@@ -312,7 +313,7 @@ def _project(first, last, posed, third, window, size, p, screen, box, nearest): 
     for i in range(first, last):
         if third[i, 0] == 0.0 and third[i, 1] == 0.0 and third[i, 2] == 0.0:
             project_surfel(i, posed, p, window, screen, box, nearest)
-            screen[i, DIM] = 0.0
+            screen[i, DIM], screen[i, SHARE] = 0.0, 1.0
         else:
             _project_ellipsoid(i, posed, third, p, window, size, screen, box, nearest)
 
@@ -354,7 +355,7 @@ def _project_ellipsoid(i, posed, third, p, window, size, screen, box, nearest): 
     # u^2 + v^2 is the quadratic form of the inverse covariance, by its Cholesky factor.
     screen[i, A + 1], screen[i, A + 2] = np.sqrt(yy / determinant), -xy / np.sqrt(yy * determinant)
     screen[i, B + 2] = 1.0 / np.sqrt(yy)
-    screen[i, N], screen[i, D] = 1.0, depth
+    screen[i, N], screen[i, D], screen[i, SHARE] = 1.0, depth, 1.0
     reach = filter_reach(p[FILTER])
     wide, high = np.sqrt(cut * xx) + reach, np.sqrt(cut * yy) + reach
     wx0, wy0, wx1, wy1 = window

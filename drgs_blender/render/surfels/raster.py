@@ -8,6 +8,11 @@ the surfel is seen (`splats.DIM` is -2 ln c): it weakens the filter of surfels e
 decides has the centre's depth. Alphas below 1/255 are skipped, others clamped to 0.99 and blended until the
 transmittance is below 1e-4.
 
+Surfels smaller than the filter. Where the low-pass decides, a surfel's weight in the means is its alpha times the part
+of the filter's area that it fills (`splats.SHARE`; Yu et al. 2024, "Mip-Splatting", equation 9): else many small
+surfels would count for more than the few large ones beside them, and the nearest would be all that is seen of a slope.
+Coverage is of the alphas without that part, so that no object fades with its distance.
+
 Order. Contributions are blended by the depth at which the ray meets them, not by that of the surfels' centres: every
 sample lists its contributions and sorts them once all are there. A list that is full is sorted early and cut where the
 sample is opaque, and only when that does not make room it grows; as 1/255 is the least strength, it stays short.
@@ -41,6 +46,7 @@ from .splats import (
     RECORD,
     RX,
     RY,
+    SHARE,
     TILE,
     ZC,
     A,
@@ -55,8 +61,9 @@ Array = np.ndarray
 __all__ = ["GAP", "SurfelSamples", "rasterise"]
 
 # Rows of the state of a block, `LANES` samples that vector code works on at a time: position; transmittance of all
-# contributions gathered and the depth of the farthest; strength and depth of the splat at hand.
-_X, _Y, _LEFT, _FARTHEST, _ALPHA, _DEPTH, _BLOCK = (np.uintp(LANES * k) for k in range(7))
+# contributions gathered, by weights and by coverage, and the depth of the farthest; strength and depth of the splat at
+# hand.
+_X, _Y, _LEFT, _CLEAR, _FARTHEST, _ALPHA, _DEPTH, _BLOCK = (np.uintp(LANES * k) for k in range(8))
 # Columns of a splat's record that are free on the screen: opacity and nearest depth.
 _STRENGTH, _NEAREST = RECORD - 2, RECORD - 1
 #: Contributions of a sample there is room for at first.
@@ -199,7 +206,7 @@ def _meet(screen, i, opacity, near, far, state, first, last):  # type: ignore[no
     """
     big, zero, one, stop = np.float32(1e30), np.float32(0.0), np.float32(1.0), np.float32(MIN_TRANSMITTANCE)
     rx, ry, zc = screen[i, RX], screen[i, RY], screen[i, ZC]
-    cut, low, dim = screen[i, CUT], screen[i, LOW], screen[i, DIM]
+    cut, low, dim, share = screen[i, CUT], screen[i, LOW], screen[i, DIM], screen[i, SHARE]
     a0, a1, a2 = screen[i, A], screen[i, A + 1], screen[i, A + 2]
     b0, b1, b2 = screen[i, B], screen[i, B + 1], screen[i, B + 2]
     n0, n1, n2 = screen[i, N], screen[i, N + 1], screen[i, N + 2]
@@ -221,10 +228,12 @@ def _meet(screen, i, opacity, near, far, state, first, last):  # type: ignore[no
         before, farthest = state[at + _LEFT], state[at + _FARTHEST]
         inside = (np.int32(j) >= first) & (np.int32(j) < last)
         seen = inside & (q < cut) & (z > near) & (z < far) & ((before >= stop) | (z < farthest))
-        alpha = min(opacity * gaussian(q), np.float32(MAX_ALPHA)) if seen else zero
+        cover = min(opacity * gaussian(q), np.float32(MAX_ALPHA)) if seen else zero
+        alpha = cover if take else share * cover
         state[at + _ALPHA] = alpha
         state[at + _DEPTH] = z
         state[at + _LEFT] = before * (one - alpha)
+        state[at + _CLEAR] = state[at + _CLEAR] * (one - cover)
         state[at + _FARTHEST] = z if seen & (z > farthest) else farthest
         hits = np.int32(hits + np.int32(seen))
     return hits
@@ -298,6 +307,7 @@ def _place(view, tile, y, first, state):  # type: ignore[no-untyped-def]
         k = np.uintp(lane)
         x = tile.x + (first + lane) // view.subpixels
         state[_X + k] = state[_Y + k] = state[_LEFT + k] = zero
+        state[_CLEAR + k] = np.float32(1.0)
         state[_FARTHEST + k] = np.float32(-1e30)
         if tile.left <= x < tile.right:
             shift_x, shift_y = pixel_shift(view.parameters, y * view.width + x)
@@ -341,8 +351,9 @@ def _gather(own, binned, begin, end, first, view, state, count, lists):  # type:
 
 
 @njit
-def _finish(own, lists, count, scratch, view, y, x, first, samples):  # type: ignore[no-untyped-def]
+def _finish(own, lists, count, scratch, view, y, x, first, state, samples):  # type: ignore[no-untyped-def]
     """Resolve the samples of a block and write them; y, x: row, and first column of the tile, of the samples."""
+    stop = np.float32(MIN_TRANSMITTANCE)
     for lane in range(LANES):
         n = np.int64(count[lane])
         if n == 0:
@@ -354,7 +365,9 @@ def _finish(own, lists, count, scratch, view, y, x, first, samples):  # type: ig
         values = mean(own.surface, lists, base, scratch, total, begin, end)
         for c in range(SAMPLE):
             samples.surface[y, column, k, c] = values[c]
-        samples.alpha[y, column, k] = np.float32(1.0) - t
+        # Of an opaque sample, not all contributions were gathered.
+        clear = t if t < stop else min(t, state[_CLEAR + np.uintp(lane)])
+        samples.alpha[y, column, k] = np.float32(1.0) - clear
         samples.depth[y, column, k] = depth * (np.float32(1.0) / total)
         samples.object_index[y, column, k] = own.object_index[owner]
 
@@ -421,4 +434,4 @@ def _blend(first_part, last_part, parts, splats, y0, y1, samples):  # type: igno
                 if most > lists.capacity // 2:
                     lists = widen(lists)
                     scratch = scratch_for(lists.capacity)
-            _finish(own, lists, count, scratch, view, y - y0, tile.x - x0, first, samples)
+            _finish(own, lists, count, scratch, view, y - y0, tile.x - x0, first, state, samples)

@@ -34,8 +34,10 @@ MIN_ALPHA, MAX_ALPHA = 1.0 / 255.0, 0.99
 # Columns of a splat's screen record. A_, B_, N_, D_: constant, x and y coefficients of u, v, denominator and depth; ZC:
 # depth of the centre; CUT: square radius at which a splat ends. The screen-space filter has the square radius
 # LOW d^2 + DIM, weakened by the cosine at which the surfel is seen: the many surfels edge-on along a silhouette would
-# else widen it.
-RX, RY, A, B, N, D, ZC, CUT, LOW, DIM, RECORD = 0, 1, 2, 5, 8, 11, 14, 15, 16, 17, 20
+# else widen it. SHARE: part of the filter's area that the surfel, seen face-on, fills.
+RX, RY, A, B, N, D, ZC, CUT, LOW, DIM, SHARE, RECORD = 0, 1, 2, 5, 8, 11, 14, 15, 16, 17, 18, 21
+#: Least `SHARE`: what has no area still has a material.
+LEAST_SHARE = 1e-4
 
 
 class Posed(NamedTuple):
@@ -304,6 +306,12 @@ def project_surfel(i, posed, p, window, screen, box, nearest):  # type: ignore[n
         screen[i, column] = 0.0
     screen[i, RX], screen[i, RY], screen[i, ZC], screen[i, CUT] = rx, ry, c[2], cut
     screen[i, LOW] = 2.0 * p[SUBPIXELS] if in_front else 1e30
+    screen[i, SHARE] = 1.0
+    if in_front:
+        scale = np.sqrt(2.0 * p[SUBPIXELS] * fx * fy) / (1.0 if ortho else c[2])
+        along_u = min(1.0, scale * np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2]))
+        along_v = min(1.0, scale * np.sqrt(b[0] * b[0] + b[1] * b[1] + b[2] * b[2]))
+        screen[i, SHARE] = max(along_u * along_v, LEAST_SHARE)
     if length <= 0.0:
         screen[i, A], screen[i, N], screen[i, D] = 1e15, 1.0, c[2]  # a point: only the low-pass sees it
     elif ortho:
