@@ -21,12 +21,13 @@ class Library(NamedTuple):
     purpose: str
 
 
-#: The table; versions as in the extra "capture" of pyproject.toml.
+#: The table; versions as in the extras "capture" and "masks" of pyproject.toml.
 LIBRARIES = {
     "pycolmap": Library("pycolmap", "pycolmap>=4.2,<4.3", "structure from motion"),
     "opencv": Library("cv2", "opencv-python-headless>=4.10", "marker sheets and masks"),
     "av": Library("av", "av>=14", "video"),
     "torch": Library("torch", "torch>=2.5", "masks"),
+    "onnxruntime": Library("onnxruntime", "onnxruntime>=1.20", "masks by a segmentation model"),
     "rawpy": Library("rawpy", "rawpy>=0.24", "camera raw files"),
 }
 

@@ -45,7 +45,7 @@ class Settings:
         Median distance of the cameras from the object, metres, where no sheet gives the scale.
     masks : str
         One of `masks.stage.MODES`: given: those that are there are used; auto: where there are none they are made;
-        none: neither.
+        none: neither. Or a segmentation model that makes them, see `masks.segmentation_model`.
     brackets : str
         Exposure brackets that are merged: "auto", by EXIF; a number, of so many files each; "none".
     """
@@ -306,5 +306,4 @@ def check_settings(settings: Settings) -> None:
     if settings.poses not in POSES:
         raise UsageError("poses", f"is {settings.poses!r}", f"Choose from {', '.join(POSES)}")
     brackets.check_setting(settings.brackets)
-    if settings.masks not in mask_stage.MODES:
-        raise UsageError("masks", f"is {settings.masks!r}", f"Choose from {', '.join(mask_stage.MODES)}")
+    mask_stage.check_mode(settings.masks)

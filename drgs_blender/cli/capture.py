@@ -69,10 +69,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--masks",
-        choices=("given", "auto", "none"),
         default="given",
+        metavar="HOW",
         help="given: use and check masks that are there (default); auto: make them where there are none, of an object "
-        "on a ground that shows texture, in about two minutes; none: neither make nor use any",
+        "on a ground that shows texture, in about two minutes; FILE.onnx, or a name: make them by this segmentation "
+        "model; none: neither make nor use any",
     )
 
 

@@ -111,9 +111,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--masks",
-        choices=("given", "auto", "none"),
+        metavar="HOW",
         help="given: use masks that are there (default); auto: make them where there are none, of an object on a "
-        "ground that shows texture; none: use none, the surroundings are learned, too",
+        "ground that shows texture; FILE.onnx, or a name: make them by this segmentation model; none: use none, the "
+        "surroundings are learned, too",
     )
     parser.add_argument(
         "--device",
@@ -155,9 +156,11 @@ def run(args: argparse.Namespace) -> int:
     check_writable(args.out, (args.capture,))
 
     reconstruct = reconstruction()
+    from ..capture.masks.stage import check_mode
     from ..reconstruct.readers import read_capture
     from ..reconstruct.settings_table import as_tables
 
+    check_mode(reading.masks)
     source = _with_cameras(args, reading.masks)
     capture = read_capture(source, reading.resolution, reading.test_every, reading.axes, reading.up)
     _mask(args, capture, reading.masks)

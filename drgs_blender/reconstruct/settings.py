@@ -25,16 +25,17 @@ class Reading:
         Convention of the camera matrices; "opengl" is that of the layout.
     up : {"z", "y", "-z", "-y"}, optional
         Up axis of the capture's world; None: found.
-    masks : {"given", "auto", "none"}
+    masks : str
         "given" uses masks that are there; "auto" makes them where there are none, of an object on a ground that shows
-        texture; "none" uses none, and the surroundings are learned, too.
+        texture; an ONNX file, or its name, makes them by this segmentation model; "none" uses none, and the
+        surroundings are learned, too.
     """
 
     resolution: Annotated[int | None, Range(8, 1 << 16)] = None
     test_every: Annotated[int | None, Range(2, 1_000_000)] = None
     axes: Literal["opengl", "opencv", "opengl-inverse", "opencv-inverse"] = "opengl"
     up: Literal["z", "y", "-z", "-y"] | None = None
-    masks: Literal["given", "auto", "none"] = "given"
+    masks: str = "given"
 
 
 @dataclass(frozen=True, slots=True)

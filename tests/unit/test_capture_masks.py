@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from drgs_blender.capture.masks import stage
+from drgs_blender.capture.masks import settling, stage
 from drgs_blender.capture.masks.hull import Hull
 from drgs_blender.capture.masks.hull_check import check_masks
 from drgs_blender.capture.masks.mask_view import MaskView
@@ -34,7 +34,7 @@ def cv2(monkeypatch):
     # small, for speed
     monkeypatch.setattr(making, "EFFORTS", (Effort(64, 150, 5000), Effort(96, 400, 6000)))
     monkeypatch.setattr(making, "PART", 150)
-    monkeypatch.setattr(stage, "_WHOLE", 160)
+    monkeypatch.setattr(settling, "_WHOLE", 160)
     return module
 
 
@@ -283,7 +283,7 @@ def test_replaced_masks_are_drawn_as_they_are_used(cv2, tmp_path, monkeypatch):
     found = making.Found(dict.fromkeys(range(10)), views, masks, Hull(cv2, views, masks, box, 48), None, None, box)
     monkeypatch.setattr(making, "find_masks", lambda *_: found)
     drawn = []
-    monkeypatch.setattr(making, "draw_contact_sheet", lambda path, views, masks, fits: drawn.append(list(masks)))
+    monkeypatch.setattr(settling, "draw_contact_sheet", lambda path, views, masks, fits: drawn.append(list(masks)))
     made, fits = making.make_masks(cv2, views, np.zeros((0, 3)), tmp_path, "set", lambda *_: None, lambda: False)
     assert made is found and fits[4].wrong and iou(made.masks[4], true[4]) > 0.75
     assert len(drawn) == 1 and np.array_equal(drawn[0][4], made.masks[4])

@@ -53,6 +53,8 @@ def another(row) -> object:
         return next(choice for choice in rule.choices if choice != row.default)
     if rule.type is bool:
         return not row.default
+    if rule.type is str:
+        return "a text"
     low, high = rule.range.low, min(rule.range.high, 1e6)
     values = [low, high, low + 2, 32]
     return next(v for v in (rule.type(value) for value in values) if v in rule.range and v != row.default)

@@ -14,17 +14,15 @@ from scipy.ndimage import binary_fill_holes, label
 
 from ...compute.prepare import PHASE, prepare_kernels
 from ...core.arrays import Array
-from ...core.errors import first_of
 from ...reconstruct.model.gaussians import Gaussians
 from ..features import Tell
-from .contact_sheet import draw_contact_sheet
 from .hull import Hull
-from .hull_check import Fit, check_masks
+from .hull_check import Fit
 from .learned_scene import Effort, learn_scene
 from .mask_view import MaskView
 from .object_box import ObjectBox, find_box
 from .object_surfels import Cut, box_around, cut_object, share_of_object
-from .stage import REMEDY
+from .settling import REMEDY, settle
 
 logger = logging.getLogger(__name__)
 
@@ -37,8 +35,6 @@ PART = 640
 _FEWEST_SURFELS, _FEWEST_VIEWS = 30, 4
 #: Parts of a mask smaller than this part of the largest are dropped, holes smaller than this part of it are filled.
 _SMALL, _PINHOLE = 0.01, 1e-3
-#: Part of the masks that may be doubtful; with more none are used.
-_DOUBTED = 0.25
 
 
 @dataclass(slots=True)
@@ -130,25 +126,8 @@ def make_masks(cv2: Any, views: Sequence[MaskView], points: Array, sheet: Path, 
     except NoMasks as why:
         logger.warning("%s: %s: no masks are made. %s", subject, why, REMEDY)
         return None, []
-    fits = check_masks(cv2, found.parts, found.masks, found.hull)
-    doubtful = [str(fit) for fit in fits if fit.doubtful]
-    if len(doubtful) > _DOUBTED * len(fits) or not found.hull.solid().any():
-        draw_contact_sheet(sheet, found.parts, found.masks, fits)
-        logger.warning(
-            "%s: of %d masks that were made %d do not fit the others (%s): none are used. They are drawn in %s. %s",
-            subject, len(fits), len(doubtful), first_of(doubtful), sheet.name, REMEDY,
-        )  # fmt: skip
-        return None, fits
-    replaced = []
-    for index, fit in enumerate(fits):
-        if fit.wrong:  # the others know better
-            found.masks[index] = found.hull.seen_by(found.parts[index], found.hull.solid(without=index))
-            replaced.append(str(fit))
-    draw_contact_sheet(sheet, found.parts, found.masks, fits)
-    if replaced:
-        logger.warning("%s: masks that do not fit the others are replaced by these' hull: %s", subject,
-                       first_of(replaced))  # fmt: skip
-    return found, fits
+    fit, fits = settle(cv2, found.parts, found.masks, found.hull, sheet, subject)
+    return found if fit else None, fits
 
 
 def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,

@@ -20,21 +20,24 @@ from ..registration import Registration
 from ..world_alignment import GUESSED, LOWEST, PLANE, align_to_ground
 from .making import make_masks
 from .mask_view import MaskView
-from .stage import GROUND_IS_GUESSED, NO_GROUND, ONLY_SOME, REMEDY
+from .segmentation_model import SegmentationModel, masks_by_model
+from .settling import REMEDY
+from .stage import GROUND_IS_GUESSED, MODEL_UNUSED, MODES, NO_GROUND, ONLY_SOME
 
 logger = logging.getLogger(__name__)
 
 
 def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled: Callable[[], bool]) -> None:
-    """Give the views masks where none has one ("auto"), or take theirs away ("none"), in place.
+    """Give the views masks where none has one ("auto", or a model), or take theirs away ("none"), in place.
 
-    Masks are learned from training views alone; views left out get those of what is learned, as they see it.
+    Masks are learned from training views alone; views left out get those of what is learned, as they see it. A model
+    makes those of all views.
 
     Parameters
     ----------
     capture : Capture
     mode : str
-        One of `stage.MODES`.
+        One of `stage.MODES`, or a segmentation model.
     sheet : Path
         Contact sheet to write where masks are made.
     tell, cancelled : callable
@@ -50,9 +53,13 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
             view.mask = None
         capture.background = None
         return
-    if mode != "auto" or have_silhouettes(capture):
-        return
     subject = str(capture.source)
+    if mode == "given":
+        return
+    if have_silhouettes(capture):
+        if mode not in MODES:
+            logger.warning(MODEL_UNUSED, subject, mode)
+        return
     if masked := sum(view.mask is not None for view in capture.training):
         logger.warning(ONLY_SOME, subject, masked, len(capture.training))
         return
@@ -60,6 +67,9 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
         cv2: Any = libraries.load("opencv")
     except DeviceError as error:
         logger.warning("%s: masks are not made: %s", subject, error)
+        return
+    if mode not in MODES:
+        _by_model(SegmentationModel(mode), capture, cv2, sheet, tell, cancelled)
         return
     points = np.zeros((0, 3)) if capture.points is None else np.asarray(capture.points, np.float64)
     matrices = {view.name: np.asarray(view.camera.matrix_world, np.float64) for view in capture.views}
@@ -80,6 +90,15 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
     for view in capture.testing:
         if view.mask is None:
             view.mask = made.seen_by(cv2, _mask_view(view, found.matrices[view.name])).astype(np.float32) / 255
+
+
+def _by_model(model: SegmentationModel, capture: Capture, cv2: Any, sheet: Path, tell: Tell,
+              cancelled: Callable[[], bool]) -> None:  # fmt: skip
+    """Masks of all views by a model, where they fit each other."""
+    views = [_mask_view(view, np.asarray(view.camera.matrix_world, np.float64)) for view in capture.views]
+    masks, _ = masks_by_model(model, cv2, views, sheet, str(capture.source), tell, cancelled)
+    for view, mask in zip(capture.views, masks or (), strict=masks is not None):
+        view.mask = mask.astype(np.float32) / 255
 
 
 def _to_ground(found: Registration, source: Path) -> str | None:

@@ -19,19 +19,18 @@ from .. import libraries
 from ..features import Tell
 from ..pictures import Picture
 from ..registration import Registration
-from ..world_alignment import GUESSED, LOWEST, look_at
+from ..world_alignment import GUESSED, LOWEST
 from .contact_sheet import draw_contact_sheet
-from .hull import Hull
 from .hull_check import Fit, check_masks
 from .mask_view import MaskView
-from .object_box import ObjectBox
+from .segmentation_model import SegmentationModel, check_model, masks_by_model
+from .settling import REMEDY, hull_of_masks, resized, whole
 
 logger = logging.getLogger(__name__)
 
-#: given: masks that are there are used; auto: where no picture has one they are made; none: neither.
+#: given: masks that are there are used; auto: where no picture has one they are made; none: neither. Any other mode is
+#: a segmentation model, by which they are made.
 MODES = ("given", "auto", "none")
-#: Pixels of the longer side at which given masks are checked.
-_WHOLE = 560
 CONTACT_SHEET = "masks.png"
 NO_GROUND = (
     "%s: the plane on which the object stands is not known (no sparse points on it, nor a marker sheet): no masks are "
@@ -41,8 +40,8 @@ GROUND_IS_GUESSED = (
     "%s: masks are made above the lowest points, as the plane on which the object stands is not found: they may hold "
     "parts of it, or lack the object's foot. Look at %s"
 )
-REMEDY = "Draw the masks by hand (white on the object, folder masks), or give --masks none"
 ONLY_SOME = "%s: %d of %d pictures have masks: no others are made. Draw all, or remove these"
+MODEL_UNUSED = "%s: the pictures have masks: %s is not used. Remove them to use it"
 
 
 @dataclass(slots=True)
@@ -51,6 +50,13 @@ class Masked:
 
     fits: list[Fit] = field(default_factory=list)
     lines: list[str] = field(default_factory=list)
+
+
+def check_mode(mode: str) -> None:
+    """Raise an error where `mode` is neither one of `MODES` nor a segmentation model that can be loaded."""
+    check_model(mode, MODES)
+    if mode not in MODES:
+        SegmentationModel(mode)
 
 
 def mode_on_ground(mode: str, given: Path | None, ground: str, subject: str) -> str:
@@ -84,7 +90,7 @@ def make_or_check(mode: str, found: Registration, by_file: dict[str, Picture], c
     Parameters
     ----------
     mode : str
-        One of `MODES`.
+        One of `MODES`, or a segmentation model.
     found : Registration
         Z up, ground at 0.
     by_file : dict of str to Picture
@@ -104,7 +110,7 @@ def make_or_check(mode: str, found: Registration, by_file: dict[str, Picture], c
     Raises
     ------
     AssetError
-        A given mask does not fit the others.
+        A given mask does not fit the others, or a model makes no masks.
     Cancelled
         `cancelled` said so.
     """
@@ -120,10 +126,27 @@ def make_or_check(mode: str, found: Registration, by_file: dict[str, Picture], c
     views = [_view(file, by_file[file], found, copies) for file in files]
     if given is not None:
         there = sum((given / f"{file}.png").is_file() for file in files)
-        if mode == "auto" and there < len(files):
+        if mode != "given" and there < len(files):
             logger.warning(ONLY_SOME, subject, there, len(files))
+        elif mode not in MODES:
+            logger.warning(MODEL_UNUSED, subject, mode)
         return _check_given(cv2, views, files, given, sheet, subject)
-    return _make(cv2, views, files, by_file, work, sheet, found, subject, tell, cancelled)
+    pictures = [by_file[file] for file in files]
+    if mode in MODES:
+        drawn, fits = _learned(cv2, views, pictures, sheet, found, subject, tell, cancelled)
+    else:
+        drawn, fits = masks_by_model(SegmentationModel(mode), cv2, views, sheet, subject, tell, cancelled)
+    if drawn is None:
+        return Masked(fits, ["masks: none, those that were made do not fit each other" if fits else
+                             "masks: none could be made"])  # fmt: skip
+    work.mkdir(parents=True, exist_ok=True)
+    for file, picture, mask in zip(files, pictures, drawn, strict=True):
+        picture.mask = work / f"{file}.png"
+        large = Pillow.fromarray(mask).resize(picture.size, Pillow.Resampling.BILINEAR)
+        replace_by(picture.mask, partial(large.save, format="PNG"))
+    doubtful = [str(fit) for fit in fits if fit.doubtful and not fit.wrong]
+    lines = [f"masks: made for {len(views)} pictures; look at {sheet.name}"]
+    return Masked(fits, lines + _doubts(doubtful, subject, sheet))
 
 
 def _view(file: str, picture: Picture, found: Registration, copies: Path) -> MaskView:
@@ -133,34 +156,20 @@ def _view(file: str, picture: Picture, found: Registration, copies: Path) -> Mas
     return MaskView(picture.path.name, pixels, found.matrices[file], lens)
 
 
-def _whole(view: MaskView) -> MaskView:
-    height, width = view.shape
-    return view.cropped((0, 0, width, height), min(_WHOLE, max(width, height)))
-
-
-def _make(cv2: Any, views: list[MaskView], files: list[str], by_file: dict[str, Picture], work: Path, sheet: Path,
-          found: Registration, subject: str, tell: Tell, cancelled: Callable[[], bool]) -> Masked:  # fmt: skip
+def _learned(cv2: Any, views: list[MaskView], pictures: list[Picture], sheet: Path, found: Registration, subject: str,
+             tell: Tell, cancelled: Callable[[], bool]) -> tuple[list[Array] | None, list[Fit]]:  # fmt: skip
     """Masks of the learned object; none, with a warning, where no object is found or they do not fit together."""
     try:
         libraries.load("torch")
     except DeviceError as error:
         logger.warning("%s: masks are not made: %s", subject, error)
-        return Masked()
+        return None, []
     from .making import make_masks  # with torch
 
     made, fits = make_masks(cv2, views, found.points, sheet, subject, tell, cancelled)
     if made is None:
-        return Masked(fits, ["masks: none, those that were made do not fit each other" if fits else
-                             "masks: none could be made"])  # fmt: skip
-    work.mkdir(parents=True, exist_ok=True)
-    for k, (file, view) in enumerate(zip(files, views, strict=True)):
-        picture = by_file[file]
-        drawn = Pillow.fromarray(made.whole(k, view.shape, picture.size))
-        picture.mask = work / f"{file}.png"
-        replace_by(picture.mask, partial(drawn.save, format="PNG"))
-    doubtful = [str(fit) for fit in fits if fit.doubtful and not fit.wrong]
-    lines = [f"masks: made for {len(views)} pictures; look at {sheet.name}"]
-    return Masked(fits, lines + _doubts(doubtful, subject, sheet))
+        return None, fits
+    return [made.whole(k, view.shape, pictures[k].size) for k, view in enumerate(views)], fits
 
 
 def _doubts(doubtful: list[str], subject: str, sheet: Path) -> list[str]:
@@ -178,11 +187,10 @@ def _check_given(cv2: Any, views: list[MaskView], files: list[str], given: Path,
         path = given / f"{file}.png"
         if not path.is_file():
             continue
-        small = _whole(view)
+        small = whole(view)
         with Pillow.open(path) as image:
-            resized = image.convert("L").resize(small.shape[::-1], Pillow.Resampling.BILINEAR)
+            masks.append(resized(np.asarray(image.convert("L")), small))
         parts.append(small)
-        masks.append(np.asarray(resized) > 127)
     if len(parts) < 4:
         logger.warning("%s: only %d masks are there: they cannot be checked", subject, len(parts))
         return Masked()
@@ -211,17 +219,5 @@ def check_given(cv2: Any, views: list[MaskView], masks: list[Array]) -> list[Fit
     views : list of MaskView
     masks : list of (h, w) bool arrays
     """
-    box = _box_of_masks(views)
-    for _ in range(2):  # around what the cameras look at, then around the hull
-        hull = Hull(cv2, views, masks, box)
-        if not hull.solid().any():
-            return []
-        box = hull.box(box, grounded=False)
-    return check_masks(cv2, views, masks, Hull(cv2, views, masks, box))
-
-
-def _box_of_masks(views: list[MaskView]) -> ObjectBox:
-    """A cube around what the cameras look at, as large as their nearest distance from it."""
-    target = look_at(np.stack([view.matrix for view in views]))
-    near = 0.7 * min(float(np.linalg.norm(view.centre - target)) for view in views)
-    return ObjectBox(target - near, target + near, np.zeros((0, 3)))
+    hull = hull_of_masks(cv2, views, masks)
+    return [] if hull is None else check_masks(cv2, views, masks, hull)

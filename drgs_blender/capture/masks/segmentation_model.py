@@ -1,0 +1,235 @@
+"""Masks by a segmentation model that the user has: an ONNX file, by path or by the name that rembg gives it.
+
+Nothing is downloaded. Pictures are prepared as the program that published a model does it (`KNOWN`).
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import Image as Pillow
+
+from ...core.arrays import Array
+from ...core.errors import AssetError, Cancelled, UsageError, first_of
+from .. import libraries
+from ..features import Tell
+from .hull_check import Fit
+from .mask_view import MaskView
+from .settling import REMEDY, hull_of_masks, resized, settle, whole
+
+logger = logging.getLogger(__name__)
+
+_IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+class Preparation(NamedTuple):
+    """How a model wants its pictures: side, pixels, where its input leaves it open; mean and deviation of channels."""
+
+    side: int
+    mean: tuple[float, float, float]
+    deviation: tuple[float, float, float]
+
+
+#: Beginning of a file's name -> how pictures are prepared (of rembg 2.0.76, MIT, and of the models' own programs); the
+#: longest that fits counts, the last is for all others.
+KNOWN = {
+    "u2net": Preparation(320, *_IMAGENET),
+    "silueta": Preparation(320, *_IMAGENET),
+    "isnet": Preparation(1024, _IMAGENET[0], (1.0, 1.0, 1.0)),
+    "birefnet": Preparation(1024, *_IMAGENET),
+    "bria-rmbg": Preparation(1024, *_IMAGENET),
+    "rmbg-1.4": Preparation(1024, (0.5, 0.5, 0.5), (1.0, 1.0, 1.0)),
+    "": Preparation(1024, *_IMAGENET),
+}
+#: A model whose largest value is below it sees nothing.
+_NOTHING = 0.1
+
+
+def find_model(given: str) -> Path | None:
+    """The file of a model, by its path or by its name in rembg's folder; None where there is none.
+
+    Parameters
+    ----------
+    given : str
+        As in "models/mine.onnx" or "isnet-general-use".
+    """
+    for path in (Path(given), _home() / given, _home() / f"{given}.onnx"):
+        if path.is_file():
+            return path
+    return None
+
+
+def _home() -> Path:
+    """The folder of rembg's models."""
+    return Path(os.environ.get("U2NET_HOME") or Path.home() / ".u2net")
+
+
+def check_model(given: str, modes: tuple[str, ...]) -> None:
+    """Raise UsageError where `given` is neither one of the `modes` nor a model that is there."""
+    if given in modes or find_model(given):
+        return
+    raise UsageError(
+        "masks",
+        f"is {given!r}: no file of that name, nor a model in {_home()}",
+        f"Choose from {', '.join(modes)}, or give a segmentation model in ONNX format",
+    )
+
+
+class SegmentationModel:
+    """A model that tells the object of a picture from all else.
+
+    Parameters
+    ----------
+    given : str
+        As of `find_model`.
+
+    Raises
+    ------
+    AssetError
+        The file is no such model.
+    DeviceError
+        ONNX Runtime is not installed.
+    UsageError
+        There is no such file.
+    """
+
+    def __init__(self, given: str) -> None:
+        path = find_model(given)
+        if path is None:
+            check_model(given, ())
+        assert path is not None
+        self.path = path
+        runtime: Any = libraries.load("onnxruntime")
+        options = runtime.SessionOptions()
+        options.log_severity_level = 4  # its errors arrive as exceptions
+        try:
+            self._session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # of ONNX Runtime's own kinds
+            raise AssetError(str(path), f"is no model that ONNX Runtime reads ({_first_line(error)})",
+                             "Export it again as ONNX") from error  # fmt: skip
+        inputs = self._session.get_inputs()
+        shape = inputs[0].shape if inputs else []
+        if len(inputs) != 1 or len(shape) != 4 or shape[1] != 3 or inputs[0].type != "tensor(float)":
+            raise AssetError(
+                str(path), f"takes {', '.join(f'{one.name} {one.type} {one.shape}' for one in inputs)}",
+                "A segmentation model takes one picture: floats of the shape (1, 3, height, width)",
+            )  # fmt: skip
+        name = path.stem.lower()
+        known = max((start for start in KNOWN if name.startswith(start)), key=len)
+        self._input, self._preparation = inputs[0].name, KNOWN[known]
+        sides = [side if isinstance(side, int) and side > 0 else self._preparation.side for side in shape[2:]]
+        self._size = sides[1], sides[0]
+        if not known:
+            logger.warning(
+                "%s: is none of the models known by name (%s): pictures are prepared by ImageNet's mean and deviation, "
+                "%d x %d", path, ", ".join(filter(None, KNOWN)), *self._size,
+            )  # fmt: skip
+
+    def __call__(self, pixels: Array, subject: str) -> Array:
+        """How sure the model is of the object, in [0, 1].
+
+        Parameters
+        ----------
+        pixels : (h, w, 3) uint8 array
+            sRGB.
+        subject : str
+            Of the picture, for messages.
+
+        Returns
+        -------
+        (h, w) float32 array
+
+        Raises
+        ------
+        AssetError
+            What the model gives is no mask.
+        """
+        height, width = pixels.shape[:2]
+        small = Pillow.fromarray(pixels).resize(self._size, Pillow.Resampling.LANCZOS)
+        values = np.asarray(small, np.float32) / max(int(pixels.max()), 1)
+        _, mean, deviation = self._preparation
+        given = ((values - np.asarray(mean, np.float32)) / np.asarray(deviation, np.float32)).transpose(2, 0, 1)[None]
+        try:
+            found = np.asarray(self._session.run(None, {self._input: given})[0], np.float32)
+        except Exception as error:
+            raise AssetError(str(self.path), f"fails on {subject} ({_first_line(error)})",
+                             "Check that it is a segmentation model") from error  # fmt: skip
+        if found.ndim not in (3, 4) or found.shape[0] != 1 or found.size != found.shape[-1] * found.shape[-2]:
+            raise AssetError(str(self.path), f"gives values of the shape {found.shape}",
+                             "A segmentation model gives one mask: (1, 1, height, width)")  # fmt: skip
+        found = found.reshape(found.shape[-2:])
+        if not np.isfinite(found).all():
+            raise AssetError(str(self.path), f"gives NaN or infinity for {subject}", "Use another model")
+        low, high = float(found.min()), float(found.max())
+        if low < 0 or high > 1:  # logits
+            found = (1 / (1 + np.exp(-np.clip(found, -40, 40)))).astype(np.float32)
+            low, high = float(found.min()), float(found.max())
+        if high < _NOTHING or high <= low:
+            return np.full((height, width), high > 0.5, np.float32)
+        whole = Pillow.fromarray((found - low) / (high - low)).resize((width, height), Pillow.Resampling.BILINEAR)
+        return np.asarray(whole)
+
+
+def masks_by_model(model: SegmentationModel, cv2: Any, views: Sequence[MaskView], sheet: Path, subject: str, tell: Tell,
+                   cancelled: Callable[[], bool]) -> tuple[list[Array] | None, list[Fit]]:  # fmt: skip
+    """Masks that a segmentation model makes, held against each other.
+
+    Parameters
+    ----------
+    model : SegmentationModel
+    cv2 : module
+        OpenCV.
+    views : sequence of MaskView
+    sheet : Path
+        Contact sheet to write.
+    subject : str
+        For messages.
+    tell, cancelled : callable
+
+    Returns
+    -------
+    masks : list of (h, w) uint8 arrays, optional
+        In the size of the views; None, with a warning, where they do not fit each other.
+    fits : list of Fit
+
+    Raises
+    ------
+    AssetError
+        The model fails on a picture.
+    Cancelled
+        `cancelled` said so.
+    """
+    drawn = []
+    for k, view in enumerate(views):
+        tell("masks", k / len(views))
+        if cancelled():
+            raise Cancelled
+        drawn.append((model(view.pixels, view.name) * 255 + 0.5).astype(np.uint8))
+    if nothing := [view.name for view, mask in zip(views, drawn, strict=True) if mask.max() < 128]:
+        logger.warning(
+            "%s: %s finds no object in %s: these masks are empty", subject, model.path.name, first_of(nothing)
+        )
+    small = [whole(view) for view in views]
+    masks = [resized(mask, view) for mask, view in zip(drawn, small, strict=True)]
+    hull = hull_of_masks(cv2, small, masks)
+    if hull is None:
+        logger.warning("%s: the masks of %s have no part of the space in common: none are used. %s", subject,
+                       model.path.name, REMEDY)  # fmt: skip
+        return None, []
+    settled = list(masks)
+    fit, fits = settle(cv2, small, settled, hull, sheet, subject)
+    for k, (old, new) in enumerate(zip(masks, settled, strict=True)):
+        if new is not old:
+            height, width = views[k].shape
+            outline = Pillow.fromarray(new.astype(np.uint8) * 255)
+            drawn[k] = np.asarray(outline.resize((width, height), Pillow.Resampling.BILINEAR))
+    return drawn if fit else None, fits
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
