@@ -16,7 +16,7 @@ from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.engine import jit_events
 from drgs_blender.engine.session import Session
 
-#: dB between devices. On a card last bits decide which of the surfels of one flat face comes first, for these lie at one
+#: dB between devices. On a card last bits decide which of the surfels of one flat face comes first, as these lie at one
 #: depth; the coarse ball of these tests has few faces, each with many surfels of unlike materials.
 LIKE = 35.0 if IS_CARD else 60.0
 
