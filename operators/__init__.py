@@ -11,6 +11,7 @@ from . import (
     bind_cage,
     bind_lattice,
     bind_rig,
+    capture_cameras,
     compositing,
     convert,
     engine,
@@ -36,6 +37,7 @@ MODULES = (
     import_asset,
     import_parts,
     reconstruct,
+    capture_cameras,
     export,
     convert,
     splats,
@@ -65,6 +67,7 @@ def _file_import(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
     menu.layout.operator("import_scene.drgs", text="DR-GS asset (.drgs)")
     menu.layout.operator("drgs.import_parts", text="DR-GS asset from splats and mesh")
     menu.layout.operator("drgs.reconstruct", text="DR-GS asset from photographs")
+    menu.layout.operator("drgs.import_cameras", text="Cameras of photographs")
 
 
 def _file_export(menu: bpy.types.Menu, context: bpy.types.Context) -> None:

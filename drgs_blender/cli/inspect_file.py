@@ -1,4 +1,4 @@
-"""Say what a file holds: a .drgs asset, a mesh, surfels or splats, an environment, or a rendered EXR frame.
+"""Say what a file holds: a .drgs asset, a mesh, surfels or splats, an environment, a rendered EXR frame, a capture.
 
 The kind is found from the content, not from the name.
 """
@@ -21,6 +21,7 @@ EXAMPLES = """examples:
   drgs inspect helmet.drgs
   drgs inspect capture.ply --json
   drgs inspect frames/0001.exr
+  drgs inspect statue --json > cameras.json
 """
 
 _ZIP = b"PK\x03\x04"
@@ -67,10 +68,57 @@ def inspect_file(path: Path) -> dict[str, Any]:
 
     if path.suffix.lower() == SUFFIX:
         return inspect_exported_frame(path)
+    if is_capture(path):
+        return inspect_capture(path)
     from ..formats.registry import find_format, read
 
     kind = find_format(path)
     return {"kind": kind.kind, "format": kind.name, **describe(read(path))}
+
+
+def is_capture(path: Path) -> bool:
+    """Whether a folder or JSON file is a capture: photographs with cameras."""
+    if not path.is_dir() and path.suffix.lower() != ".json":
+        return False
+    from ..reconstruct.readers import find_layout
+
+    try:
+        find_layout(path)
+    except AssetError:
+        return False
+    return True
+
+
+def inspect_capture(path: Path) -> dict[str, Any]:
+    """Describe a capture and the camera of each photograph: Blender's axes, Z up, metres, pixels."""
+    from ..reconstruct.readers import find_layout, read_layout
+    from ..reconstruct.readers.layout import picture_size
+
+    layout, _ = read_layout(path)
+    lenses = [one.lens.scaled(*picture_size(one.image)) for one in layout.photographs]
+    cameras = [
+        {
+            "name": one.name,
+            "image": str(one.image.absolute()),
+            "mask": None if one.mask is None else str(one.mask.absolute()),
+            "test": one.test,
+            "matrix_world": one.matrix.tolist(),
+            **{name: getattr(lens, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "model")},
+            "distorts": lens.distorts,
+            "coefficients": list(lens.coefficients),
+        }
+        for one, lens in zip(layout.photographs, lenses, strict=True)
+    ]
+    return {
+        "kind": "capture",
+        "format": find_layout(path).name,
+        "photographs": len(cameras),
+        "left_out": sum(one["test"] for one in cameras),
+        "masks": sum(one["mask"] is not None for one in cameras),
+        "points": 0 if layout.points is None else len(layout.points),
+        "guessed": layout.guessed,
+        "cameras": describe(cameras),
+    }
 
 
 def inspect_exported_frame(path: Path) -> dict[str, Any]:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import pickle
 from dataclasses import replace
+from pathlib import Path
 
 import captures
 import numpy as np
 import pytest
 from PIL import Image
 
+from drgs_blender.cli.main import main
 from drgs_blender.core.errors import AssetError, UsageError
 from drgs_blender.reconstruct.readers import BYTES_A_PIXEL, read_capture
 from drgs_blender.reconstruct.readers.lens import MODELS, Lens, distort, lens_of, resample, undistorted
@@ -48,6 +50,21 @@ def test_every_layout_gives_the_cameras_and_pixels_it_was_written_from(tmp_path,
     rgba = layout in ("nerf", "tensoir")
     assert capture.background == ((1.0, 1.0, 1.0) if rgba else (0.0, 0.0, 0.0))
     assert all(np.allclose(view.colour[view.mask == 0], capture.background) for view in capture.views)
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_inspect_says_where_photographs_were_taken(tmp_path, capsys, layout):
+    scene = captures.make(tmp_path / "capture")
+    WRITERS[layout](scene)
+    assert main(["inspect", str(scene.folder), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    capture = read_capture(scene.folder)
+    assert said["kind"] == "capture" and said["photographs"] == len(capture.views) == len(scene.cameras)
+    assert said["left_out"] == sum(view.test for view in capture.views)
+    for camera, view in zip(said["cameras"], capture.views, strict=True):
+        assert Path(camera["image"]).is_file() and camera["name"] == view.name
+        np.testing.assert_allclose(camera["matrix_world"], view.camera.matrix_world, atol=1e-9)
+        assert (camera["width"], camera["fx"]) == (view.camera.width, pytest.approx(view.camera.fx))
 
 
 def test_a_set_made_for_learning_and_one_for_testing(tmp_path, caplog):

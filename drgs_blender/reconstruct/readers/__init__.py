@@ -98,14 +98,8 @@ def read_capture(
     """
     path = Path(path)
     _check_parameters(resolution, test_every, axes, up)
-    reader = find_layout(path)
-    layout = reader.read(path, light) if reader.lights else reader.read(path)
-    photographs = sorted(layout.photographs, key=lambda photograph: _natural(photograph.name))
-    matrices = np.stack([AXES[axes](photograph.matrix) for photograph in photographs])
-    check_positions(matrices, str(path), axes)
-    turn = _turn(layout, matrices, axes, up)
-    for photograph, matrix in zip(photographs, matrices):
-        photograph.matrix = turn @ matrix
+    layout, turn = read_layout(path, axes, up, light)
+    photographs = layout.photographs
     _check_memory(layout, resolution, path)
     _tell_guesses(layout, path, up)
     known: dict[Lens, tuple[Lens, np.ndarray]] = {}
@@ -129,6 +123,41 @@ def read_capture(
         check_overlap(learned, str(path))
     points = None if layout.points is None else (layout.points @ turn[:3, :3].T).astype(np.float32)
     return Capture(path, views, find_background(views), points)
+
+
+def read_layout(
+    path: Path, axes: str = "opengl", up: str | None = None, light: str | None = None
+) -> tuple[Layout, np.ndarray]:
+    """Where the photographs of a capture were taken, without their pixels.
+
+    Parameters
+    ----------
+    path : Path
+    axes : str
+    up, light : str, optional
+        As of `read_capture`.
+
+    Returns
+    -------
+    layout : Layout
+        Photographs in the order of their names; their matrices are of a world with Z up, its points of the capture's.
+    turn : (4, 4) float64 array
+        From the capture's world to that with Z up.
+
+    Raises
+    ------
+    AssetError
+        Nothing is recognised, or cameras are impossible.
+    """
+    reader = find_layout(path)
+    layout = reader.read(path, light) if reader.lights else reader.read(path)
+    layout.photographs.sort(key=lambda photograph: _natural(photograph.name))
+    matrices = np.stack([AXES[axes](photograph.matrix) for photograph in layout.photographs])
+    check_positions(matrices, str(path), axes)
+    turn = _turn(layout, matrices, axes, up)
+    for photograph, matrix in zip(layout.photographs, matrices):
+        photograph.matrix = turn @ matrix
+    return layout, turn
 
 
 def _tell_guesses(layout: Layout, path: Path, up: str | None) -> None:

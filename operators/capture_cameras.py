@@ -1,0 +1,113 @@
+"""File > Import > Cameras of photographs: one looks through each with its photograph behind the scene."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from bpy.props import BoolProperty, FloatProperty, StringProperty
+from mathutils import Matrix
+
+from ..addon import engine_link
+from ..drgs_blender.core.errors import AssetError, first_of
+from .base import DrgsOperator
+
+#: Width of the sensor that the cameras get, mm: that of full frame.
+_SENSOR = 36.0
+#: Size of the cameras in the viewport, in parts of their median distance from the world's origin.
+_DISPLAY = 0.06
+#: Difference of fx and fy beyond which pixels are told not to be square.
+_SQUARE = 0.005
+
+
+class DRGS_OT_import_cameras(DrgsOperator, bpy.types.Operator):
+    """Add the cameras of a capture (COLMAP, NeRF, nerfstudio, drgs capture), each with its photograph as background"""
+
+    bl_idname = "drgs.import_cameras"
+    bl_label = "Import Cameras of Photographs"
+    bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
+
+    filepath: StringProperty(
+        description="Folder of the capture, or its transforms.json", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
+    filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    filter_glob: StringProperty(default="*.json", options={"HIDDEN"})
+    use_pictures: BoolProperty(
+        name="Photographs", description="Show each photograph behind the scene in its camera's view", default=True
+    )
+    opacity: FloatProperty(name="Opacity", description="Of the photographs", default=0.5, min=0.0, max=1.0)
+    use_resolution: BoolProperty(
+        name="Set Resolution", description="Give the scene the resolution of most photographs", default=True
+    )
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        path = Path(bpy.path.abspath(self.chosen("Import Cameras"))).absolute()
+        found = json.loads(engine_link.output_of(["inspect", str(path), "--json"]))
+        if found.get("kind") != "capture":
+            raise AssetError(str(path), f"is no capture, but {found.get('kind')}", "Choose photographs with cameras")
+        cameras = found["cameras"]
+        into = bpy.data.collections.new(f"Cameras of {path.parent.name if path.is_file() else path.name}")
+        context.scene.collection.children.link(into)
+        distances = [float(np.linalg.norm(np.array(one["matrix_world"])[:3, 3])) for one in cameras]
+        made = [_camera(one, _DISPLAY * float(np.median(distances))) for one in cameras]
+        for obj in made:
+            into.objects.link(obj)
+        missing = [name for one, obj in zip(cameras, made) if (name := self._show(one, obj.data))]
+        context.scene.camera = made[0]
+        if self.use_resolution:
+            (size, _), = Counter((one["width"], one["height"]) for one in cameras).most_common(1)  # fmt: skip
+            context.scene.render.resolution_x, context.scene.render.resolution_y = size
+            context.scene.render.resolution_percentage = 100
+        self._tell(path, cameras, missing)
+        return {"FINISHED"}
+
+    def _show(self, camera: dict[str, Any], data: bpy.types.Camera) -> str:
+        """Put the photograph behind the camera's view; the name of one that cannot be loaded, else ""."""
+        if not self.use_pictures:
+            return ""
+        try:
+            image = bpy.data.images.load(camera["image"], check_existing=True)
+        except RuntimeError:
+            return Path(camera["image"]).name
+        background = data.background_images.new()
+        background.image, background.alpha, background.frame_method = image, self.opacity, "FIT"
+        data.show_background_images = True
+        return ""
+
+    def _tell(self, path: Path, cameras: list[dict[str, Any]], missing: list[str]) -> None:
+        """Warn of what Blender's cameras cannot show."""
+        if missing:
+            self.warn(f"{path}: {len(missing)} photographs cannot be loaded: {first_of(missing)}")
+        if bent := [one["name"] for one in cameras if one["distorts"]]:
+            self.warn(
+                f"{path}: the lenses of {len(bent)} photographs distort, Blender's cameras do not: towards the edges "
+                f"photographs and scene differ ({first_of(bent)})"
+            )
+        if oblong := [one["name"] for one in cameras if abs(one["fx"] / one["fy"] - 1) > _SQUARE]:
+            self.warn(f"{path}: pixels are not square, and shown so, of {first_of(oblong)}")
+        if len(sizes := {(one["width"], one["height"]) for one in cameras}) > 1 and self.use_resolution:
+            self.warn(f"{path}: photographs have {len(sizes)} sizes: set the resolution to look through the others")
+
+
+def _camera(camera: dict[str, Any], size: float) -> bpy.types.Object:
+    """A camera object, in no collection yet."""
+    data = bpy.data.cameras.new(camera["name"])
+    width, height = camera["width"], camera["height"]
+    data.sensor_fit, data.sensor_width = "HORIZONTAL", _SENSOR
+    data.lens = camera["fx"] / width * _SENSOR
+    data.shift_x, data.shift_y = (width / 2 - camera["cx"]) / width, (camera["cy"] - height / 2) / width
+    data.display_size = max(size, 1e-3)
+    obj = bpy.data.objects.new(camera["name"], data)
+    obj.matrix_world = Matrix(camera["matrix_world"])
+    return obj
+
+
+CLASSES = (DRGS_OT_import_cameras,)
