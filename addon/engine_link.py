@@ -112,8 +112,9 @@ def output_of(arguments: list[str]) -> str:
     reading, writing = os.pipe()  # its standard input, which stays open
     try:
         done = subprocess.run(
-            [*command, *arguments], stdin=reading, capture_output=True, timeout=PATIENCE, env=clean_environment()
-        )
+            [*command, *arguments], stdin=reading, capture_output=True, timeout=PATIENCE, env=clean_environment(),
+            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),  # Windows alone has it
+        )  # fmt: skip
     except (OSError, subprocess.TimeoutExpired) as error:
         raise EngineError("Engine", f"{command[0]} does not answer ({error})", "See the preferences") from error
     finally:

@@ -147,6 +147,7 @@ class CommandOperator(DrgsOperator):
                 stdout=handle,
                 stderr=handle,
                 env=clean_environment(),
+                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),  # Windows alone has it
             )
         except OSError as error:
             self._log.unlink()
