@@ -1,7 +1,7 @@
 """File integrity: whether a picture was written to its end, without decoding it.
 
 Where a disk is full, Blender leaves what fitted; and what reads pictures, shows what there is of them or crashes.
-Layouts after the file format pages of OpenEXR, PNG (ISO 15948), JPEG (T.81) and WebP (RFC 9649).
+Layouts after the file format pages of OpenEXR, PNG (ISO 15948), JPEG (T.81), WebP (RFC 9649) and TIFF 6.0.
 """
 
 from __future__ import annotations
@@ -11,6 +11,9 @@ import struct
 from pathlib import Path
 
 _EXR, _PNG, _JPEG, _RIFF = b"\x76\x2f\x31\x01", b"\x89PNG", b"\xff\xd8\xff", b"RIFF"
+_TIFF = {b"II*\0": "<", b"MM\0*": ">"}
+#: Tags of the places and sizes of a TIFF's strips, and of its tiles; how their numbers are stored, by type.
+_TIFF_PIECES, _TIFF_NUMBERS = ((273, 279), (324, 325)), {3: "H", 4: "I"}
 _PNG_END, _JPEG_END = b"IEND\xae\x42\x60\x82", b"\xff\xd9"
 _TILED, _DEEP, _PARTS = 0x200, 0x800, 0x1000
 _JPEG_SCAN = b"\xff\xda"
@@ -30,9 +33,10 @@ def crashes_blender(data: bytes) -> bool:
 
 def is_whole_data(data: bytes) -> bool:
     """`is_whole` of the bytes of a file."""
-    if data[:4] == _EXR:
+    looks = _is_whole_exr if data[:4] == _EXR else _is_whole_tiff if data[:4] in _TIFF else None
+    if looks is not None:
         try:
-            return _is_whole_exr(data)
+            return looks(data)
         except (struct.error, ValueError, IndexError, KeyError):
             return False
     if data[:4] == _PNG:
@@ -71,6 +75,24 @@ def _is_whole_exr(data: bytes) -> bool:
             if b"chunkCount" not in header:
                 first = min(first, offset)
     return True
+
+
+def _is_whole_tiff(data: bytes) -> bool:
+    """Whether the strips or tiles of the first picture end within the file."""
+    order = _TIFF[data[:4]]
+    (place,) = struct.unpack_from(f"{order}I", data, 4)
+    (count,) = struct.unpack_from(f"{order}H", data, place)
+    found: dict[int, tuple[int, ...]] = {}
+    for entry in range(place + 2, place + 2 + 12 * count, 12):
+        tag, kind, many = struct.unpack_from(f"{order}HHI", data, entry)
+        if any(tag in pieces for pieces in _TIFF_PIECES):
+            numbers = f"{order}{many}{_TIFF_NUMBERS[kind]}"
+            at = entry + 8
+            if struct.calcsize(numbers) > 4:
+                (at,) = struct.unpack_from(f"{order}I", data, at)
+            found[tag] = struct.unpack_from(numbers, data, at)
+    ends = [a + b for places, sizes in _TIFF_PIECES for a, b in zip(found.get(places, ()), found.get(sizes, ()))]
+    return max(ends, default=0) <= len(data)
 
 
 def _header(data: bytes, position: int) -> tuple[dict[bytes, bytes], int]:

@@ -94,6 +94,10 @@ def cut_webp(scene, folder: Path, drgs) -> None:
     textured(picture(folder / "a.webp", "WEBP", 0.5))
 
 
+def cut_tiff(scene, folder: Path, drgs) -> None:
+    textured(picture(folder / "a.tif", "TIFF", 0.5))
+
+
 def surface_loop(scene, folder: Path, drgs) -> None:
     textured(picture(folder / "a.png", "PNG"))
     tree = bpy.data.materials["Bad"].node_tree
@@ -192,6 +196,7 @@ CASES = {
     tile_exr: f'Image "a.1001.exr": tile 1002: {CUT_OFF}',
     cut_jpeg: f'Image "a.jpg": {CUT_OFF}',
     packed_jpeg: f'Image "a.jpg": {CUT_OFF}',
+    cut_tiff: f'Image "a.tif": {CUT_OFF}',
     cut_webp: f'Image "a.webp": {CUT_OFF}',
     surface_loop: f'Material "Bad", node "Mapping": {LOOP.format("Vector")}',
     world_loop: f'World "World", node "Mapping": {LOOP.format("Vector")}',
@@ -218,6 +223,13 @@ def test_it_is_named_and_the_rest_is_exported(scene, export, tmp_path, request, 
         assert any(text.startswith(CASES[make]) for text in warnings), warnings
         assert "Good" in {mesh.name for mesh in frame.meshes}
         assert np.isfinite([light.power for light in frame.lights]).all()
+
+
+@pytest.mark.parametrize("kind", ["OPEN_EXR", "HDR", "PNG", "JPEG", "WEBP", "TIFF", "TARGA", "BMP", "JPEG2000"])
+def test_a_whole_file_is_nothing_to_speak_of(scene, export, tmp_path, kind):
+    textured(picture(tmp_path / "a", kind))
+    frame, warnings = export()
+    assert not warnings and len(frame.images) == 1
 
 
 def test_a_cut_off_exr_is_no_light(scene, tmp_path):

@@ -74,6 +74,6 @@ def test_exr_whose_table_was_never_written(tmp_path: Path) -> None:
     assert not is_whole(tmp_path / "a.exr")
 
 
-@pytest.mark.parametrize("kind", ["PNG", "JPEG", "WebP"])
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "WebP", "TIFF"])
 def test_other_formats(tmp_path: Path, kind: str) -> None:
     assert_complete(tmp_path / "a", other(kind))
