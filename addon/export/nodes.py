@@ -364,8 +364,8 @@ def hollow(node: bpy.types.Node) -> str:
     tree = node.node_tree
     if tree is None:
         return "has no node group"
-    if tree.library is not None and tree.is_missing:
-        return f'its node group "{tree.name}" is missing from {tree.library.filepath}'
+    if tree.original.is_missing:  # which an evaluated one does not say
+        return f'its node group "{tree.name}" is missing from {tree.original.library.filepath}'
     return f'its node group "{tree.name}" has no output'
 
 

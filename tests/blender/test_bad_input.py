@@ -225,6 +225,22 @@ def test_it_is_named_and_the_rest_is_exported(scene, export, tmp_path, request, 
         assert np.isfinite([light.power for light in frame.lights]).all()
 
 
+def test_a_node_group_whose_library_is_gone_is_named_with_it(scene, export, tmp_path):
+    hollow_shader(scene, tmp_path, None)
+    made, library = bpy.data.node_groups["Hollow"], str(tmp_path / "lib.blend")
+    bpy.data.libraries.write(library, {made})
+    node = bpy.data.materials["Bad"].node_tree.nodes["Group"]
+    with bpy.data.libraries.load(library, link=True) as (_, wanted):
+        wanted.node_groups = ["Hollow"]
+    (node.node_tree,) = wanted.node_groups
+    bpy.data.node_groups.remove(made)
+    bpy.ops.wm.save_mainfile()
+    Path(library).unlink()
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    (text,) = set(export()[1])
+    assert text.startswith('Material "Bad", node "Group": its node group "Hollow" is missing from ') and library in text
+
+
 @pytest.mark.parametrize("kind", ["OPEN_EXR", "HDR", "PNG", "JPEG", "WEBP", "TIFF", "TARGA", "BMP", "JPEG2000"])
 def test_a_whole_file_is_nothing_to_speak_of(scene, export, tmp_path, kind):
     textured(picture(tmp_path / "a", kind))
