@@ -322,8 +322,8 @@ def _key(image: bpy.types.Image, frame: int) -> tuple[object, ...] | None:
         return None
     settings = image.session_uid, image.name_full, image.source, image.colorspace_settings.name, image.alpha_mode
     if image.source == "TILED":
-        packed = {p.tile_number: _digest(p.packed_file) for p in image.packed_files}
-        return *settings, *(packed.get(tile.number) or _tile_key(image, tile) for tile in image.tiles)
+        known = {p.tile_number: _digest(p.packed_file) for p in image.packed_files}
+        return *settings, *(known.get(tile.number) or _tile_key(image, tile) for tile in image.tiles)
     stamp = _stamp(image_parts.frame_file(image, frame))
     packed = _digest(image.packed_file) if image.packed_file else b""
     # Not its size: to say it, Blender reads the file.
