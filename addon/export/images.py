@@ -188,9 +188,19 @@ def _still(
     return picture
 
 
-def _with_problems(make: Callable[[bpy.types.Image], T]) -> Callable[[bpy.types.Image], tuple[T, list[str]]]:
+def _with_problems(
+    make: Callable[[bpy.types.Image], T | None],
+) -> Callable[[bpy.types.Image], tuple[T | None, list[str]]]:
     """`make`, with what is wrong with the image."""
-    return lambda image: (make(image), image_pixels.problems(image))
+
+    def made(image: bpy.types.Image) -> tuple[T | None, list[str]]:
+        try:
+            return make(image), image_pixels.problems(image)
+        except MemoryError:
+            size = " x ".join(map(str, image.size))
+            return None, [f"there is no memory for its {size} pixels. Use a smaller image, or close other programs"]
+
+    return made
 
 
 def _told(image: bpy.types.Image, found: tuple[T, list[str]], warn: Warn) -> T:

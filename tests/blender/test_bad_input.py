@@ -278,6 +278,17 @@ def test_an_image_larger_than_blender_gives_away_is_made_smaller(scene, export, 
     assert len(bpy.data.images) == 1, "no copy is left behind"
 
 
+def test_an_image_that_memory_has_no_room_for_is_named(scene, export, tmp_path, monkeypatch):
+    def full(image: bpy.types.Image) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(part("addon.export.image_pixels"), "_given", full)
+    textured(picture(tmp_path / "a.png", "PNG"))
+    frame, warnings = export()
+    assert warnings[0].startswith('Image "a.png": there is no memory for its 64 x 64 pixels. Use a smaller image')
+    assert not frame.images and len(frame.meshes) == 1
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit for files")
 def test_a_full_disk_is_told_without_a_traceback(scene, tmp_path, monkeypatch):
     """The archive that was being written has nothing to say of its own when it goes."""
