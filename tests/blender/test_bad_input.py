@@ -179,6 +179,8 @@ def lost_mask(scene, folder: Path, drgs) -> None:
 
 
 def lost_normals(scene, folder: Path, drgs) -> None:
+    if bpy.app.version < (5, 0, 0):
+        pytest.skip("before Blender 5.0 custom normals are angles")
     obj = mesh_object("Bad", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
     corners = obj.data.attributes.new("custom_normal", "FLOAT_VECTOR", "CORNER")
     corners.data.foreach_set("vector", np.full(9, NAN, np.float32))
