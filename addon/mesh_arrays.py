@@ -85,7 +85,9 @@ def make_paintable(mesh: bpy.types.Mesh, channel: str, values: Array) -> None:
 
 
 def read_channel(mesh: bpy.types.Mesh, channel: str) -> Array | None:
-    """The point attribute of a material channel, linear and within its limits, NaN kept; None where there is none.
+    """The point attribute of a material channel, linear and within its limits; None where there is none.
+
+    What is no number, or infinite, is NaN.
 
     Of a number that is stored as a colour, as brushes need it, the mean of red, green and blue.
 
@@ -110,6 +112,7 @@ def read_channel(mesh: bpy.types.Mesh, channel: str) -> Array | None:
             values[:, i] = colours[:, i]
         if width == 1:
             values = _brightness(values)
+    values[np.isinf(values)] = np.nan
     return np.clip(values, 0, MATERIAL_CHANNELS[channel].limit, out=values)
 
 

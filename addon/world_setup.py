@@ -8,6 +8,7 @@ from pathlib import Path
 import bpy
 
 from ..drgs_blender.core.errors import AssetError, UsageError
+from ..drgs_blender.core.file_integrity import crashes_blender
 
 #: Label of the nodes that are made here, by which they are found again.
 LABEL = "DR-GS Light"
@@ -34,6 +35,8 @@ def choose_light(scene: bpy.types.Scene, path: Path, rotation: float = 0.0, stre
         raise UsageError(f'Scene "{scene.name}"', "comes from a library and cannot be changed here", "Make it local")
     if not os.path.isfile(path):
         raise AssetError(str(path), "does not exist", "Choose another image")
+    if crashes_blender(Path(path).read_bytes()):
+        raise AssetError(str(path), "is cut off", "Copy it again, or choose another image")
     try:
         image = bpy.data.images.load(str(path), check_existing=True)
     except RuntimeError as error:

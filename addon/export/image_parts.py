@@ -49,10 +49,29 @@ def tile_file(image: bpy.types.Image, number: int) -> str:
     return path.replace("<UDIM>", str(number)).replace("<UVTILE>", f"u{column + 1}_v{row + 1}")
 
 
+def file_data(image: bpy.types.Image) -> bytes:
+    """The file that Blender reads an image from, packed or on disk, of a tiled image that of its first tile.
+
+    Empty where there is none, and of a movie.
+    """
+    if image.source not in ("FILE", "SEQUENCE", "TILED") or image.is_dirty:
+        return b""
+    packed = [file.packed_file for file in image.packed_files if file.packed_file is not None]
+    if packed:
+        return packed[0].data
+    tiled = image.source == "TILED" and len(image.tiles)
+    path = tile_file(image, image.tiles[0].number) if tiled else image.filepath
+    try:
+        with open(bpy.path.abspath(path, library=image.library), "rb") as file:
+            return file.read()
+    except OSError:
+        return b""
+
+
 @contextmanager
 def still(image: bpy.types.Image, frame: int) -> Iterator[bpy.types.Image]:
     """A copy that shows a frame of a sequence or movie; one without pixels where that cannot be read."""
-    with _copied(image) as copy:
+    with copied(image) as copy:
         if image.source == "SEQUENCE":
             settings = image.colorspace_settings.name, image.alpha_mode
             copy.source, copy.filepath = "FILE", frame_file(image, frame)
@@ -66,7 +85,7 @@ def still(image: bpy.types.Image, frame: int) -> Iterator[bpy.types.Image]:
 @contextmanager
 def tiles(image: bpy.types.Image) -> Iterator[Iterator[tuple[int, bpy.types.Image]]]:
     """Numbers of the tiles, each with an image that shows it. What is painted and not saved is in the first alone."""
-    with _copied(image) as copy:
+    with copied(image) as copy:
         yield _each_tile(image.original, copy)
 
 
@@ -96,7 +115,8 @@ def _unpacked(image: bpy.types.Image, data: bytes) -> Iterator[bpy.types.Image]:
 
 
 @contextmanager
-def _copied(image: bpy.types.Image) -> Iterator[bpy.types.Image]:
+def copied(image: bpy.types.Image) -> Iterator[bpy.types.Image]:
+    """A copy of an image, for a while."""
     copy = image.original.copy()
     try:
         yield copy

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import bpy
@@ -9,7 +10,9 @@ import numpy as np
 
 from ...drgs_blender.core.arrays import shareable
 from ...drgs_blender.core.color import linear_to_srgb, srgb_to_linear
+from ...drgs_blender.core.file_integrity import crashes_blender, is_whole_data
 from ...drgs_blender.core.materials import Image
+from . import image_parts
 
 Array = np.ndarray
 
@@ -19,12 +22,45 @@ LINEAR = {"Linear Rec.709", "Linear", "Non-Color", "Raw", "scene_linear"}
 DATA = {"Non-Color", "Raw"}
 #: Rows that are worked on at once: whole copies of a large image are larger than all the rest.
 _STRIP = 32
+#: Numbers that Blender hands out of one image at most: it counts them in 32 bits.
+_MOST = 2**31 - 1
+
+
+def is_empty(image: bpy.types.Image) -> bool:
+    """Whether Blender has no pixels of an image, or cannot be asked for them."""
+    return crashes_blender(image_parts.file_data(image)) or 0 in image.size[:]
+
+
+def problems(image: bpy.types.Image) -> list[str]:
+    """What is wrong with an image that was just read, for the user."""
+    data = image_parts.file_data(image)
+    if data and not is_whole_data(data):
+        return ["its file is cut off; as much of it is shown as can be read. Copy or export it again"]
+    if (times := _reduction(image)) > 1:
+        size = " x ".join(map(str, image.size))
+        return [f"its {size} pixels are more than Blender gives away; it is reduced {times} times. Use a smaller one"]
+    return []
+
+
+def _reduction(image: bpy.types.Image) -> int:
+    """How many times an image has to be made smaller for Blender to hand out its pixels."""
+    return math.ceil(math.sqrt(image.size[0] * image.size[1] * 4 / _MOST))
 
 
 def _read(image: bpy.types.Image) -> Array | None:
     """(h, w, c) float32 as Blender holds them, row 0 at the top; None when the image has no pixels."""
+    if is_empty(image):
+        return None
+    if (times := _reduction(image)) > 1:
+        with image_parts.copied(image) as smaller:
+            smaller.scale(*(max(1, n // times) for n in image.size))
+            return _given(smaller)
+    return _given(image)
+
+
+def _given(image: bpy.types.Image) -> Array | None:
     width, height = image.size
-    if width * height == 0 or len(image.pixels) == 0:
+    if len(image.pixels) == 0:
         return None
     pixels = np.empty(width * height * image.channels, np.float32)
     image.pixels.foreach_get(pixels)

@@ -6,7 +6,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import bpy
 import numpy as np
@@ -17,6 +17,7 @@ from . import image_cubic, image_grid, image_parts, image_pixels
 
 Array = np.ndarray
 Warn = Callable[[str], None]
+T = TypeVar("T")
 
 #: What Cycles shows for an image it cannot read.
 MISSING = (1.0, 0.0, 1.0)
@@ -75,7 +76,7 @@ def linear_pixels(image: bpy.types.Image, warn: Warn) -> Array | None:
     if image.source == "TILED" and len(image.tiles) > 1:
         warn(f'Image "{image.name}": of its {len(image.tiles)} UDIM tiles only the first is used')
     _check(image, warn)
-    return _remembered(image, "light", image_pixels.linear)
+    return _told(image, _remembered(image, "light", _with_problems(image_pixels.linear)), warn)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +124,7 @@ def show(image: bpy.types.Image, straight: bool, warn: Warn, lookup: Lookup) -> 
         _moving = True
         picture = _still(image, kind, make, f"{name} (frame {lookup.frame})", lookup, warn)
     else:
-        picture = _remembered(image, kind, lambda i: _named(make(i), name))
+        picture = _told(image, _remembered(image, kind, _with_problems(lambda i: _named(make(i), name))), warn)
     if picture is None:
         return None
     shown = Shown(picture, np.eye(4), lookup.extension)
@@ -148,11 +149,13 @@ def _tiled(
     closest = lookup.interpolation == "Closest"
 
     def stitch(image: bpy.types.Image) -> tuple[Image | None, list[str]]:
+        read = _with_problems(make)
         with image_parts.tiles(image) as shown:
-            found = {number: make(tile) for number, tile in shown}
+            tiles = {number: read(tile) for number, tile in shown}
+        found = {number: picture for number, (picture, _) in tiles.items()}
         lost = [str(number) for number, picture in found.items() if picture is None]
         whole = {number: picture for number, picture in found.items() if picture is not None}
-        problems: list[str] = []
+        problems = [f"tile {number}: {text}" for number, (_, texts) in tiles.items() for text in texts]
         if not whole:
             return None, problems
         if lost:
@@ -166,10 +169,7 @@ def _tiled(
             problems.append(f"its {len(found)} tiles are too large together and are reduced {reduced:.3g} times")
         return _named(picture, f"{name} ({lookup.extension} {'closest' if closest else 'linear'} tiles)"), problems
 
-    picture, problems = _remembered(image, f"{kind} {lookup.extension} {closest}", stitch)
-    for problem in problems:
-        warn(f'Image "{image.name}": {problem}')
-    return picture
+    return _told(image, _remembered(image, f"{kind} {lookup.extension} {closest}", stitch), warn)
 
 
 def _still(
@@ -177,15 +177,37 @@ def _still(
 ) -> Image | None:
     """The picture of a frame; None where it cannot be read."""
 
-    def read(image: bpy.types.Image) -> Image | None:
+    def read(image: bpy.types.Image) -> tuple[Image | None, list[str]]:
         with image_parts.still(image, lookup.frame) as shown:
-            return _named(make(shown), name)
+            return _with_problems(lambda i: _named(make(i), name))(shown)
 
-    picture = _remembered(image, f"{kind} {lookup.frame}", read, lookup.frame)
+    picture = _told(image, _remembered(image, f"{kind} {lookup.frame}", read, lookup.frame), warn)
     if picture is None:
         path = image_parts.frame_file(image, lookup.frame)
         warn(f'Image "{image.name}": frame {lookup.frame}, {path}, cannot be read. See that the file is there')
     return picture
+
+
+def _with_problems(
+    make: Callable[[bpy.types.Image], T | None],
+) -> Callable[[bpy.types.Image], tuple[T | None, list[str]]]:
+    """`make`, with what is wrong with the image."""
+
+    def made(image: bpy.types.Image) -> tuple[T | None, list[str]]:
+        try:
+            return make(image), image_pixels.problems(image)
+        except MemoryError:
+            size = " x ".join(map(str, image.size))
+            return None, [f"there is no memory for its {size} pixels. Use a smaller image, or close other programs"]
+
+    return made
+
+
+def _told(image: bpy.types.Image, found: tuple[T, list[str]], warn: Warn) -> T:
+    """What was made of an image; what is wrong with it is told."""
+    for problem in found[1]:
+        warn(f'Image "{image.name}": {problem}')
+    return found[0]
 
 
 def _named(picture: Image | None, name: str) -> Image | None:
@@ -281,7 +303,7 @@ def _check(image: bpy.types.Image, warn: Warn) -> None:
     space = image.colorspace_settings.name
     if space in (*image_pixels.LINEAR, "sRGB", ""):  # "": of a movie that was not read yet
         return
-    if not _remembered(image, "float", lambda i: i.is_float):
+    if not _remembered(image, "float", lambda i: image_pixels.is_empty(i) or i.is_float):
         warn(f'Image "{image.name}": colour space {space} of an 8-bit image is read as sRGB')
 
 
@@ -310,17 +332,20 @@ def _key(image: bpy.types.Image, frame: int) -> tuple[object, ...] | None:
         return None
     settings = image.session_uid, image.name_full, image.source, image.colorspace_settings.name, image.alpha_mode
     if image.source == "TILED":
-        files = [(*_generated(tile), *_stamp(image_parts.tile_file(image, tile.number))) for tile in image.tiles]
-        return *settings, *files, *(_digest(p.packed_file) for p in image.packed_files)
+        known = {p.tile_number: _digest(p.packed_file) for p in image.packed_files}
+        return *settings, *(known.get(tile.number) or _tile_key(image, tile) for tile in image.tiles)
     stamp = _stamp(image_parts.frame_file(image, frame))
     packed = _digest(image.packed_file) if image.packed_file else b""
     # Not its size: to say it, Blender reads the file.
     return *settings, *stamp, packed, 0 if image.source == "FILE" else frame
 
 
-def _generated(tile: bpy.types.UDIMTile) -> tuple[object, ...]:
-    """What a generated tile is filled with."""
-    return tile.number, *tile.size, tile.generated_type, *tile.generated_color
+def _tile_key(image: bpy.types.Image, tile: bpy.types.UDIMTile) -> tuple[object, ...]:
+    """File of a tile, or what it is filled with: to say its size, Blender reads the file."""
+    path, changed = _stamp(image_parts.tile_file(image, tile.number))
+    if changed:
+        return tile.number, path, changed
+    return tile.number, path, *tile.size, tile.generated_type, *tile.generated_color
 
 
 def _stamp(path: str) -> tuple[str, int]:

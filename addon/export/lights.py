@@ -19,7 +19,7 @@ Warn = Callable[[str], None]
 
 
 def export_light(item: Visible, warn: Warn) -> Light | None:
-    """Describe a visible instance of a light; None for portals, which give no light of their own."""
+    """Describe a visible instance of a light; None for portals and for what is not finite, which give none."""
     obj, light = item.object, item.object.data
     if light.type == "AREA" and getattr(getattr(light, "cycles", None), "is_portal", False):
         return None
@@ -32,10 +32,12 @@ def export_light(item: Visible, warn: Warn) -> Light | None:
     if light.use_nodes and light.node_tree is not None:
         colour *= _Tree(light, warn).emission()
     power = light.energy * 2.0 ** getattr(light, "exposure", 0.0)
-    if not (np.isfinite(colour).all() and np.isfinite(power)):
-        warn(f"{name}: its colour or power is not finite; it is off. Check its values and their drivers")
-        colour, power = np.zeros(3), 0.0
     kind = light.type.lower()
+    shape = _SHAPES[kind](light)
+    sizes = [value for value in shape.values() if isinstance(value, float)]
+    if not np.isfinite((*colour, power, *sizes)).all():
+        warn(f"{name}: its colour, power or size is not finite; it is off. Check its values and their drivers")
+        return None
     rays = item.visibility
     return Light(
         name=obj.name,
@@ -49,7 +51,7 @@ def export_light(item: Visible, warn: Warn) -> Light | None:
         glossy=rays.glossy,
         cast_shadow=light.use_shadow,
         light_group=obj.lightgroup,
-        **_SHAPES[kind](light),
+        **shape,
     )
 
 
@@ -92,7 +94,7 @@ class _Tree(Walker):
     @once(lambda self: np.ones(3))
     def shader(self, ref: SocketRef) -> np.ndarray:
         """(3,) of a shader input."""
-        origin = ref.origin()
+        origin = self.origin(ref)
         if not origin.socket.is_output:
             return np.zeros(3)
         node = origin.node

@@ -179,6 +179,8 @@ class Meshes:
         if len(corners) == 0:
             return None
         normals = arrays.corner_normals
+        if normals is not None:
+            check_normals(item.object.name, mesh, normals, self._warn)
         return MeshState(
             name=item.object.name,
             vertices=arrays.vertices,
@@ -260,6 +262,12 @@ def _read(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Iterator[bpy
         yield obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
     finally:
         obj.to_mesh_clear()
+
+
+def check_normals(name: str, mesh: bpy.types.Mesh, normals: Array, warn: Warn) -> None:
+    """Say how many custom normals the engine cannot use."""
+    if mesh.has_custom_normals and (lost := int((~np.isfinite(normals)).any(axis=-1).sum())):
+        warn(f'"{name}": {lost} of its custom normals are not finite; its faces\' own are used there. Clear them')
 
 
 def _images_of(state: MeshState | None) -> set[str]:

@@ -185,6 +185,9 @@ class Walker:
     def nearest(self, origin: SocketRef, ref: SocketRef) -> SocketValue:
         """An unknown node: its first linked colour, the mean of its own colours, or what the input is without it."""
         node = origin.node
+        if node.type == "GROUP":
+            self.note(node, f"{hollow(node)}; it is black in Cycles. Mend or replace it", approximated=True)
+            return uniform(self.unknown)
         colours = [SocketRef(s, origin.groups) for s in node.inputs if s.type == "RGBA" and s.enabled]
         linked = [c for c in colours if c.socket.is_linked]
         if linked:
@@ -354,6 +357,16 @@ class Walker:
         return self.combine(output.node, joined, *(self.number(output.input(i)) for i in range(3)))
 
     node_combrgb = node_combxyz = node_combine_color
+
+
+def hollow(node: bpy.types.Node) -> str:
+    """What is wrong with a group node whose outputs nothing feeds."""
+    tree = node.node_tree
+    if tree is None:
+        return "has no node group"
+    if tree.original.is_missing:  # which an evaluated one does not say
+        return f'its node group "{tree.name}" is missing from {tree.original.library.filepath}'
+    return f'its node group "{tree.name}" has no output'
 
 
 def _fixed_but(value: SocketValue, texture: Hashable, means: dict[Hashable, Array]) -> SocketValue:

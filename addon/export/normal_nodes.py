@@ -50,7 +50,7 @@ class NormalWalker(TextureWalker):
     @once(lambda self: ())
     def normal(self, ref: SocketRef) -> tuple[DetailRef, ...]:
         """What a normal input does to the shading normal, first to last."""
-        origin = ref.origin()
+        origin = self.origin(ref)
         if not origin.socket.is_output:
             return ()
         evaluate = getattr(self, f"normal_{origin.node.type.lower()}", None)

@@ -21,6 +21,7 @@ from .export_cache import ExportCache, uid
 from .holdouts import Holdouts
 from .instances import Key, Visible, terminator_offset
 from .materials import finite
+from .meshes import check_normals
 from .surface_nodes import SurfaceWalker
 from .topology_check import check_modifiers, check_topology
 
@@ -55,6 +56,9 @@ class DrgsObjects:
             modifiers.
         """
         obj = item.object
+        if not np.isfinite(item.matrix_world).all():
+            self._warn(f'"{obj.name}": its transform is not finite; it is left out. Check its drivers and constraints')
+            return
         check_modifiers(obj, self._depsgraph)
         cache_playback.check(obj, self._warn, final=self._depsgraph.mode == "RENDER")
         appearance = obj.drgs.show_captured, obj.drgs.adjustment.values(), *cache_playback.fracture_state(obj).items()
@@ -148,7 +152,9 @@ def _corner_normals(obj: bpy.types.Object, mesh: bpy.types.Mesh, same_faces: boo
     if not same_faces:
         warn(f'"{obj.name}": its faces are not those of the asset, so it is shaded smooth')
         return None
-    return mesh_arrays.read_corner_normals(mesh)
+    normals = mesh_arrays.read_corner_normals(mesh)
+    check_normals(obj.name, mesh, normals, warn)
+    return normals
 
 
 def _adjustment(obj: bpy.types.Object, mesh: bpy.types.Mesh, warn: Warn) -> Adjustment | None:
@@ -165,6 +171,9 @@ def _adjustment(obj: bpy.types.Object, mesh: bpy.types.Mesh, warn: Warn) -> Adju
                 "points; they are applied nowhere"
             )
             return None
+        if lost := int((~np.isfinite(mask)).sum()):
+            warn(f'"{obj.name}": {lost} values of the mask "{settings.mask}" are not finite; 0 is used there')
+            mask = np.nan_to_num(mask, posinf=0.0, neginf=0.0)
     return settings.to_frame(mask, warn)
 
 
@@ -179,6 +188,6 @@ def _edited(obj: bpy.types.Object, mesh: bpy.types.Mesh, asset: Asset, channel: 
         return None
     own, lost = asset.mesh.channel(channel), np.isnan(values)
     if lost.any():
-        warn(f'"{obj.name}": {lost.sum()} values of attribute {channel} are not numbers; the asset\'s are used there')
+        warn(f'"{obj.name}": {lost.sum()} values of attribute {channel} are not finite; the asset\'s are used there')
         values[lost] = own[lost]
     return None if np.array_equal(values, own) else values

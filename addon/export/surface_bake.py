@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -189,8 +190,10 @@ class SurfaceBakes:
         }
 
         def write(folder: Path) -> None:
-            with open(folder / "mesh.npz", "wb") as file:
-                np.savez(file, faces=faces, **arrays, **extra)  # type: ignore[arg-type]
+            # In memory first: NumPy's archive complains at its own end of a disk that is full.
+            data = io.BytesIO()
+            np.savez(data, faces=faces, **arrays, **extra)  # type: ignore[arg-type]
+            (folder / "mesh.npz").write_bytes(data.getbuffer())
 
         label = f'Material "{material.name}" on "{obj.name}", {_words(name)}'
         return request("surface", material, label, found, about, write=write, follow=follow)

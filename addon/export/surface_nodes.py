@@ -11,6 +11,7 @@ from ..bakes.node_trees import COLOURS, SHADERS, leaf_of
 from .bsdfs import Bsdf, MixingWalker, Part, Surface
 from .layers import LayerRef
 from .node_math import conductor
+from .nodes import hollow
 from .normal_nodes import DetailRef
 from .socket_value import SocketValue, constant, once, uniform
 from .sockets import SocketRef, surface_of
@@ -40,6 +41,9 @@ class SurfaceWalker(MixingWalker):
         # From Blender 5.0 on every material has nodes, and the switch is deprecated.
         if material.node_tree is None or (bpy.app.version < (5, 0, 0) and not material.use_nodes):
             return _plain(uniform(material.diffuse_color[:3]), uniform(material.roughness), uniform(material.metallic))
+        for node in material.node_tree.nodes:
+            if node.type == "GROUP" and node.node_tree is None:  # which has no sockets, so that nothing leads to it
+                self.note(node, f"{hollow(node)}; what it fed is as if unlinked. Choose one, or remove the node")
         ref = surface_of(material.node_tree)
         origin = None if ref is None else ref.origin()
         linked = origin is not None and origin.socket.is_output
@@ -243,7 +247,8 @@ class SurfaceWalker(MixingWalker):
     def other_shader(self, output: SocketRef) -> Surface:
         """The nearest to a shader that is not known: its colour, scattered."""
         node = output.node
-        self.note(node, f"{node.bl_label} is not supported; a surface of its colour is used")
+        problem = hollow(node) if node.type == "GROUP" else f"{node.bl_label} is not supported"
+        self.note(node, f"{problem}; a surface of its colour is used")
         colours = [s for s in node.inputs if s.type == "RGBA" and s.enabled]
         base = self.colour(SocketRef(colours[0], output.groups)) if colours else uniform(0.8)
         rough = output.input("Roughness") if "Roughness" in node.inputs else None

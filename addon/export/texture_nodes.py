@@ -56,9 +56,9 @@ class TextureWalker(Walker):
         shown = None if image is None else images.show(image, straight, self._warn, lookup)
         if shown is None:
             name = "has no image" if image is None else f'image "{image.name}" cannot be read'
-            problem = f"{name}; as in Cycles it is magenta. Choose another, or find its file"
-            # Cycles reads part of some damaged files.
-            self.note(node, problem, approximated=image is not None and images.has_file(image, lookup.frame))
+            damaged = image is not None and images.has_file(image, lookup.frame)  # of which Cycles may read a part
+            seen = "what Cycles makes of it is shown" if damaged else "as in Cycles it is magenta"
+            self.note(node, f"{name}; {seen}. Choose another, or find its file", approximated=damaged)
             return uniform(1) if output.socket.name == "Alpha" else SocketValue(np.array(images.MISSING))
         if node.projection != "FLAT":
             self.warn(node, f"the {node.projection.title()} projection is not supported; the UV map is used")
@@ -148,7 +148,7 @@ class TextureWalker(Walker):
 
     def coordinates(self, ref: SocketRef) -> tuple[Array, LayerRef]:
         """(4, 4) from coordinates on the mesh to those of a texture, and which ones these are."""
-        origin = ref.origin()
+        origin = self.origin(ref)
         if not origin.socket.is_output:
             return np.eye(4), LayerRef("uv")
         node, name = origin.node, origin.socket.name

@@ -199,7 +199,7 @@ class _Tree(Walker):
     @once(lambda self: uniform(self.unknown))
     def shader(self, ref: SocketRef) -> SocketValue:
         """Light of a shader input."""
-        origin = ref.origin()
+        origin = self.origin(ref)
         if not origin.socket.is_output:
             return BLACK
         node = origin.node
@@ -228,10 +228,8 @@ class _Tree(Walker):
 
     def node_tex_environment(self, output: SocketRef) -> SocketValue:
         node = output.node
-        if node.image is None or 0 in node.image.size[:]:
-            name = "has no image" if node.image is None else f'image "{node.image.name}" cannot be read'
-            remedy = "Choose one, or File > External Data > Find Missing Files"
-            self.warn(node, f"{name}; as in Cycles it is magenta. {remedy}")
+        if problem := world_bake.missing_image(node):
+            self.warn(node, problem)
             return SocketValue(np.array(MISSING))
         if node.type == "TEX_ENVIRONMENT" and node.projection != "EQUIRECTANGULAR":
             self.warn(node, "the Mirror Ball projection is read as Equirectangular")
@@ -252,7 +250,7 @@ class _Tree(Walker):
 
     def rotation(self, ref: SocketRef) -> np.ndarray:
         """Rotation of the view direction by the nodes before a texture."""
-        origin = ref.origin()
+        origin = self.origin(ref)
         if not origin.socket.is_output:
             return np.eye(3)
         node, name = origin.node, origin.socket.name

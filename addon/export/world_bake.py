@@ -13,6 +13,8 @@ from ...drgs_blender.core.frame import Light
 from ..bakes import node_trees
 from ..bakes.requests import Request, request
 from ..bakes.store import Baked
+from .image_pixels import is_empty
+from .images import has_file
 from .node_math import rgb
 from .sockets import surface_of
 
@@ -68,14 +70,24 @@ def world_request(world: bpy.types.World, size: int, camera: bool) -> tuple[Requ
 
 def report(world: bpy.types.World, found: Baked, warn: Callable[[str], None]) -> None:
     """Say what is not as it should be in a baked world."""
-    for _, image in node_trees.images(_trees(world)):
-        if image.size[0] * image.size[1] == 0:
-            warn(
-                f'World "{world.name}": image "{image.name}" cannot be read; as in Cycles it is magenta. Choose File > '
-                "External Data > Find Missing Files, or another image"
-            )
+    for node in (node for tree in _trees(world) for node in tree.nodes):
+        if node.type in ("TEX_ENVIRONMENT", "TEX_IMAGE") and (problem := missing_image(node)):
+            warn(f'World "{world.name}", node "{node.label or node.name}": {problem}')
     if int(found["kept"]):
         warn(f'World "{world.name}": a sun of it is not one round disc; it is part of the map, as sharp as that is')
+
+
+def missing_image(node: bpy.types.Node) -> str:
+    """Why a node has no image to show, for the user; "" where it has one."""
+    image = node.image
+    if image is not None and not is_empty(image):
+        return ""
+    name = "has no image" if image is None else f'image "{image.name}" cannot be read'
+    damaged = image is not None and has_file(image, 0)
+    return (
+        f"{name}; {'what Cycles makes of it is shown' if damaged else 'as in Cycles it is magenta'}. Choose one, or "
+        "File > External Data > Find Missing Files"
+    )
 
 
 def baked_suns(found: Baked, factor: float, name: str) -> list[Light]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..core.asset.model import Asset, Environment, Mesh, SourceVertices, Surfels
-from ..core.errors import AssetError
+from ..core.errors import AssetError, first_of
 from ..deform.attach import attach
 from ..deform.face_frames import Faces
 from ..formats.axes import UP_AXES, mesh_to_z_up
@@ -150,6 +150,10 @@ def detailed_mesh(
     materials = Materials(file.materials, coloured=file.vertex_colours is not None)
     net, (source, corners), frames = _net(file, name, report, materials.width)
     faces = len(net.faces)
+    if file.corner_uvs is None and (lost := [m.name for m, has in zip(file.materials, materials.textured) if has]):
+        report["notes"].append(
+            f"no texture coordinates: images of {first_of(lost)} show a single texel. Unwrap the mesh"
+        )
     net, values, report["rounds"], report["unresolved_edges"] = refine(net, materials, tolerance, max_triangles)
     columns: dict[str, Any] = {
         n: values[:, own] if own.stop - own.start > 1 else values[:, own.start] for n, own in materials.columns.items()

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
-from scenes import mesh_object, part, read_exr
+from scenes import mesh_object, part, read_exr, sphere
 from test_baked_world import folder, jobs  # noqa: F401 - fixtures
 
 pytestmark = pytest.mark.blender_api
@@ -138,6 +138,20 @@ def test_a_procedural_colour_is_what_cycles_shows(scene, bake, kind, coordinates
     frame, warnings = bake()
     assert not warnings and psnr(seen(frame), shining(obj, shader.inputs["Base Color"])) > 40
     assert (frame.meshes[0].uvs is None) == (kind != "own"), "another map is made where the own one is of no use"
+
+
+def test_vertices_that_are_nowhere_do_not_take_the_others_with_them(scene, bake):
+    """A UV map is made for the mesh, with a place for every face that there is."""
+    vertices, faces = sphere()
+    vertices[33:44] = np.nan
+    obj = mesh_object("Sphere", vertices, faces)
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    noise(tree, shader.inputs["Base Color"], "Object")
+    frame, _ = bake()
+    _, uvs = texture_of(frame, frame.meshes[0], "base_colour")
+    there = np.isfinite(vertices[faces]).all(axis=(1, 2))
+    assert np.isfinite(uvs).all() and (np.ptp(uvs[there], axis=1) > 0).all()
 
 
 def test_faces_that_overlap_get_places_of_their_own(scene, bake):

@@ -56,6 +56,16 @@ def test_vertex_colours_are_the_texture_at_their_uv():
     assert report["degenerate_faces"] == 0 and mesh.groups["paint"].size == len(mesh.vertices)
 
 
+def test_images_without_coordinates_are_named():
+    file = plane(1, ramp())
+    file.materials[0].name, file.corner_uvs = "Paint", None
+    mesh, report = mesh_with_materials(file, "plane")
+    assert report["notes"] == ["no texture coordinates: images of Paint show a single texel. Unwrap the mesh"]
+    assert np.ptp(mesh.albedo, axis=0).max() == 0 and mesh.textures is None
+    file.materials[0].base_colour_image = None
+    assert not mesh_with_materials(file, "plane")[1]["notes"]
+
+
 def test_srgb_images_are_decoded_and_factors_multiply():
     image = Image(np.full((4, 4, 3), 188, np.uint8), srgb=True)
     file = plane(1, image)

@@ -15,10 +15,12 @@ from drgs_blender.core.file_integrity import is_whole
 COMPRESSIONS = ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB")
 
 
-def exr(path: Path, compression: str, parts: int = 1) -> bytes:
+def exr(path: Path, compression: str, parts: int = 1, kind: object = OpenEXR.scanlineimage) -> bytes:
     """A picture of 70 lines of noise in as many layers."""
     rng = np.random.default_rng(1)
-    header = {"type": OpenEXR.scanlineimage, "compression": getattr(OpenEXR, f"{compression}_COMPRESSION")}
+    header = {"type": kind, "compression": getattr(OpenEXR, f"{compression}_COMPRESSION")}
+    if kind == OpenEXR.tiledimage:
+        header["tiles"] = OpenEXR.TileDescription()
     made = [
         OpenEXR.Part(dict(header), {c: rng.random((70, 20), np.float32) for c in "ABGR"}, f"layer {k}")
         for k in range(parts)
@@ -53,6 +55,17 @@ def test_exr_of_several_layers(tmp_path: Path) -> None:
     assert_complete(tmp_path / "a.exr", exr(tmp_path / "a.exr", "ZIP", 3))
 
 
+@pytest.mark.parametrize("parts", [1, 2])
+def test_exr_of_tiles(tmp_path: Path, parts: int) -> None:
+    assert_complete(tmp_path / "a.exr", exr(tmp_path / "a.exr", "ZIP", parts, OpenEXR.tiledimage))
+
+
+def test_jpeg_with_more_behind_its_end(tmp_path: Path) -> None:
+    """Cameras and editors put thumbnails and padding there."""
+    (tmp_path / "a").write_bytes(other("JPEG") + bytes(64) + b"more")
+    assert is_whole(tmp_path / "a")
+
+
 def test_exr_whose_table_was_never_written(tmp_path: Path) -> None:
     """The writer goes back to it when all else is there."""
     whole = exr(tmp_path / "a.exr", "NO")
@@ -61,6 +74,6 @@ def test_exr_whose_table_was_never_written(tmp_path: Path) -> None:
     assert not is_whole(tmp_path / "a.exr")
 
 
-@pytest.mark.parametrize("kind", ["PNG", "JPEG", "WebP"])
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "WebP", "TIFF"])
 def test_other_formats(tmp_path: Path, kind: str) -> None:
     assert_complete(tmp_path / "a", other(kind))

@@ -94,7 +94,8 @@ def _object(job: dict[str, Any], arrays: dict[str, np.ndarray], material: bpy.ty
     mesh = bpy.data.meshes.new("Baked")
     vertices, corners, starts = arrays["vertices"], arrays["corner_vertices"], arrays["starts"]
     mesh.vertices.add(len(vertices))
-    mesh.vertices.foreach_set("co", vertices.ravel())
+    # One that is not finite would take all others' place in a UV map with it.
+    mesh.vertices.foreach_set("co", np.nan_to_num(vertices, posinf=0.0, neginf=0.0).ravel())
     mesh.loops.add(len(corners))
     mesh.loops.foreach_set("vertex_index", corners)
     mesh.polygons.add(len(starts))
