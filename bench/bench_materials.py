@@ -10,6 +10,7 @@ Both pictures come out of Blender, ours through the extension, from one file (`c
 from __future__ import annotations
 
 import argparse
+import re
 
 import numpy as np
 from bench_composed import BOUNCES, compare, options_of
@@ -69,6 +70,8 @@ PASSES = {
     "light_passes": (*(f"{lobe} {part}" for lobe in _LOBES for part in ("Direct", "Indirect", "Color")), "Emission"),
 }
 TITLE = "Materials and worlds against Cycles"
+#: A run of some scenes, as the section has it; its group is these.
+_RUN = re.compile(r"\n\nRows [^\n]*:\n\n`[^`\n]*--scenes ([^`\n]*)`[^\n]*")
 
 
 def main() -> None:
@@ -113,7 +116,7 @@ def figures(ours: np.ndarray, theirs: np.ndarray) -> tuple[float | str, ...]:
 def replaced(section: str, rows: list[tuple[str, ...]], samples: str) -> str:
     """The text of a section with these rows, in place of its own or where the order of `SCENES` has them.
 
-    Rows that were measured with other numbers of samples than the section say so.
+    Rows that were measured with other numbers of samples than the section say so. Runs of which no row is left go.
     """
     lines = section.splitlines()[2:-1]  # neither its marks nor its title
     old = {name: line for line in lines if line.startswith("| ") and (name := line.split(" | ")[0][2:]) in SCENES}
@@ -124,7 +127,9 @@ def replaced(section: str, rows: list[tuple[str, ...]], samples: str) -> str:
         old[name] = "| " + " | ".join([name, what + note, *cells]) + " |"
     lines[first:first] = [old[name] for name in SCENES if name in old]
     again = f"Rows that name {samples}:" if note else "Rows measured alone:"
-    return "\n".join(line for line in lines) + f"\n\n{again}"
+    measured = {name for name, *_ in rows}
+    text = _RUN.sub(lambda run: "" if measured.issuperset(run[1].split()) else run[0], "\n".join(lines))
+    return f"{text}\n\n{again}"
 
 
 def report(options: argparse.Namespace, rows: list[tuple[str, ...]]) -> str:
