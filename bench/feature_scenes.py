@@ -40,6 +40,12 @@ def three() -> tuple[bpy.types.Object, ...]:
     return ground, head, middle, block
 
 
+def wall() -> None:
+    """A wall behind, before which all edges are compared: those before an empty film are not."""
+    bpy.ops.mesh.primitive_plane_add(size=12, location=(0, 2.2, 2), rotation=(math.pi / 2, 0, 0))
+    finish("Wall", material("Wall", (0.35, 0.45, 0.55), 0.8))
+
+
 def light_linking(job: dict) -> None:
     """A spot that lights floor and Suzanne, an area light that leaves out the floor, a panel for ball and cube."""
     ground, head, middle, block = three()
@@ -152,6 +158,7 @@ def blurred(steps: int) -> bpy.types.Scene:
 def motion_blur(job: dict) -> None:
     """A ball flies, Suzanne turns, a cube grows."""
     _, head, middle, block = three()
+    wall()
     for frame, x, turn, scale in ((1, -0.2, 0.0, 0.8), (3, 0.5, 0.9, 1.2)):
         middle.location.x, head.rotation_euler.z, block.scale = x, turn, (scale,) * 3
         for obj, path in ((middle, "location"), (head, "rotation_euler"), (block, "scale")):
@@ -165,6 +172,7 @@ def motion_blur(job: dict) -> None:
 def deform_blur(job: dict) -> None:
     """Suzanne bends by a shape key."""
     _, head, _, _ = three()
+    wall()
     head.shape_key_add(name="Basis")
     bent = head.shape_key_add(name="Bent")
     for point in bent.data:
@@ -181,10 +189,11 @@ def deform_blur(job: dict) -> None:
 def depth_of_field(job: dict) -> None:
     """The ball in the middle is sharp, what is before and behind it is not; five blades."""
     _, head, middle, block = three()
+    wall()
     head.location.y, block.location.y = 1.2, -1.4
     add_light("SUN", 2.5, (2.5, -2, 3), angle=math.radians(8))
     lens = bpy.context.scene.camera.data.dof
-    lens.use_dof, lens.focus_object, lens.aperture_fstop = True, middle, 0.18
+    lens.use_dof, lens.focus_object, lens.aperture_fstop = True, middle, 0.09
     lens.aperture_blades, lens.aperture_rotation = 5, 0.3
     bpy.context.scene.drgs.blur_steps = 128
 
@@ -221,6 +230,7 @@ def painted_light(job: dict) -> None:
         opacity=lambda p: np.clip(0.5 + 0.8 * p[:, 0], 0, 1),
     )
     cube(material("Cube", (0.2, 0.3, 0.7), 0.4), 0.7, (-0.3, 1.2, 0.35), 0.4)
+    wall()
     stage()
 
 
