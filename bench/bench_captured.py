@@ -245,11 +245,12 @@ def main() -> None:
         "captured",
         "Splats as captured against gsplat",
         f"`drgs relight --captured`, {4 * options.places**2} sub-pixel samples and a box filter, against gsplat's "
-        f"torch reference of 3DGS and 2DGS on the same file. Not in its antialiased mode; its opacity may be 0.999, "
-        f"here it is {MOST} at most as in the published renderers, which it follows in all else. {options.size} x "
-        f"{options.size} pixels, the worst of {options.views} views; PSNR of the display's colours over black where "
-        f"splats are. *Mean over pixels*: gsplat's pictures of {options.places} x {options.places} places in each "
-        "pixel, decoded and averaged as ours are. *Centres of pixels*: its own one picture, which is not anti-aliased."
+        f"torch reference of 3DGS and 2DGS on the same file, not in its antialiased mode. It differs from the "
+        f"published renderers in opacities up to 0.999 (here at most {MOST}, as there), in splats that reach 3.33 "
+        f"standard deviations (there 3, rounded up to tiles) and in its near plane. {options.size} x {options.size} "
+        f"pixels, the worst of {options.views} views; PSNR of the display's colours over black where splats are. "
+        f"*Mean over pixels*: gsplat's pictures of {options.places} x {options.places} places in each pixel, decoded "
+        "and averaged as ours are. *Centres of pixels*: its own one picture, which is not anti-aliased."
         "\n\n" + table(columns, rows),
     )
 

@@ -59,8 +59,8 @@ SCENES = {
     "deform_blur": "motion blur of a shape key",
     "depth_of_field": "depth of field, aperture of five blades",
     "subsurface": "subsurface scattering (Christensen-Burley) over 1 mm: its diffuse limit, which is what we render",
-    "painted_light": "captured object, painted opacity and emission",
-    "painted_lobes": "captured object, painted coat and specular",
+    "painted_light": "DR-GS object, painted opacity and emission",
+    "painted_lobes": "DR-GS object, painted coat and specular",
     "terminator": "coarse smooth meshes with Blender's own shadow terminator offset",
 }
 _LOBES = ("Diffuse", "Glossy", "Transmission")

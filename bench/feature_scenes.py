@@ -223,7 +223,7 @@ def painted(job: dict, **channels: Callable[[np.ndarray], np.ndarray]) -> bpy.ty
 
 
 def painted_light(job: dict) -> None:
-    """A captured object that glows above and lets light pass on one side, before a cube."""
+    """A DR-GS object that glows above and lets light pass on one side, before a cube."""
     painted(
         job,
         emission=lambda p: np.clip(p[:, 2:], 0, 1) * np.float32([0.8, 0.4, 0.15]),
@@ -235,7 +235,7 @@ def painted_light(job: dict) -> None:
 
 
 def painted_lobes(job: dict) -> None:
-    """A captured object that is varnished on one side and reflects nothing below."""
+    """A DR-GS object that is varnished on one side and reflects nothing below."""
     painted(job, coat=lambda p: np.clip(0.5 + 2 * p[:, 0], 0, 1), specular=lambda p: np.clip(0.5 + 1.5 * p[:, 2], 0, 1))
     stage()
 
