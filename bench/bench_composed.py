@@ -14,10 +14,12 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
+import OpenEXR
 from judge import blender_python, environments, psnr, systematic_error, to_srgb, without_noise
 from PIL import Image
 from report import OUT, ROOT, table, write_section
@@ -38,9 +40,9 @@ Row = Callable[[str, np.ndarray, np.ndarray], tuple[str, ...]]
 
 
 def render(
-    name: str, options: argparse.Namespace, folder: Path, module: str = "composed_job"
+    name: str, options: argparse.Namespace, folder: Path, module: str = "composed_job", passes: Sequence[str] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(ours, theirs): (k, h, w, 4) pictures of k seeds.
+    """(ours, theirs): (k, h, w, 4) pictures of k seeds; of `passes`, those side by side.
 
     Those of Cycles are kept for as long as the job is the same; ours, too, where an interrupted run is resumed.
     """
@@ -52,14 +54,14 @@ def render(
             note = out.with_suffix(".job.json")
             programs = b"".join(path.read_bytes() for path in sorted(_PROGRAM.parent.glob("*_scenes.py")))
             sources = hashlib.sha256(_PROGRAM.read_bytes() + programs + npz.read_bytes()).hexdigest()
-            text = json.dumps([sources, name, samples, seed, options.size, BOUNCES])
+            text = json.dumps([sources, name, samples, seed, options.size, BOUNCES, passes])
             known = out.exists() and note.exists() and note.read_text() == text
             known &= engine == "CYCLES" or options.resume
             wanted.append(({"engine": engine, "seed": seed, "samples": samples, "out": str(out)}, note, text, known))
     job = {
         "zip": str(folder / "extension.zip"), "asset": str(drgs), "module": module, "scene": name,
         "hdris": str(environments()), "blend": str(OUT / f"{module}-{name}.blend"), "size": options.size,
-        "bounces": BOUNCES,
+        "bounces": BOUNCES, "passes": passes,
         "pictures": [picture for picture, _, _, known in wanted if not known],
     }  # fmt: skip
     path = OUT / f"{module}-{name}.json"
@@ -68,10 +70,22 @@ def render(
     command = [str(blender_python()), "-P", str(_PROGRAM), str(path)]
     if job["pictures"]:
         subprocess.run(command, check=True, timeout=3000, env=environment)
-    for _, note, text, _ in wanted:
+    for picture, note, text, known in wanted:
+        if passes and not known:
+            np.save(picture["out"], side_by_side(Path(picture["out"]).with_suffix(".exr"), passes))
         note.write_text(text)
     pictures = [np.load(picture["out"]) for picture, _, _, _ in wanted]
     return np.stack(pictures[options.seeds :]), np.stack(pictures[: options.seeds])
+
+
+def side_by_side(path: Path, passes: Sequence[str]) -> np.ndarray:
+    """(h, n w, 4): passes of a multilayer EXR file, with the alpha of its picture; the file goes."""
+    parts = OpenEXR.File(str(path), separate_channels=True).parts
+    layers = {name.split(".", 1)[1]: channel.pixels for part in parts for name, channel in part.channels.items()}
+    alpha = layers["Combined.A"]
+    tiles = [np.stack([*(layers[f"{name}.{c}"] for c in "RGB"), alpha], -1) for name in passes]
+    path.unlink()
+    return np.concatenate(tiles, axis=1).astype(np.float32)
 
 
 def show(ours: np.ndarray, theirs: np.ndarray, path: Path) -> None:
@@ -96,8 +110,17 @@ def options_of(text: str, scenes: Collection[str], seeds: int, spp: int, samples
     return options
 
 
-def compare(options: argparse.Namespace, row: Row, name: str, module: str = "composed_job") -> list[tuple[str, ...]]:
-    """Lines of the table of all scenes that the options ask for; a picture of each is kept as ``name-SCENE.png``."""
+def compare(
+    options: argparse.Namespace,
+    row: Row,
+    name: str,
+    module: str = "composed_job",
+    passes: Mapping[str, Sequence[str]] = MappingProxyType({}),
+) -> list[tuple[str, ...]]:
+    """Lines of the table of all scenes that the options ask for; a picture of each is kept as ``name-SCENE.png``.
+
+    Of the scenes in `passes` these are compared instead of the picture.
+    """
     OUT.mkdir(parents=True, exist_ok=True)
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
@@ -105,7 +128,7 @@ def compare(options: argparse.Namespace, row: Row, name: str, module: str = "com
         command = [sys.executable, str(ROOT / "tools" / "extension.py"), "--out", str(folder / "extension.zip")]
         subprocess.run(command, check=True)
         for scene in options.scenes:
-            ours, theirs = render(scene, options, folder, module)
+            ours, theirs = render(scene, options, folder, module, passes.get(scene, ()))
             rows.append(row(scene, ours, theirs))
             show(ours.mean(0), theirs.mean(0), OUT / f"{name}-{scene}.png")
             print(*rows[-1], flush=True)

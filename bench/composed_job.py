@@ -4,7 +4,7 @@
 
 The job names the extension's zip, a .drgs, the module with the scene in its `SCENES` (this one or another), a folder
 of HDRIs, the .blend to write, size and bounces, and pictures: engine, seed, samples and the .npy they go to, (h, w, 4),
-linear, row 0 on top.
+linear, row 0 on top. Where it names passes, each picture is left as the multilayer EXR file of that name instead.
 """
 
 from __future__ import annotations
@@ -59,6 +59,17 @@ def ball(look: bpy.types.Material, radius: float, at: tuple[float, float, float]
 def cube(look: bpy.types.Material, size: float, at: tuple[float, float, float], turn: float = 0) -> bpy.types.Object:
     bpy.ops.mesh.primitive_cube_add(size=size, location=at, rotation=(0, 0, turn))
     return finish("Cube", look)
+
+
+def monkey(
+    name: str, tree_of: str, at: tuple[float, float, float] = (0, 0, 0.6), turn: float = 0.0
+) -> bpy.types.Object:
+    """Suzanne, smooth, twice subdivided, with a UV map and the material `tree_of`."""
+    bpy.ops.mesh.primitive_monkey_add(size=1.1, location=at, rotation=(0, 0, turn))
+    obj = bpy.context.active_object
+    obj.modifiers.new("Smooth", "SUBSURF").levels = 2
+    bpy.ops.object.modifier_apply(modifier="Smooth")
+    return finish(name, bpy.data.materials[tree_of], smooth=True)
 
 
 def subject(path: str, turn: float = 0.0) -> bpy.types.Object:
@@ -227,7 +238,11 @@ def build(job: dict) -> bpy.types.Scene:
     render.film_transparent = True
     scene.view_settings.view_transform = "Raw"
     image = render.image_settings
-    image.file_format, image.color_depth, image.color_mode = "OPEN_EXR", "32", "RGBA"
+    if job["passes"]:
+        image.media_type = "MULTI_LAYER_IMAGE"
+    else:
+        image.file_format, image.color_mode = "OPEN_EXR", "RGBA"
+    image.color_depth = "32"
     cycles = scene.cycles
     cycles.device, cycles.use_adaptive_sampling, cycles.use_denoising = "CPU", False, False
     cycles.pixel_filter_type, cycles.filter_width = "BOX", 1.0
@@ -251,6 +266,8 @@ def picture(scene: bpy.types.Scene, engine: str, seed: int, samples: int, path: 
     scene.drgs.seed, scene.drgs.samples = seed, samples
     scene.render.filepath = str(path.with_suffix(".exr"))
     bpy.ops.render.render(write_still=True)
+    if scene.render.image_settings.file_format == "OPEN_EXR_MULTILAYER":
+        return
     image = bpy.data.images.load(scene.render.filepath)
     image.colorspace_settings.name = "Non-Color"
     pixels = np.empty(image.size[0] * image.size[1] * 4, np.float32)

@@ -34,7 +34,7 @@ def plain_shading() -> None:
     """Let all materials and objects of the file be what both programs solve alike.
 
     GGX without multiple scattering, but for materials with the property "multiscatter"; Cycles' shadow terminator
-    offsets, which are no physics, off.
+    offsets, which are no physics, off, but for objects with the property "own_terminator".
     """
     for material in bpy.data.materials:
         if "multiscatter" in material:
@@ -43,6 +43,8 @@ def plain_shading() -> None:
             if getattr(node, "distribution", "") == "MULTI_GGX":
                 node.distribution = "GGX"
     for obj in bpy.data.objects:
+        if "own_terminator" in obj:
+            continue
         obj.shadow_terminator_geometry_offset = obj.shadow_terminator_shading_offset = 0.0
 
 

@@ -9,21 +9,12 @@ from pathlib import Path
 import bpy
 import numpy as np
 from bsdf_scenes import BSDFS
-from composed_job import add_light, ball, camera, cube, finish, floor, material, subject, world
+from composed_job import add_light, ball, camera, cube, finish, floor, material, monkey, subject, world
+from feature_scenes import FEATURES
+from image_scenes import IMAGES
 from scene_nodes import look, node, painted_image
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
-
-
-def monkey(
-    name: str, tree_of: str, at: tuple[float, float, float] = (0, 0, 0.6), turn: float = 0.0
-) -> bpy.types.Object:
-    """Suzanne, smooth, twice subdivided, with a UV map and the material `tree_of`."""
-    bpy.ops.mesh.primitive_monkey_add(size=1.1, location=at, rotation=(0, 0, turn))
-    obj = bpy.context.active_object
-    obj.modifiers.new("Smooth", "SUBSURF").levels = 2
-    bpy.ops.object.modifier_apply(modifier="Smooth")
-    return finish(name, bpy.data.materials[tree_of], smooth=True)
 
 
 def stage() -> None:
@@ -240,4 +231,4 @@ SCENES: dict[str, Callable[[dict], None]] = {
         helmet, statue, normal_map, bump, colours, coordinates, leaves, veil, sky, procedural_world, procedural, forest,
         workshop,
     )
-} | BSDFS  # fmt: skip
+} | BSDFS | IMAGES | FEATURES  # fmt: skip

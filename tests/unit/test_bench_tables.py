@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("torch")
@@ -12,6 +13,7 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / "bench"))
 
 import bench_asset
 import bench_baselines
+import bench_materials
 from bench_evaluate import similarity
 from report import table
 
@@ -44,3 +46,34 @@ def test_rows_of_earlier_runs_have_dashes_in_columns_that_they_lack():
     head, rule, old = table(columns, [("spot", "DR-GS", "1", "2", "3", "4")]).splitlines()
     assert head.count("|") == rule.count("|") == old.count("|") == len(columns) + 1
     assert old.endswith("| 4 | - | - |")
+
+
+def test_rows_of_some_scenes_go_where_the_order_has_them_and_the_others_stay():
+    kept = [(name, "once", "50.0", "44.0", "+0.00%", "45.0") for name in ("helmet", "glass")]
+    columns = ("Scene", "", "No noise, dB", "PSNR dB", "Mean light", "Cycles itself")
+    section = "<!-- begin materials -->\n## Title\n\nPictures of 384 spp and 384 samples.\n\n" + table(columns, kept)
+    section += "\n\n`python bench/bench_materials.py`"
+    run = "\n\nRows that name 9 and 9 samples:\n\n`python bench/bench_materials.py --scenes {}` · 2026-11-26"
+    section += run.format("glass bump") + run.format("bump helmet") + "\n<!-- end materials -->"
+    new = [(name, "again", "60.0", "50.0", "+0.01%", "55.0") for name in ("terminator", "bump", "helmet")]
+    text = bench_materials.replaced(section, new, "64 and 96 samples")
+    rows = [line for line in text.splitlines() if line.startswith("|")][2:]
+    assert [row.split(" | ")[0] for row in rows] == ["| helmet", "| bump", "| glass", "| terminator"]
+    assert rows[2] in section and all("again (64 and 96 samples)" in rows[i] for i in (0, 1, 3))
+    assert "`python bench/bench_materials.py`" in text
+    assert run.format("glass bump") in text and "bump helmet" not in text
+    again = bench_materials.replaced(section, new, "384 and 384 samples")
+    assert "| again |" in again and "Rows measured alone:" in again
+
+
+def test_of_several_passes_the_row_has_the_worst():
+    """Its name is in the row, and its pixels alone decide."""
+    name, passes = next(iter(bench_materials.PASSES.items()))
+    rng = np.random.default_rng(1)
+    theirs = rng.uniform(0.2, 0.6, (2, 24, 24 * len(passes), 4)).astype(np.float32)
+    theirs[..., 3] = 1.0
+    theirs[1] = theirs[0]
+    ours = theirs.copy()
+    ours[:, :, 24:48, :3] *= 1.1
+    row = bench_materials.row(name, ours, theirs)
+    assert row[1].endswith(passes[1]) and row[4] == "+10.00%" and 25 < float(row[3]) < 35
