@@ -20,7 +20,7 @@ from scipy.ndimage import binary_erosion
 
 SCENES = {
     "helmet": "a glTF file: normal, metallic and roughness maps, five materials, lenses of alpha",
-    "statue": "a glTF file: gilded, normal map",
+    "statue": "a glTF file: gilded, normal map; 128 sub-pixel samples",
     "normal_map": "normal map, strength .8",
     "bump": "heights",
     "colours": "colour attribute of corners, float attribute of points as roughness",

@@ -254,7 +254,8 @@ def build(job: dict) -> bpy.types.Scene:
     cycles.caustics_reflective = cycles.caustics_refractive = True
     cycles.light_sampling_threshold = 0.0
     settings = scene.drgs
-    settings.subpixel_samples, settings.camera_sees, settings.bounces = 16, "mesh", job["bounces"]
+    settings.subpixel_samples, settings.camera_sees = job.get("subpixels", 16), "mesh"
+    settings.bounces = job["bounces"]
     settings.denoise, settings.filter_width = "none", 0.0  # the box of Cycles above
     bpy.ops.wm.save_as_mainfile(filepath=job["blend"])
     return scene
