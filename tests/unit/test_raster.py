@@ -159,9 +159,9 @@ def test_small_surfels_count_by_their_area(subpixels: int) -> None:
     """Stripes of coarse black and of fine white surfels, all smaller than the filter, are grey and opaque."""
     stripes = []
     for k in range(-20, 20):
-        spacing, white = (0.01, 1.0) if k % 2 else (0.05, 0.0)
-        across = 0.05 * k + np.arange(0, 0.05 - 1e-9, spacing) + spacing / 2
-        x, z = (a.ravel() for a in np.meshgrid(across, np.arange(-1, 1, spacing) + spacing / 2))
+        spacing, white = (0.02, 1.0) if k % 2 else (0.06, 0.0)
+        across = 0.06 * k + np.arange(0, 0.06 - 1e-9, spacing) + spacing / 2
+        x, z = (a.ravel() for a in np.meshgrid(across, np.arange(-1.2, 1.2, spacing) + spacing / 2))
         sigma = 0.8 * spacing
         stripes.append(
             surfels(np.stack([x, 0 * x, z], -1), [sigma, 0, 0], [0, 0, sigma], opacity=0.99, albedo=(white,) * 3)

@@ -16,7 +16,7 @@ from ...compute.warp.kernels import Launcher, ScratchArray, WarpKernel
 from ..camera import CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, lattice, pixel_shift
 from ..sampling import ONE, ZERO, F
 from ..surfel_columns import ALBEDO, METALLIC, NORMAL, OPACITY, ROUGHNESS, SAMPLE, SIZE
-from ..surfels.blending import GAP, MIN_TRANSMITTANCE
+from ..surfels.blending import BEHIND, GAP, MIN_TRANSMITTANCE, behind_of, goes_on
 from ..surfels.raster import SurfelSamples, gaussian
 from ..surfels.splats import CUT, DIM, LOW, MAX_ALPHA, RX, RY, SHARE, TILE, ZC, A, B, D, N, Splats
 
@@ -59,6 +59,8 @@ class PixelPosition(NamedTuple):
         Its position, pixels.
     near, far : float
         Clip range, metres.
+    pixel_base, pixel, behind : float
+        As of `surfels.raster.View`.
     """
 
     x: int
@@ -67,6 +69,9 @@ class PixelPosition(NamedTuple):
     py: np.float32
     near: np.float32
     far: np.float32
+    pixel_base: np.float32
+    pixel: np.float32
+    behind: np.float32
 
 
 def meet(screen: Any, i: Any, opacity: Any, near: Any, far: Any, x: Any, y: Any) -> Any:
@@ -87,13 +92,16 @@ def meet(screen: Any, i: Any, opacity: Any, near: Any, far: Any, x: Any, y: Any)
     return cover, cover if exact <= filtered else screen[i, SHARE] * cover, depth
 
 
-def insert(lists_z: Any, lists_a: Any, lists_i: Any, n: Any, z: Any, alpha: Any, splat: Any) -> None:
+def insert(
+    lists_z: Any, lists_c: Any, lists_a: Any, lists_i: Any, n: Any, z: Any, cover: Any, alpha: Any, splat: Any
+) -> None:
     """Put a contribution behind those of n that are not farther; if the list is full, its last one goes."""
     k = min(n, MOST - 1)
     while k > 0 and lists_z[k - 1] > z:
-        lists_z[k], lists_a[k], lists_i[k] = lists_z[k - 1], lists_a[k - 1], lists_i[k - 1]
+        lists_z[k], lists_c[k] = lists_z[k - 1], lists_c[k - 1]
+        lists_a[k], lists_i[k] = lists_a[k - 1], lists_i[k - 1]
         k = k - 1
-    lists_z[k], lists_a[k], lists_i[k] = z, alpha, np.int32(splat)
+    lists_z[k], lists_c[k], lists_a[k], lists_i[k] = z, cover, alpha, np.int32(splat)
 
 
 def settle(sums: Any, owner: Any) -> None:
@@ -129,38 +137,39 @@ def add(sums: Any, owner: Any, surface: Any, i: Any, z: Any, w: Any) -> None:
 def gather(lists: Any, splats: Any, first: Any, last: Any, position: PixelPosition, passed: Any) -> Any:
     """List the nearest contributions of the entries first .. last of the tiles' list to a sample.
 
-    `passed` is the light that is left, the depth and the splat behind which to look; how many there are, those left out
-    included, and the transmittance by their coverage.
+    `passed` is what is left by strength and by coverage, the depth behind which none counts, and the depth and the
+    splat behind which to look; how many there are, those left out included.
     """
-    lists_z, lists_a, lists_i = lists
+    lists_z, lists_c, lists_a, lists_i = lists
     screen, surface, box, nearest, _, _, tile_list = splats
-    t, after, after_splat = passed
+    t, seen_through, behind, after, after_splat = passed
     stop = F(MIN_TRANSMITTANCE)
-    n, left, clear, farthest = 0, t, ONE, F(-1e30)
+    n, left, clear, farthest = 0, t, seen_through, F(-1e30)
     for entry in range(first, last):
         i = np.int64(tile_list[entry])
         if position.x < box[i, 0] or position.x >= box[i, 2] or position.y < box[i, 1] or position.y >= box[i, 3]:
             continue
-        if left < stop and nearest[i] >= farthest:
+        if (left < stop and nearest[i] >= farthest) or nearest[i] > behind:
             continue
         cover, alpha, z = meet(screen, i, surface[i, OPACITY], position.near, position.far, position.px, position.py)
-        if not alpha > ZERO or (left < stop and not z < farthest):
+        if not alpha > ZERO or (left < stop and not z < farthest) or z > behind:
             continue
         if z < after or (z == after and i <= after_splat):
             continue
         if n < MOST or z < lists_z[MOST - 1]:
-            insert(lists_z, lists_a, lists_i, n, z, alpha, i)
+            insert(lists_z, lists_c, lists_a, lists_i, n, z, cover, alpha, i)
         n += 1
+        farthest = max(farthest, z)
         left = left * (ONE - alpha)
         clear = clear * (ONE - cover)
-        farthest = max(farthest, z)
-    return n, clear
+        behind = behind_of(clear, behind, farthest, position.pixel_base, position.pixel, position.behind)
+    return n
 
 
 def blend_samples(thread: Any, stride: Any, scratch: Any, splats: Any, p: Any, rows: Rows, out: Any) -> None:
     """Blend samples as `raster._blend` does; `splats` are the arrays of `Splats`."""
-    lists_z, lists_a, lists_i, sums, owner = scratch
-    lists = lists_z, lists_a, lists_i
+    lists_z, lists_c, lists_a, lists_i, sums, owner = scratch
+    lists = lists_z, lists_c, lists_a, lists_i
     _, surface, _, _, objects, tile_start, _ = splats
     x0, y0, subpixels = rows.x0, rows.y0, rows.subpixels
     out_alpha, out_depth, out_surface, out_object = out
@@ -172,7 +181,7 @@ def blend_samples(thread: Any, stride: Any, scratch: Any, splats: Any, p: Any, r
     slope = F(1.0 / min(p[FX], p[FY]))
     pixel = ZERO if p[ORTHOGRAPHIC] != 0.0 else slope
     pixel_base = slope if p[ORTHOGRAPHIC] != 0.0 else ZERO
-    stop = F(MIN_TRANSMITTANCE)
+    reach = F(BEHIND / math.sqrt(p[SUBPIXELS]))
     for sample in range(thread, (rows.y1 - y0) * columns * subpixels, stride):
         number = sample % subpixels
         column, row = sample // subpixels % columns, sample // (subpixels * columns)
@@ -182,26 +191,31 @@ def blend_samples(thread: Any, stride: Any, scratch: Any, splats: Any, p: Any, r
         jx, jy = lattice(shift_x, shift_y, number, p)
         for c in range(_SUMS):
             sums[0, c], sums[1, c] = ZERO, ZERO
-        t, clear, before, before_size = ONE, ONE, ZERO, F(1e30)
-        after, after_splat = F(-1e30), np.int64(-1)
-        position = PixelPosition(x, y, F(x + jx), F(y + jy), near, far)
+        t, clear, behind, before, before_size = ONE, ONE, F(np.inf), ZERO, F(1e30)
+        after, after_splat, taken = F(-1e30), np.int64(-1), 0
+        position = PixelPosition(x, y, F(x + jx), F(y + jy), near, far, pixel_base, pixel, reach)
         more: Any = True
         while more:
-            first = after_splat < 0
-            n, among = gather(lists, splats, tile_start[tile], tile_start[tile + 1], position, (t, after, after_splat))
-            clear = among if first else clear
+            passed = t, clear, behind, after, after_splat
+            n = gather(lists, splats, tile_start[tile], tile_start[tile + 1], position, passed)
             k = 0
-            while k < min(n, MOST) and t >= stop:
+            more = n > MOST
+            while k < min(n, MOST):
                 z, alpha, i = lists_z[k], lists_a[k], np.int64(lists_i[k])
+                if not goes_on(t, clear, behind, z, taken):
+                    more = False
+                    break
                 share = t * alpha
                 t = t * (ONE - alpha)
+                clear = clear * (ONE - lists_c[k])
+                behind = behind_of(clear, behind, z, pixel_base, pixel, reach)
                 size = max(surface[i, SIZE], pixel_base + pixel * z)
                 if z - before > F(0.5 * GAP) * (size + before_size):
                     settle(sums, owner)
                 add(sums, owner, surface, i, z, share)
                 before, before_size, after, after_splat = z, size, z, i
                 k += 1
-            more = n > MOST and t >= stop
+                taken += 1
         settle(sums, owner)
         total = sums[1, _WEIGHT]
         if not total > ZERO:
@@ -210,7 +224,7 @@ def blend_samples(thread: Any, stride: Any, scratch: Any, splats: Any, p: Any, r
         nx, ny, nz = sums[1, _NORMAL], sums[1, _NORMAL + 1], sums[1, _NORMAL + 2]
         length = F(math.sqrt(nx * nx + ny * ny + nz * nz))
         f = ONE / length if length > F(1e-6) * total else ZERO
-        out_alpha[row, column, number] = ONE - (t if t < stop else min(t, clear))
+        out_alpha[row, column, number] = ONE - clear
         out_depth[row, column, number] = sums[1, _DEPTH] * g
         for c in range(3):
             out_surface[row, column, number, NORMAL + c] = f * sums[1, _NORMAL + c]
@@ -220,6 +234,7 @@ def blend_samples(thread: Any, stride: Any, scratch: Any, splats: Any, p: Any, r
 
 
 _SCRATCH = (
+    ScratchArray("float32", (MOST,)),
     ScratchArray("float32", (MOST,)),
     ScratchArray("float32", (MOST,)),
     ScratchArray("int32", (MOST,)),

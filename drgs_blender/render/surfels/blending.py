@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import inlined, njit
 from ..surfel_columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
 
 #: Samples that vector code works on at a time; a tile's side and the capacity of `Contributions` are multiples of it.
@@ -20,6 +20,10 @@ MANY = 128
 GAP = 3.0
 #: Blending stops once no more than this part of the background is left.
 MIN_TRANSMITTANCE = 1e-4
+#: Where surfels smaller than the filter cover a sample before their weights, less than their coverage, are used up, it
+#: goes on behind that depth: so many pixels times the root of the samples per pixel, the depth that a slope of 2 has
+#: within the filter; and to so many contributions.
+BEHIND, MOST_BEHIND = 9.4, 512
 
 Array = np.ndarray
 
@@ -33,14 +37,17 @@ class Contributions(NamedTuple):
         Places in each list.
     depth : (LANES * capacity,) float32 array
         Metres along the view axis.
-    strength : (LANES * capacity,) float32 array
+    cover : (LANES * capacity,) float32 array
         Opacity times kernel.
+    strength : (LANES * capacity,) float32 array
+        The same, of surfels smaller than the filter times their share of it (`splats.SHARE`).
     splat : (LANES * capacity,) int32 array
         Its number.
     """
 
     capacity: int
     depth: Array
+    cover: Array
     strength: Array
     splat: Array
 
@@ -146,8 +153,8 @@ def sort(lists, base, n, scratch):  # type: ignore[no-untyped-def]
 
 
 @njit
-def prune(lists, base, n, scratch):  # type: ignore[no-untyped-def]
-    """Sort the contributions of a sample in place, and drop those behind the point where it is opaque.
+def prune(lists, base, n, scratch, view):  # type: ignore[no-untyped-def]
+    """Sort the contributions of a sample in place, and drop those behind the point where blending stops.
 
     Parameters
     ----------
@@ -157,6 +164,8 @@ def prune(lists, base, n, scratch):  # type: ignore[no-untyped-def]
         First entry of the sample, and how many.
     scratch : Scratch
         Written.
+    view : View
+        See `raster`.
 
     Returns
     -------
@@ -164,21 +173,61 @@ def prune(lists, base, n, scratch):  # type: ignore[no-untyped-def]
         How many remain.
     """
     sort(lists, base, n, scratch)
-    z, alpha, splat, order = lists.depth, lists.strength, lists.splat, scratch.order
-    old_z, old_alpha, old_splat = (
+    z, cover, alpha, splat, order = lists.depth, lists.cover, lists.strength, lists.splat, scratch.order
+    old_z, old_cover, old_alpha, old_splat = (
         z[base : base + n].copy(),
+        cover[base : base + n].copy(),
         alpha[base : base + n].copy(),
         splat[base : base + n].copy(),
     )
-    t = np.float32(1.0)
+    t, clear, behind = np.float32(1.0), np.float32(1.0), np.float32(np.inf)
     kept = 0
-    for k in range(n):
-        z[base + k], alpha[base + k], splat[base + k] = old_z[order[k]], old_alpha[order[k]], old_splat[order[k]]
-        t *= np.float32(1.0) - alpha[base + k]
+    while kept < n and goes_on(t, clear, behind, old_z[order[kept]], kept):
+        k = order[kept]
+        z[base + kept], cover[base + kept], alpha[base + kept] = old_z[k], old_cover[k], old_alpha[k]
+        splat[base + kept] = old_splat[k]
+        t *= np.float32(1.0) - old_alpha[k]
+        clear *= np.float32(1.0) - old_cover[k]
+        behind = behind_of(clear, behind, old_z[k], view.pixel_base, view.pixel, view.behind)
         kept += 1
-        if t < np.float32(MIN_TRANSMITTANCE):
-            break
     return kept
+
+
+@inlined
+def goes_on(t, clear, behind, z, k):  # type: ignore[no-untyped-def]
+    """Whether the k-th contribution of a sample, at depth `z`, still counts.
+
+    Parameters
+    ----------
+    t, clear : float32
+        Transmittance of those before, by strength and by coverage.
+    behind : float32
+        See `behind_of`.
+    z : float32
+        Metres.
+    k : int64
+    """
+    stop = np.float32(MIN_TRANSMITTANCE)
+    return (t >= stop) & ((clear >= stop) | ((z <= behind) & (k < MOST_BEHIND)))
+
+
+@inlined
+def behind_of(clear, behind, z, pixel_base, pixel, reach):  # type: ignore[no-untyped-def]
+    """Depth behind which nothing counts, metres: infinite until contributions cover the sample.
+
+    Parameters
+    ----------
+    clear : float32
+        Transmittance by coverage, with the contribution at depth `z`.
+    behind : float32
+        As it was.
+    z, pixel_base, pixel : float32
+        ``pixel_base + pixel z`` is the width of a pixel at depth z, m.
+    reach : float32
+        Pixels, of `BEHIND`.
+    """
+    covered = (clear < np.float32(MIN_TRANSMITTANCE)) & (behind == np.float32(np.inf))
+    return z + reach * (pixel_base + pixel * z) if covered else behind
 
 
 @njit
@@ -195,7 +244,8 @@ def contributions(capacity):  # type: ignore[no-untyped-def]
     Contributions
     """
     size = LANES * capacity
-    return Contributions(capacity, np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.int32))
+    depth, cover, strength = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
+    return Contributions(capacity, depth, cover, strength, np.empty(size, np.int32))
 
 
 @njit
@@ -231,14 +281,15 @@ def widen(lists):  # type: ignore[no-untyped-def]
         old, new = capacity * lane, 2 * capacity * lane
         for k in range(capacity):  # assigning slices would take a second to compile
             wider.depth[new + k] = lists.depth[old + k]
+            wider.cover[new + k] = lists.cover[old + k]
             wider.strength[new + k] = lists.strength[old + k]
             wider.splat[new + k] = lists.splat[old + k]
     return wider
 
 
 @njit
-def weigh(surface, lists, base, n, scratch, pixel_base, pixel):  # type: ignore[no-untyped-def]
-    """Weights (transmittance times alpha) of the sorted contributions of a sample, and its heaviest cluster.
+def weigh(surface, lists, base, n, scratch, view):  # type: ignore[no-untyped-def]
+    """Weights (transmittance times strength) of the sorted contributions of a sample, and its heaviest cluster.
 
     Parameters
     ----------
@@ -249,13 +300,13 @@ def weigh(surface, lists, base, n, scratch, pixel_base, pixel):  # type: ignore[
         First entry of the sample, and how many.
     scratch : Scratch
         `order` is read, see `sort`; `weights` is written.
-    pixel_base, pixel : float32
-        ``pixel_base + pixel z`` is the width of a pixel at depth z, m.
+    view : View
+        See `raster`.
 
     Returns
     -------
-    t : float32
-        Transmittance of all.
+    clear : float32
+        Transmittance of all, by their coverage.
     weight : float32
         Of the heaviest cluster; so the others.
     depth : float32
@@ -266,18 +317,22 @@ def weigh(surface, lists, base, n, scratch, pixel_base, pixel):  # type: ignore[
         Its contributions, half-open, in their order.
     """
     order, weights = scratch.order, scratch.weights
-    depths, strengths, splats = lists.depth, lists.strength, lists.splat
-    zero, one, stop = np.float32(0.0), np.float32(1.0), np.float32(MIN_TRANSMITTANCE)
-    t, last, last_size = one, zero, np.float32(1e30)
+    depths, covers, strengths, splats = lists.depth, lists.cover, lists.strength, lists.splat
+    zero, one = np.float32(0.0), np.float32(1.0)
+    t, clear, behind, last, last_size = one, one, np.float32(np.inf), zero, np.float32(1e30)
     weight, depth, heaviest, owner, begin = zero, zero, zero, np.int32(0), 0
     best_weight, best_depth, best_owner, best_begin, best_end = zero, zero, np.int32(0), 0, 0
     k = 0
-    while (k < n) & (t >= stop):
+    while k < n:
         at = np.uintp(base + order[np.uintp(k)])
         z, alpha, i = depths[at], strengths[at], np.uintp(splats[at])
+        if not goes_on(t, clear, behind, z, k):
+            break
         share = t * alpha
         t = t * (one - alpha)
-        size = max(surface[i, SIZE], pixel_base + pixel * z)
+        clear = clear * (one - covers[at])
+        behind = behind_of(clear, behind, z, view.pixel_base, view.pixel, view.behind)
+        size = max(surface[i, SIZE], view.pixel_base + view.pixel * z)
         if z - last > np.float32(0.5 * GAP) * (size + last_size):
             if weight > best_weight:
                 best_weight, best_depth, best_owner, best_begin, best_end = weight, depth, owner, begin, k
@@ -291,7 +346,7 @@ def weigh(surface, lists, base, n, scratch, pixel_base, pixel):  # type: ignore[
         k += 1
     if weight > best_weight:
         best_weight, best_depth, best_owner, best_begin, best_end = weight, depth, owner, begin, k
-    return t, best_weight, best_depth, best_owner, best_begin, best_end
+    return clear, best_weight, best_depth, best_owner, best_begin, best_end
 
 
 @njit

@@ -11,7 +11,8 @@ transmittance is below 1e-4.
 Surfels smaller than the filter. Where the low-pass decides, a surfel's weight in the means is its alpha times the part
 of the filter's area that it fills (`splats.SHARE`; Yu et al. 2024, "Mip-Splatting", equation 9): else many small
 surfels would count for more than the few large ones beside them, and the nearest would be all that is seen of a slope.
-Coverage is of the alphas without that part, so that no object fades with its distance.
+Coverage is of the alphas without that part, so that no object fades with its distance; a little behind the depth where
+it is full, blending ends (`blending.BEHIND`).
 
 Order. Contributions are blended by the depth at which the ray meets them, not by that of the surfels' centres: every
 sample lists its contributions and sorts them once all are there. A list that is full is sorted early and cut where the
@@ -37,7 +38,7 @@ from ...compute.jit import inlined, njit
 from ...compute.threads import over_strided
 from ..camera import CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, lattice, pixel_shift
 from ..surfel_columns import OPACITY, SAMPLE, SPLAT
-from .blending import GAP, LANES, MIN_TRANSMITTANCE, contributions, mean, prune, scratch_for, sort, weigh, widen
+from .blending import BEHIND, GAP, LANES, MIN_TRANSMITTANCE, contributions, mean, prune, scratch_for, sort, weigh, widen
 from .splats import (
     CUT,
     DIM,
@@ -61,9 +62,9 @@ Array = np.ndarray
 __all__ = ["GAP", "SurfelSamples", "rasterise"]
 
 # Rows of the state of a block, `LANES` samples that vector code works on at a time: position; transmittance of all
-# contributions gathered, by weights and by coverage, and the depth of the farthest; strength and depth of the splat at
-# hand.
-_X, _Y, _LEFT, _CLEAR, _FARTHEST, _ALPHA, _DEPTH, _BLOCK = (np.uintp(LANES * k) for k in range(8))
+# contributions gathered, by strength and by coverage; the depth of the farthest, and that behind which none counts;
+# strength, coverage and depth of the splat at hand.
+_X, _Y, _LEFT, _CLEAR, _FARTHEST, _BEHIND, _ALPHA, _COVER, _DEPTH, _BLOCK = (np.uintp(LANES * k) for k in range(10))
 # Columns of a splat's record that are free on the screen: opacity and nearest depth.
 _STRENGTH, _NEAREST = RECORD - 2, RECORD - 1
 #: Contributions of a sample there is room for at first.
@@ -106,6 +107,8 @@ class View(NamedTuple):
         Clip range, metres.
     pixel_base, pixel : float
         A pixel at depth z is ``pixel_base + pixel * z`` metres wide.
+    behind : float
+        `blending.BEHIND` for these samples, pixels.
     """
 
     parameters: Array
@@ -115,6 +118,7 @@ class View(NamedTuple):
     far: np.float32
     pixel_base: np.float32
     pixel: np.float32
+    behind: np.float32
 
 
 class Tile(NamedTuple):
@@ -199,12 +203,13 @@ def gaussian(q):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _meet(screen, i, opacity, near, far, state, first, last):  # type: ignore[no-untyped-def]
+def _meet(screen, i, opacity, view, state, first, last):  # type: ignore[no-untyped-def]
     """Splat i at the lanes first .. last of a block: strength (0 where it has no part) and depth; how many have one.
 
     One array, constant distances, no branch: the loop becomes vector code.
     """
     big, zero, one, stop = np.float32(1e30), np.float32(0.0), np.float32(1.0), np.float32(MIN_TRANSMITTANCE)
+    near, far, wide, slope = view.near, view.far, view.behind * view.pixel_base, view.behind * view.pixel
     rx, ry, zc = screen[i, RX], screen[i, RY], screen[i, ZC]
     cut, low, dim, share = screen[i, CUT], screen[i, LOW], screen[i, DIM], screen[i, SHARE]
     a0, a1, a2 = screen[i, A], screen[i, A + 1], screen[i, A + 2]
@@ -225,16 +230,22 @@ def _meet(screen, i, opacity, near, far, state, first, last):  # type: ignore[no
         take = exact <= filtered
         q = exact if take else filtered
         z = z if take else zc
-        before, farthest = state[at + _LEFT], state[at + _FARTHEST]
+        before, clear, farthest = state[at + _LEFT], state[at + _CLEAR], state[at + _FARTHEST]
         inside = (np.int32(j) >= first) & (np.int32(j) < last)
-        seen = inside & (q < cut) & (z > near) & (z < far) & ((before >= stop) | (z < farthest))
+        counts = ((before >= stop) | (z < farthest)) & (z < state[at + _BEHIND])
+        seen = inside & (q < cut) & (z > near) & (z < far) & counts
         cover = min(opacity * gaussian(q), np.float32(MAX_ALPHA)) if seen else zero
         alpha = cover if take else share * cover
+        farthest = z if seen & (z > farthest) else farthest
+        left = clear * (one - cover)
+        covered = (clear >= stop) & (left < stop)
         state[at + _ALPHA] = alpha
+        state[at + _COVER] = cover
         state[at + _DEPTH] = z
         state[at + _LEFT] = before * (one - alpha)
-        state[at + _CLEAR] = state[at + _CLEAR] * (one - cover)
-        state[at + _FARTHEST] = z if seen & (z > farthest) else farthest
+        state[at + _CLEAR] = left
+        state[at + _FARTHEST] = farthest
+        state[at + _BEHIND] = farthest + (wide + slope * farthest) if covered else state[at + _BEHIND]
         hits = np.int32(hits + np.int32(seen))
     return hits
 
@@ -295,7 +306,7 @@ def _limit(state):  # type: ignore[no-untyped-def]
     for lane in range(LANES):
         k = np.uintp(lane)
         is_open = state[_LEFT + k] >= np.float32(MIN_TRANSMITTANCE)
-        limit = max(limit, np.float32(1e30) if is_open else state[_FARTHEST + k])
+        limit = max(limit, min(np.float32(1e30) if is_open else state[_FARTHEST + k], state[_BEHIND + k]))
     return limit
 
 
@@ -307,7 +318,7 @@ def _place(view, tile, y, first, state):  # type: ignore[no-untyped-def]
         k = np.uintp(lane)
         x = tile.x + (first + lane) // view.subpixels
         state[_X + k] = state[_Y + k] = state[_LEFT + k] = zero
-        state[_CLEAR + k] = np.float32(1.0)
+        state[_CLEAR + k], state[_BEHIND + k] = np.float32(1.0), np.float32(np.inf)
         state[_FARTHEST + k] = np.float32(-1e30)
         if tile.left <= x < tile.right:
             shift_x, shift_y = pixel_shift(view.parameters, y * view.width + x)
@@ -321,8 +332,8 @@ def _gather(own, binned, begin, end, first, view, state, count, lists):  # type:
 
     Returns the splat to go on with: it is less than `end` when a sample's list is full.
     """
-    screen, span, capacity, near, far = own.screen, own.span, lists.capacity, view.near, view.far
-    depth, strength, splat = lists.depth, lists.strength, lists.splat
+    screen, span, capacity = own.screen, own.span, lists.capacity
+    depth, cover, strength, splat = lists.depth, lists.cover, lists.strength, lists.splat
     limit = np.float32(1e30)
     for entry in range(begin, end):
         i = np.uintp(binned[np.uintp(entry)])
@@ -331,7 +342,7 @@ def _gather(own, binned, begin, end, first, view, state, count, lists):  # type:
         if screen[i, _NEAREST] >= limit:
             continue
         hits = _meet(
-            screen, i, screen[i, _STRENGTH], near, far, state,
+            screen, i, screen[i, _STRENGTH], view, state,
             np.int32(span[i, 0] - first), np.int32(span[i, 2] - first),
         )  # fmt: skip
         if hits == 0:
@@ -341,7 +352,8 @@ def _gather(own, binned, begin, end, first, view, state, count, lists):  # type:
             k = np.uintp(lane)
             n = count[k]
             to = k * np.uintp(capacity) + np.uintp(n)
-            depth[to], strength[to], splat[to] = state[_DEPTH + k], state[_ALPHA + k], i
+            depth[to], cover[to] = state[_DEPTH + k], state[_COVER + k]
+            strength[to], splat[to] = state[_ALPHA + k], i
             n += np.int32(state[_ALPHA + k] > np.float32(0.0))
             count[k] = n
             most = max(most, n)
@@ -351,9 +363,8 @@ def _gather(own, binned, begin, end, first, view, state, count, lists):  # type:
 
 
 @njit
-def _finish(own, lists, count, scratch, view, y, x, first, state, samples):  # type: ignore[no-untyped-def]
+def _finish(own, lists, count, scratch, view, y, x, first, samples):  # type: ignore[no-untyped-def]
     """Resolve the samples of a block and write them; y, x: row, and first column of the tile, of the samples."""
-    stop = np.float32(MIN_TRANSMITTANCE)
     for lane in range(LANES):
         n = np.int64(count[lane])
         if n == 0:
@@ -361,12 +372,10 @@ def _finish(own, lists, count, scratch, view, y, x, first, state, samples):  # t
         base = lane * lists.capacity
         sort(lists, base, n, scratch)
         column, k = x + (first + lane) // view.subpixels, (first + lane) % view.subpixels
-        t, total, depth, owner, begin, end = weigh(own.surface, lists, base, n, scratch, view.pixel_base, view.pixel)
+        clear, total, depth, owner, begin, end = weigh(own.surface, lists, base, n, scratch, view)
         values = mean(own.surface, lists, base, scratch, total, begin, end)
         for c in range(SAMPLE):
             samples.surface[y, column, k, c] = values[c]
-        # Of an opaque sample, not all contributions were gathered.
-        clear = t if t < stop else min(t, state[_CLEAR + np.uintp(lane)])
         samples.alpha[y, column, k] = np.float32(1.0) - clear
         samples.depth[y, column, k] = depth * (np.float32(1.0) / total)
         samples.object_index[y, column, k] = own.object_index[owner]
@@ -378,7 +387,8 @@ def _view(p):  # type: ignore[no-untyped-def]
     pixel = np.float32(0.0 if ortho else 1.0 / min(p[FX], p[FY]))
     pixel_base = np.float32(1.0 / min(p[FX], p[FY]) if ortho else 0.0)
     near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
-    return View(p, np.int64(p[WIDTH]), np.int64(p[SUBPIXELS]), near, far, pixel_base, pixel)
+    behind = np.float32(BEHIND / np.sqrt(p[SUBPIXELS]))
+    return View(p, np.int64(p[WIDTH]), np.int64(p[SUBPIXELS]), near, far, pixel_base, pixel, behind)
 
 
 @njit
@@ -426,12 +436,13 @@ def _blend(first_part, last_part, parts, splats, y0, y1, samples):  # type: igno
                 most = 0
                 for lane in range(LANES):
                     if count[lane] == lists.capacity:
-                        kept = prune(lists, lane * lists.capacity, lists.capacity, scratch)
+                        kept = prune(lists, lane * lists.capacity, lists.capacity, scratch, view)
                         if kept < lists.capacity:
-                            state[_FARTHEST + np.uintp(lane)] = lists.depth[lane * lists.capacity + kept - 1]
+                            last = lists.depth[lane * lists.capacity + kept - 1]
+                            state[_FARTHEST + np.uintp(lane)] = state[_BEHIND + np.uintp(lane)] = last
                         count[lane] = kept
                     most = max(most, count[lane])
                 if most > lists.capacity // 2:
                     lists = widen(lists)
                     scratch = scratch_for(lists.capacity)
-            _finish(own, lists, count, scratch, view, y - y0, tile.x - x0, first, state, samples)
+            _finish(own, lists, count, scratch, view, y - y0, tile.x - x0, first, samples)
