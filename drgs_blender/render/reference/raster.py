@@ -24,6 +24,10 @@ FILTER_VARIANCE = 0.5
 MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.99
 #: Blending stops once no more than this part of the background is left.
 MIN_TRANSMITTANCE = 1e-4
+#: Least part of the filter's area that a surfel fills.
+LEAST_SHARE = 1e-4
+#: Behind the depth where coverage is full, pixels times the root of the samples per pixel, and contributions at most.
+BEHIND, MOST_BEHIND = 9.4, 512
 #: Sine of the angle between ray and plane below which the intersection is not used.
 MIN_SINE = 1e-6
 
@@ -134,11 +138,13 @@ def rasterise(
 ) -> ReferenceGBuffer:
     """G-buffer of surfels at pixel positions.
 
-    Contribution i has the strength a_i = opacity_i max(G_3d, G_2d cosine), with the cosine at which it is seen, at most
+    Contribution i covers c_i = opacity_i max(G_3d, G_2d cosine), with the cosine at which it is seen, at most
     `MAX_ALPHA`, skipped below `MIN_ALPHA`. Its depth is that of the ray's intersection where G_3d is the larger, else
-    that of the centre. Sorted by depth, T_i = prod_{j<i} (1 - a_j) and the weights of the means are T_i a_i / sum. A
-    contribution counts while T_i is at least `MIN_TRANSMITTANCE`. Normals are turned to agree with the nearest
-    contribution's, their mean to the viewer.
+    that of the centre; there its strength a_i is c_i times the part of the filter's area that it fills, else c_i.
+    Sorted by depth, T_i = prod_{j<i} (1 - a_j) and the weights of the means are T_i a_i / sum; coverage is
+    1 - prod (1 - c_i). A contribution counts while T_i is at least `MIN_TRANSMITTANCE`, and so is what those before
+    leave uncovered, or it is not `BEHIND` that depth nor beyond `MOST_BEHIND`. Normals are turned to agree with the
+    nearest contribution's, their mean to the viewer.
 
     Parameters
     ----------
@@ -186,6 +192,21 @@ def _facing(splats: Splats, camera: Camera) -> Tensor:
     return torch.where(normal.norm(dim=1) > 0, cosine, torch.ones_like(cosine))
 
 
+def _share(splats: Splats, camera: Camera, depth: Tensor, samples: int) -> Tensor:
+    """(n,) part of the area of the low-pass filter that each surfel, seen face-on, fills."""
+    scale = (samples * camera.fx * camera.fy / FILTER_VARIANCE) ** 0.5
+    scale = scale if camera.orthographic else scale / depth.abs().clamp(min=1e-30)
+    along_u = (scale * torch.linalg.vector_norm(splats.tangent_u, dim=-1)).clamp(max=1)
+    along_v = (scale * torch.linalg.vector_norm(splats.tangent_v, dim=-1)).clamp(max=1)
+    return (along_u * along_v).clamp(min=LEAST_SHARE)
+
+
+def _left_before(alpha: Tensor) -> Tensor:
+    """(p, n) what the contributions before each leave."""
+    left = torch.cumprod(1 - alpha, 1)
+    return torch.cat([torch.ones_like(left[:, :1]), left[:, :-1]], 1)
+
+
 def _blend(splats: Splats, camera: Camera, position: Tensor, gap: float | None, samples: int) -> ReferenceGBuffer:
     if not len(splats.centre):
         empty, rows = position.new_zeros(len(position)), position.new_zeros(len(position), 3)
@@ -201,15 +222,22 @@ def _blend(splats: Splats, camera: Camera, position: Tensor, gap: float | None, 
     around = around * _facing(splats, camera)
 
     depth = torch.where(inside >= around, t, centre_depth.expand_as(t))
-    alpha = (splats.opacity * torch.maximum(inside, around)).clamp(max=MAX_ALPHA)
-    alpha = torch.where(alpha >= MIN_ALPHA, alpha, torch.zeros_like(alpha))
+    cover = (splats.opacity * torch.maximum(inside, around)).clamp(max=MAX_ALPHA)
+    cover = torch.where(cover >= MIN_ALPHA, cover, torch.zeros_like(cover))
+    alpha = torch.where(inside >= around, cover, cover * _share(splats, camera, centre_depth, samples))
     order = torch.argsort(depth.detach(), dim=1, stable=True)
-    alpha, depth = alpha.gather(1, order), depth.gather(1, order)
-    left = torch.cumprod(1 - alpha, 1)
-    before = torch.cat([torch.ones_like(left[:, :1]), left[:, :-1]], 1)
-    alpha = torch.where(before.detach() >= MIN_TRANSMITTANCE, alpha, torch.zeros_like(alpha))
+    alpha, cover, depth = alpha.gather(1, order), cover.gather(1, order), depth.gather(1, order)
+    before, uncovered = _left_before(alpha), _left_before(cover)
+    with torch.no_grad():
+        pixel = (1.0 if camera.orthographic else depth) / min(camera.fx, camera.fy)
+        full = (uncovered * (1 - cover) < MIN_TRANSMITTANCE) & (cover > 0)
+        end = torch.where(full, depth + BEHIND / samples**0.5 * pixel, torch.inf)
+        end = torch.where(full.any(1), end.gather(1, full.to(torch.int8).argmax(1, keepdim=True))[:, 0], torch.inf)
+        among = (depth <= end[:, None]) & (torch.cumsum(cover > 0, 1) <= MOST_BEHIND)
+        counts = (before >= MIN_TRANSMITTANCE) & ((uncovered >= MIN_TRANSMITTANCE) | among)
+    alpha = torch.where(counts, alpha, torch.zeros_like(alpha))
     weight = before * alpha
-    coverage = weight.sum(1)
+    coverage = 1 - torch.where(counts, 1 - cover, torch.ones_like(cover)).prod(1)
     depth = torch.where(weight > 0, depth, torch.zeros_like(depth))
     if gap is not None:
         with torch.no_grad():
