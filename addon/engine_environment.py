@@ -37,8 +37,8 @@ class Group(NamedTuple):
 ENGINE = Group("", 175e6, 650e6)
 #: PyTorch. On Linux the package index has it with CUDA, which the engine does not use; measured without.
 RECONSTRUCT = Group("reconstruct", 200e6, 900e6)
-#: COLMAP, OpenCV and PyAV, which find the cameras of photographs and videos.
-CAPTURE = Group("capture", 170e6, 390e6)
+#: COLMAP, OpenCV and PyAV, which find the cameras of photographs and videos; ONNX Runtime, which runs models of masks.
+CAPTURE = Group("capture", 200e6, 480e6)
 #: NVIDIA Warp, for graphics cards.
 GPU = Group("gpu", 150e6, 400e6)
 CUDA_BYTES = 3e9

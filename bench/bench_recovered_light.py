@@ -23,8 +23,9 @@ from drgs_blender.evaluate.truth import read_truth
 FIGURE = ROOT / "docs" / "images" / "recovered-light.png"
 #: Rows of the maps that are compared.
 ROWS = 32
-#: Exponents of the cosine lobes through which light is compared, by their names: what reflects it.
-LOBES = {"diffuse": 1, "lobe of 25 deg": 16, "lobe of 9 deg": 128}
+#: Exponents of the cosine lobes through which light is compared, by their names: what reflects it, and the angle at
+#: which a lobe has half of its height.
+LOBES = {"diffuse": 1, "half at 17 deg": 16, "half at 6 deg": 128}
 COLUMNS = ("Object", *(f"Light, {name}" for name in LOBES), "Brightest direction, deg")
 Array = np.ndarray
 
@@ -39,10 +40,13 @@ def directions(rows: int) -> tuple[Array, Array]:
 
 
 def reduced(radiance: Array, rows: int = ROWS) -> Array:
-    """(rows, 2 rows, 3) means of a lat-long map of any size, by boxes."""
-    grown = radiance.repeat(max(1, -(-rows // len(radiance))), 0).repeat(max(1, -(-rows // len(radiance))), 1)
-    height, width = (len(grown) // rows * rows, grown.shape[1] // (2 * rows) * 2 * rows)
-    return grown[:height, :width].reshape(rows, height // rows, 2 * rows, width // (2 * rows), 3).mean((1, 3))
+    """(rows, 2 rows, 3) means of a lat-long map, by boxes; its rows must be so many times a whole number, or parts."""
+    times = -(-rows // len(radiance))
+    grown = radiance.repeat(times, 0).repeat(times, 1)
+    if len(grown) % rows or grown.shape[1] != 2 * len(grown):
+        raise SystemExit(f"a map of {radiance.shape[:2]} pixels cannot be reduced to {rows} rows: choose another light")
+    side = len(grown) // rows
+    return grown.reshape(rows, side, 2 * rows, side, 3).mean((1, 3))
 
 
 def scaled(found: Array, true: Array, weight: Array) -> Array:

@@ -9,12 +9,14 @@ from typing import Any
 
 import bpy
 import numpy as np
-from bpy.props import BoolProperty, FloatProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 from mathutils import Matrix
 
 from ..addon import engine_link
 from ..drgs_blender.core.errors import AssetError, first_of
+from ..drgs_blender.core.file_integrity import crashes_blender
 from .base import DrgsOperator
+from .reconstruct import CAMERA_ITEMS
 
 #: Width of the sensor that the cameras get, mm: that of full frame.
 _SENSOR = 36.0
@@ -40,8 +42,18 @@ class DRGS_OT_import_cameras(DrgsOperator, bpy.types.Operator):
         name="Photographs", description="Show each photograph behind the scene in its camera's view", default=True
     )
     opacity: FloatProperty(name="Opacity", description="Of the photographs", default=0.5, min=0.0, max=1.0)
+    axes: EnumProperty(
+        name="Camera Convention",
+        description="Axes of the cameras' matrices, as the object was reconstructed with",
+        items=CAMERA_ITEMS,
+        default="opengl",
+        options={"SKIP_SAVE"},
+    )
+    use_camera: BoolProperty(name="Set Camera", description="Make the first one the camera of the scene", default=True)
     use_resolution: BoolProperty(
-        name="Set Resolution", description="Give the scene the resolution of most photographs", default=True
+        name="Set Resolution",
+        description="Give the scene the resolution of most photographs, and square pixels",
+        default=True,
     )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -50,7 +62,7 @@ class DRGS_OT_import_cameras(DrgsOperator, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context) -> set[str]:
         path = Path(bpy.path.abspath(self.chosen("Import Cameras"))).absolute()
-        found = json.loads(engine_link.output_of(["inspect", str(path), "--json"]))
+        found = json.loads(engine_link.output_of(["inspect", str(path), "--json", "--axes", self.axes]))
         if found.get("kind") != "capture":
             raise AssetError(str(path), f"is no capture, but {found.get('kind')}", "Choose photographs with cameras")
         cameras = found["cameras"]
@@ -61,29 +73,38 @@ class DRGS_OT_import_cameras(DrgsOperator, bpy.types.Operator):
         for obj in made:
             into.objects.link(obj)
         missing = [name for one, obj in zip(cameras, made) if (name := self._show(one, obj.data))]
-        context.scene.camera = made[0]
+        if self.use_camera:
+            context.scene.camera = made[0]
         if self.use_resolution:
+            render = context.scene.render
             (size, _), = Counter((one["width"], one["height"]) for one in cameras).most_common(1)  # fmt: skip
-            context.scene.render.resolution_x, context.scene.render.resolution_y = size
-            context.scene.render.resolution_percentage = 100
-        self._tell(path, cameras, missing)
+            (render.resolution_x, render.resolution_y), render.resolution_percentage = size, 100
+            render.pixel_aspect_x = render.pixel_aspect_y = 1.0
+        self._tell(path, found, missing)
         return {"FINISHED"}
 
     def _show(self, camera: dict[str, Any], data: bpy.types.Camera) -> str:
         """Put the photograph behind the camera's view; the name of one that cannot be loaded, else ""."""
         if not self.use_pictures:
             return ""
+        path = Path(camera["image"])
         try:
-            image = bpy.data.images.load(camera["image"], check_existing=True)
-        except RuntimeError:
-            return Path(camera["image"]).name
+            if crashes_blender(path.read_bytes()):
+                return f"{path.name} (cut off)"
+            image = bpy.data.images.load(str(path), check_existing=True)
+        except (RuntimeError, OSError):
+            return path.name
         background = data.background_images.new()
         background.image, background.alpha, background.frame_method = image, self.opacity, "FIT"
         data.show_background_images = True
         return ""
 
-    def _tell(self, path: Path, cameras: list[dict[str, Any]], missing: list[str]) -> None:
-        """Warn of what Blender's cameras cannot show."""
+    def _tell(self, path: Path, found: dict[str, Any], missing: list[str]) -> None:
+        """Warn of what Blender's cameras cannot show, and of what the capture assumed."""
+        cameras = found["cameras"]
+        if found["guessed"]:
+            guessed = ", ".join(f"{name} ({why})" for name, why in found["guessed"].items())
+            self.warn(f"{path}: was made without knowing {guessed}: objects made of it are where these cameras are")
         if missing:
             self.warn(f"{path}: {len(missing)} photographs cannot be loaded: {first_of(missing)}")
         if bent := [one["name"] for one in cameras if one["distorts"]]:

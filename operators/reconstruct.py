@@ -21,7 +21,7 @@ def _title(cameras: str) -> str:
 
 
 #: Choices of what the cameras' matrices are.
-_CAMERAS = (
+CAMERA_ITEMS = (
     ("opengl", "Automatic", "What the layout of the files has by convention: COLMAP, NeRF, nerfstudio"),
     *((name, _title(name), meaning.capitalize()) for name, meaning in CAMERAS.items() if name != "opengl"),
 )
@@ -117,7 +117,7 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
     axes: EnumProperty(
         name="Camera Convention",
         description="Axes of the cameras' matrices. Where another one fits better, a message names it (--axes)",
-        items=_CAMERAS,
+        items=CAMERA_ITEMS,
         default="opengl",
         options={"SKIP_SAVE"},
     )

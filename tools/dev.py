@@ -59,7 +59,7 @@ APT_PACKAGES = {
     "libxkbcommon.so.0": "libxkbcommon0",
 }
 #: The groups of dependencies in pyproject.toml that the site takes, and that tests of `drgs capture` do.
-DOCS, CAPTURE, MASKS = "docs", "capture", "masks"
+DOCS, CAPTURE = "docs", "capture"
 #: The suite of the oldest Blender, which `make check` runs, and that of the LTS, which runs when asked for.
 FLOOR, LTS = "floor", "lts"
 SUITES = {
@@ -244,10 +244,9 @@ def ensure_node() -> None:
 def ensure_capture(engine: Path) -> None:
     """Fetch the libraries of `drgs capture` into the engine's environment.
 
-    They come after it and may be missing: no demo waits for their 175 MB, and not every system has wheels of pycolmap.
+    They come after it and may be missing: no demo waits for their 165 MB, and not every system has wheels of pycolmap.
     """
-    extras = project_table()["optional-dependencies"]
-    packages = [*extras[CAPTURE], *extras[MASKS], "onnx>=1.16"]
+    packages = project_table()["optional-dependencies"][CAPTURE]
     pip = [str(engine), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--only-binary", ":all:"]
     fetch(ROOT / ".venv", "drgs-stamp-capture.json", packages, [*pip, *packages], "the libraries of drgs capture")
 

@@ -21,7 +21,7 @@ class Library(NamedTuple):
     purpose: str
 
 
-#: The table; versions as in the extras "capture" and "masks" of pyproject.toml.
+#: The table; versions as in the extra "capture" of pyproject.toml.
 LIBRARIES = {
     "pycolmap": Library("pycolmap", "pycolmap>=4.2,<4.3", "structure from motion"),
     "opencv": Library("cv2", "opencv-python-headless>=4.10", "marker sheets and masks"),

@@ -213,9 +213,9 @@ def torch(args: argparse.Namespace) -> str:
 
 
 def capture(args: argparse.Namespace) -> str:
-    """Libraries that find the cameras of photographs and videos. They are not loaded."""
+    """Libraries that find the cameras of photographs and videos, and that run models of masks. They are not loaded."""
     found, absent = [], []
-    for name in ("pycolmap", "opencv-python-headless", "av"):
+    for name in ("pycolmap", "opencv-python-headless", "av", "onnxruntime"):
         try:
             found.append(f"{name} {importlib.metadata.version(name)}")
         except importlib.metadata.PackageNotFoundError:

@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import AssetError
+from ..core.file_types import CAMERAS
+from ..formats.axes import UP_AXES
 
 EXAMPLES = """examples:
   drgs inspect helmet.drgs
@@ -34,17 +36,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs inspect``."""
     parser.add_argument("file", type=Path, metavar="FILE", help="any file (or folder) that DR-GS reads or writes")
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--axes", choices=tuple(CAMERAS), default="opengl", help="of a capture, as drgs reconstruct")
+    parser.add_argument("--up", choices=tuple(UP_AXES), help="of a capture, as drgs reconstruct")
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the description."""
-    report = {"file": str(args.file), **inspect_file(args.file)}
+    report = {"file": str(args.file), **inspect_file(args.file, args.axes, args.up)}
     print(json.dumps(report, indent=2, allow_nan=False) if args.json else "\n".join(as_lines(report)))
     return 0
 
 
-def inspect_file(path: Path) -> dict[str, Any]:
-    """Describe a file with JSON-able values; ``kind`` says what it is.
+def inspect_file(path: Path, axes: str = "opengl", up: str | None = None) -> dict[str, Any]:
+    """Describe a file with JSON-able values; ``kind`` says what it is. Of captures, `axes` and `up` as they are read.
 
     Raises
     ------
@@ -68,33 +72,23 @@ def inspect_file(path: Path) -> dict[str, Any]:
 
     if path.suffix.lower() == SUFFIX:
         return inspect_exported_frame(path)
-    if is_capture(path):
-        return inspect_capture(path)
     from ..formats.registry import find_format, read
 
-    kind = find_format(path)
+    try:
+        kind = find_format(path)
+    except AssetError:
+        if path.is_dir() or path.suffix.lower() == ".json":
+            return inspect_capture(path, axes, up)
+        raise
     return {"kind": kind.kind, "format": kind.name, **describe(read(path))}
 
 
-def is_capture(path: Path) -> bool:
-    """Whether a folder or JSON file is a capture: photographs with cameras."""
-    if not path.is_dir() and path.suffix.lower() != ".json":
-        return False
-    from ..reconstruct.readers import find_layout
-
-    try:
-        find_layout(path)
-    except AssetError:
-        return False
-    return True
-
-
-def inspect_capture(path: Path) -> dict[str, Any]:
+def inspect_capture(path: Path, axes: str = "opengl", up: str | None = None) -> dict[str, Any]:
     """Describe a capture and the camera of each photograph: Blender's axes, Z up, metres, pixels."""
     from ..reconstruct.readers import find_layout, read_layout
     from ..reconstruct.readers.layout import picture_size
 
-    layout, _ = read_layout(path)
+    layout, _ = read_layout(path, axes, up)
     lenses = [one.lens.scaled(*picture_size(one.image)) for one in layout.photographs]
     cameras = [
         {

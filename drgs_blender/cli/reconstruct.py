@@ -163,7 +163,8 @@ def run(args: argparse.Namespace) -> int:
     check_mode(reading.masks)
     source = _with_cameras(args, reading.masks)
     capture = read_capture(source, reading.resolution, reading.test_every, reading.axes, reading.up)
-    _mask(args, capture, reading.masks)
+    if source == args.capture or reading.masks == "none":  # else `drgs capture` has made them
+        _mask(args, capture, reading.masks)
     logger.info("%d views to learn from, %d left out", len(capture.training), len(capture.testing))
     work = args.out.with_name(f"{args.out.stem}.reconstruct")
 

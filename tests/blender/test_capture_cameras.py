@@ -66,8 +66,25 @@ def test_what_blenders_cameras_cannot_show_is_told(scene, capture):
     assert not bpy.data.collections["Cameras of statue"].objects["photo_0"].data.background_images
 
 
+def test_photographs_that_are_cut_off_or_gone_are_named(scene, capture):
+    folder, _ = capture
+    exr = scene.render.image_settings
+    image = bpy.data.images.new("whole", 80, 60, float_buffer=True)
+    exr.file_format = "OPEN_EXR"
+    image.save_render(str(folder / "images" / "photo_0.exr"), scene=scene)
+    data = (folder / "images" / "photo_0.exr").read_bytes()
+    (folder / "images" / "photo_0.exr").write_bytes(data[: len(data) // 2])
+    text = (folder / "transforms.json").read_text().replace("photo_0.png", "photo_0.exr")
+    (folder / "transforms.json").write_text(text)
+    before = scene.camera
+    assert bpy.ops.drgs.import_cameras(filepath=str(folder), use_camera=False) == {"FINISHED"}
+    assert scene.camera == before
+    said = [message.text for message in part("addon.messages").history]
+    assert any("1 photographs cannot be loaded: photo_0.exr (cut off)" in text for text in said)
+
+
 def test_folders_without_cameras_are_refused(scene, tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(RuntimeError, match="empty"):
+    with pytest.raises(RuntimeError, match=r"empty: is no capture\. Understood: transforms"):
         bpy.ops.drgs.import_cameras(filepath=str(tmp_path / "empty"))
     assert not [group for group in bpy.data.collections if group.name.startswith("Cameras")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -301,3 +302,13 @@ def test_pose_of_a_rig(shared_data, tmp_path, rig):
         extents.append(np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]))
         np.testing.assert_allclose(extents[-1], [expected.min(axis=0), expected.max(axis=0)], atol=1e-4)
     assert np.abs(extents[0] - extents[1]).max() > 0.01
+
+
+def test_inspect_tells_a_sog_folder_from_a_capture(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Both may be a JSON file beside pictures."""
+    packed = tmp_path / "ball.sog"
+    assert main(["convert", str(splats(tmp_path / "ball.ply")), str(packed)]) == 0
+    with zipfile.ZipFile(packed) as archive:
+        archive.extractall(tmp_path / "ball")
+    found = described(tmp_path / "ball" / "meta.json", capsys)
+    assert found["kind"] == "surfels" and found["surfels"]["centre"]["shape"] == [400, 3]

@@ -9,30 +9,58 @@ import pytest
 from PIL import Image
 from test_capture_masks import iou, run, scene, written
 
-onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
-pytest.importorskip("cv2")
+cv2 = pytest.importorskip("cv2")
+pytest.importorskip("torch")
 
+from drgs_blender.capture.masks.of_capture import mask_capture  # noqa: E402
 from drgs_blender.capture.masks.segmentation_model import SegmentationModel, find_model  # noqa: E402
 from drgs_blender.capture.masks.stage import check_mode  # noqa: E402
 from drgs_blender.core.errors import AssetError, UsageError  # noqa: E402
+from drgs_blender.reconstruct.capture.capture import Capture, View  # noqa: E402
+
+
+def field(number: int, value: bytes | str | int) -> bytes:
+    """A field of a protobuf message: a number, or text, bytes or a message with their length."""
+    if isinstance(value, int):
+        return varint(number << 3) + varint(value)
+    data = value.encode() if isinstance(value, str) else value
+    return varint(number << 3 | 2) + varint(len(data)) + data
+
+
+def varint(value: int) -> bytes:
+    head = b""
+    while value > 127:
+        head, value = head + bytes([value & 127 | 128]), value >> 7
+    return head + bytes([value])
 
 
 def write_model(path: Path, side: int | str = 96, channels: int = 3, gain: float = -40.0, shift: float = -41.0,
                 sigmoid: bool = False) -> Path:  # fmt: skip
-    """A model whose logit is ``gain * mean + shift`` of the prepared picture: 0 where its colours' mean is -1.03."""
-    helper, floats = onnx.helper, onnx.TensorProto.FLOAT
-    weights = onnx.numpy_helper.from_array(np.full((1, channels, 1, 1), gain / channels, np.float32), "w")
-    bias = onnx.numpy_helper.from_array(np.array([shift], np.float32), "b")
-    nodes = [helper.make_node("Conv", ["picture", "w", "b"], ["logit" if sigmoid else "mask"])]
-    nodes += [helper.make_node("Sigmoid", ["logit"], ["mask"])] if sigmoid else []
-    graph = helper.make_graph(
-        nodes, "dark",
-        [helper.make_tensor_value_info("picture", floats, [1, channels, side, side])],
-        [helper.make_tensor_value_info("mask", floats, [1, 1, side, side])],
-        [weights, bias],
-    )  # fmt: skip
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), str(path))
+    """A model whose logit is ``gain * mean + shift`` of the prepared picture: 0 where its colours' mean is -1.03.
+
+    Written field by field as onnx.proto has them (ONNX 1.16): a convolution of 1 x 1, and a sigmoid.
+    """
+
+    def tensor(name: str, shape: tuple[int, ...], values: list[float]) -> bytes:
+        dims = b"".join(field(1, n) for n in shape)
+        return dims + field(2, 1) + field(8, name) + field(9, np.array(values, "<f4").tobytes())
+
+    def picture(name: str, count: int) -> bytes:
+        dims = [field(1, n) if isinstance(n, int) else field(2, n) for n in (1, count, side, side)]
+        shape = b"".join(field(1, dim) for dim in dims)
+        return field(1, name) + field(2, field(1, field(1, 1) + field(2, shape)))
+
+    def node(kind: str, inputs: tuple[str, ...], output: str) -> bytes:
+        return b"".join(field(1, name) for name in inputs) + field(2, output) + field(4, kind)
+
+    nodes = [node("Conv", ("picture", "w", "b"), "logit" if sigmoid else "mask")]
+    nodes += [node("Sigmoid", ("logit",), "mask")] if sigmoid else []
+    graph = b"".join(field(1, one) for one in nodes) + field(2, "dark")
+    graph += field(5, tensor("w", (1, channels, 1, 1), [gain / channels] * channels))
+    graph += field(5, tensor("b", (1,), [shift]))
+    graph += field(11, picture("picture", channels)) + field(12, picture("mask", 1))
+    path.write_bytes(field(1, 8) + field(7, graph) + field(8, field(1, "") + field(2, 13)))
     return path
 
 
@@ -57,12 +85,19 @@ def test_a_mask_that_does_not_fit_becomes_the_others_hull(tmp_path: Path, caplog
     assert iou(np.asarray(Image.open(pictures["photo_4.png"].mask)) > 127, true[4]) > 0.85
 
 
-def test_a_model_that_sees_all_as_object_gives_no_masks(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_model_that_sees_nothing_gives_no_masks(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     views, _ = scene()
     found, pictures = written(tmp_path, views, np.zeros((0, 3)))
     masked = run(tmp_path, str(write_model(tmp_path / "u2net.onnx", gain=1e-3, shift=-9.0)), found, pictures)
     assert "finds no object in" in caplog.text and masked.lines == ["masks: none could be made"]
     assert all(picture.mask is None for picture in pictures.values())
+
+
+@pytest.mark.parametrize("shift", [9.0, -9.0])
+def test_pictures_that_are_all_object_or_without_any_have_no_noise(tmp_path: Path, shift: float) -> None:
+    model = SegmentationModel(str(write_model(tmp_path / "u2net.onnx", gain=0.1, shift=shift)))
+    pixels = np.random.default_rng(0).integers(0, 255, (30, 40, 3), np.uint8)
+    assert (model(pixels, "picture") == (shift > 0)).all()
 
 
 def test_models_are_prepared_as_their_names_say(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -90,6 +125,21 @@ def test_models_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     check_mode("auto")
     with pytest.raises(UsageError, match="'autp': no file of that name, nor a model"):
         check_mode("autp")
+
+
+@pytest.mark.slow
+def test_a_capture_with_cameras_gets_masks_of_all_its_views(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    views, true = scene()
+    capture = Capture(tmp_path, [
+        View(view.name, view.pinhole(160), view.straightened(cv2, 160).pixels.astype(np.float32) / 255, None, k == 3)
+        for k, view in enumerate(views)
+    ], None, None)  # fmt: skip
+    model = str(write_model(tmp_path / "u2net.onnx"))
+    mask_capture(capture, model, tmp_path / "sheet.png", lambda *_: None, lambda: False)
+    assert min(iou(view.mask > 0.5, mask) for view, mask in zip(capture.views, true, strict=True)) > 0.85
+    before = [view.mask for view in capture.views]
+    mask_capture(capture, model, tmp_path / "sheet.png", lambda *_: None, lambda: False)
+    assert f"{model} is not used" in caplog.text and all(a is b.mask for a, b in zip(before, capture.views))
 
 
 @pytest.mark.parametrize("what", ["text", "grey", "nan"])

@@ -20,7 +20,7 @@ from ..registration import Registration
 from ..world_alignment import GUESSED, LOWEST, PLANE, align_to_ground
 from .making import make_masks
 from .mask_view import MaskView
-from .segmentation_model import SegmentationModel, masks_by_model
+from .segmentation_model import SegmentationModel, load_model, masks_by_model
 from .settling import REMEDY
 from .stage import GROUND_IS_GUESSED, MODEL_UNUSED, MODES, NO_GROUND, ONLY_SOME
 
@@ -69,7 +69,7 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
         logger.warning("%s: masks are not made: %s", subject, error)
         return
     if mode not in MODES:
-        _by_model(SegmentationModel(mode), capture, cv2, sheet, tell, cancelled)
+        _by_model(load_model(mode), capture, cv2, sheet, tell, cancelled)
         return
     points = np.zeros((0, 3)) if capture.points is None else np.asarray(capture.points, np.float64)
     matrices = {view.name: np.asarray(view.camera.matrix_world, np.float64) for view in capture.views}

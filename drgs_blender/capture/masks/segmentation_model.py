@@ -5,6 +5,7 @@ Nothing is downloaded. Pictures are prepared as the program that published a mod
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 from collections.abc import Callable, Sequence
@@ -46,7 +47,7 @@ KNOWN = {
     "rmbg-1.4": Preparation(1024, (0.5, 0.5, 0.5), (1.0, 1.0, 1.0)),
     "": Preparation(1024, *_IMAGENET),
 }
-#: A model whose largest value is below it sees nothing.
+#: A model whose largest value is below it sees nothing; one whose least value is as near to 1, an object all over.
 _NOTHING = 0.1
 
 
@@ -58,15 +59,15 @@ def find_model(given: str) -> Path | None:
     given : str
         As in "models/mine.onnx" or "isnet-general-use".
     """
-    for path in (Path(given), _home() / given, _home() / f"{given}.onnx"):
-        if path.is_file():
-            return path
-    return None
+    if Path(given).is_file():
+        return Path(given)
+    home = _home()
+    return next((path for path in (home / given, home / f"{given}.onnx") if path.is_file()), None)
 
 
 def _home() -> Path:
-    """The folder of rembg's models."""
-    return Path(os.environ.get("U2NET_HOME") or Path.home() / ".u2net")
+    """The folder of rembg's models, as rembg finds it."""
+    return Path(os.path.expanduser(os.environ.get("U2NET_HOME") or f"{os.environ.get('XDG_DATA_HOME') or '~'}/.u2net"))
 
 
 def check_model(given: str, modes: tuple[str, ...]) -> None:
@@ -78,6 +79,12 @@ def check_model(given: str, modes: tuple[str, ...]) -> None:
         f"is {given!r}: no file of that name, nor a model in {_home()}",
         f"Choose from {', '.join(modes)}, or give a segmentation model in ONNX format",
     )
+
+
+@functools.cache
+def load_model(given: str) -> SegmentationModel:
+    """`SegmentationModel`, read once in a process."""
+    return SegmentationModel(given)
 
 
 class SegmentationModel:
@@ -169,7 +176,7 @@ class SegmentationModel:
         if low < 0 or high > 1:  # logits
             found = (1 / (1 + np.exp(-np.clip(found, -40, 40)))).astype(np.float32)
             low, high = float(found.min()), float(found.max())
-        if high < _NOTHING or high <= low:
+        if high < _NOTHING or low > 1 - _NOTHING or high <= low:  # nothing, or all, is the object
             return np.full((height, width), high > 0.5, np.float32)
         whole = Pillow.fromarray((found - low) / (high - low)).resize((width, height), Pillow.Resampling.BILINEAR)
         return np.asarray(whole)

@@ -23,7 +23,7 @@ from ..world_alignment import GUESSED, LOWEST
 from .contact_sheet import draw_contact_sheet
 from .hull_check import Fit, check_masks
 from .mask_view import MaskView
-from .segmentation_model import SegmentationModel, check_model, masks_by_model
+from .segmentation_model import check_model, load_model, masks_by_model
 from .settling import REMEDY, hull_of_masks, resized, whole
 
 logger = logging.getLogger(__name__)
@@ -41,7 +41,7 @@ GROUND_IS_GUESSED = (
     "parts of it, or lack the object's foot. Look at %s"
 )
 ONLY_SOME = "%s: %d of %d pictures have masks: no others are made. Draw all, or remove these"
-MODEL_UNUSED = "%s: the pictures have masks: %s is not used. Remove them to use it"
+MODEL_UNUSED = "%s: has masks, or a background of one colour: %s is not used. Remove the masks to use it"
 
 
 @dataclass(slots=True)
@@ -56,7 +56,8 @@ def check_mode(mode: str) -> None:
     """Raise an error where `mode` is neither one of `MODES` nor a segmentation model that can be loaded."""
     check_model(mode, MODES)
     if mode not in MODES:
-        SegmentationModel(mode)
+        libraries.load("opencv")  # without which masks are not made, with a warning
+        load_model(mode)
 
 
 def mode_on_ground(mode: str, given: Path | None, ground: str, subject: str) -> str:
@@ -135,7 +136,7 @@ def make_or_check(mode: str, found: Registration, by_file: dict[str, Picture], c
     if mode in MODES:
         drawn, fits = _learned(cv2, views, pictures, sheet, found, subject, tell, cancelled)
     else:
-        drawn, fits = masks_by_model(SegmentationModel(mode), cv2, views, sheet, subject, tell, cancelled)
+        drawn, fits = masks_by_model(load_model(mode), cv2, views, sheet, subject, tell, cancelled)
     if drawn is None:
         return Masked(fits, ["masks: none, those that were made do not fit each other" if fits else
                              "masks: none could be made"])  # fmt: skip
