@@ -30,6 +30,7 @@ SCENES = {
     "sky": "Sky Texture with its sun",
     "procedural_world": "World of noise and a colour ramp",
     "procedural": "Voronoi cells as colour, noise as roughness",
+    "procedural_bump": "Voronoi cells and noise as heights",
     "forest": "all at once: leaves, statue, captured object, sky",
     "workshop": "all at once: helmet, bumps, cells, captured object, four lamps, World of noise",
     "coat": "coats: clear, rough and tinted",

@@ -189,6 +189,18 @@ def procedural(job: dict) -> None:
     stage()
 
 
+def procedural_bump(job: dict) -> None:
+    """Noise and Voronoi cells as heights, one Bump node after the other, by UV and by Generated coordinates."""
+    tree, principled = look("Rough", Base_Color=(0.5, 0.42, 0.35, 1), Roughness=0.35)
+    cells = node(tree, "TexVoronoi", Scale=9.0, Vector=node(tree, "TexCoord").outputs["UV"])
+    noise = node(tree, "TexNoise", Scale=7.0, Detail=1.0)
+    first = node(tree, "Bump", Strength=0.9, Distance=0.15, Height=cells.outputs["Distance"])
+    second = node(tree, "Bump", Strength=0.8, Distance=0.3, Height=noise.outputs[0], Normal=first.outputs[0])
+    tree.links.new(second.outputs[0], principled.inputs["Normal"])
+    monkey("Monkey", "Rough")
+    stage()
+
+
 def forest(job: dict) -> None:
     """Leaves over a statue with a normal map and a captured object, in a sky."""
     leaves(job)
@@ -230,7 +242,8 @@ def workshop(job: dict) -> None:
 SCENES: dict[str, Callable[[dict], None]] = {
     made.__name__: made
     for made in (
-        helmet, statue, normal_map, bump, colours, coordinates, leaves, veil, sky, procedural_world, procedural, forest,
+        helmet, statue, normal_map, bump, colours, coordinates, leaves, veil, sky, procedural_world, procedural,
+        procedural_bump, forest,
         workshop,
     )
 } | BSDFS | IMAGES | FEATURES  # fmt: skip

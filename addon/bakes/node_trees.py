@@ -256,6 +256,8 @@ def follow_channel(channel: str, leaves: Leaves | None = None) -> Follow:
             return socket.name == "Surface"
         if node.type == "OUTPUT_AOV":
             return channel == f"aov {socket.name}"
+        if node.type == "BUMP" and channel == "height":
+            return socket.name == "Height"
         if not is_shader(node):
             return True
         names = shader_inputs(node, channel, leaves)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import bpy
@@ -102,7 +102,7 @@ class Materials:
             return ExportedMaterial(None)
         found = _Paints(surface)
         done: set[str] = set()
-        left = {text for detail in surface.details for text in detail.value.approximations}
+        left: set[str] = set()
         for values, name, leaves in found.all():
             value, solved = values[name], False
             if bakes is not None and value.approximations and found.are_apart:
@@ -112,8 +112,17 @@ class Materials:
         for name, (ref, value) in aovs.items():
             given[name], solved = value, False
             if bakes is not None and value.approximations:
-                given[name], solved = bakes.channel(tree.material, f"aov {ref.socket.name}", value, self._warn, aov=ref)
+                channel = f"aov {ref.socket.name}"
+                given[name], solved = bakes.channel(tree.material, channel, value, self._warn, source=ref)
             (done if solved else left).update(value.approximations)
+        details = []
+        for detail in surface.details:
+            value, solved = detail.value, False
+            if bakes is not None and value.approximations and detail.source is not None:
+                value, solved = bakes.channel(tree.material, "height", value, self._warn, source=detail.source)
+            (done if solved else left).update(detail.value.approximations)
+            details.append(replace(detail, value=value))
+        surface.details = tuple(one for one in details if one.kind != "bump" or one.value.texture is not None)
         self._say([text for text in approximations if text in left or text not in done])
         textures = [values[name].texture for values, name, _ in found.all() if values[name].texture]
         others = *given.values(), *(detail.value for detail in surface.details)

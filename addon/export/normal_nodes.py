@@ -24,6 +24,7 @@ class DetailRef:
     ----------
     value : colours or heights
     tangents : UV map that the tangents follow
+    source : input that heights come from; None of other kinds
     """
 
     kind: Kind
@@ -31,13 +32,18 @@ class DetailRef:
     strength: float
     distance: float = 1.0
     tangents: LayerRef = field(default_factory=lambda: LayerRef("uv"))
+    source: SocketRef | None = None
 
     def same(self, other: DetailRef) -> bool:
         """Whether both do the same."""
-        mine, theirs = (
-            (d.kind, d.value.texture, tuple(d.value.colour), d.strength, d.distance, d.tangents) for d in (self, other)
-        )
-        return mine == theirs
+        return self._facts == other._facts
+
+    @property
+    def _facts(self) -> tuple[object, ...]:
+        unread = self.source if self.value.texture is None else None
+        return (
+            self.kind, self.value.texture, tuple(self.value.colour), self.strength, self.distance, self.tangents, unread
+        )  # fmt: skip
 
 
 class NormalWalker(TextureWalker):
@@ -75,14 +81,15 @@ class NormalWalker(TextureWalker):
         node = output.node
         before = self.normal(output.input("Normal"))
         height = self.number(output.input("Height"))
-        if height.texture is None:
+        if height.texture is None and not height.approximations:  # else a bake may have one
             return before
         if getattr(height.texture, "interpolation", "linear") == "closest":
             self.warn(node, "an image with Closest interpolation has no slopes, and no bumps; choose Linear")
         if isinstance(height.texture, TextureRef):
             height = replace(height, texture=replace(height.texture, data=True))
         distance = self.value(output.input("Distance")) * (-1 if node.invert else 1)
-        return (*before, DetailRef("bump", height, self.value(output.input("Strength")), distance))
+        strength = self.value(output.input("Strength"))
+        return (*before, DetailRef("bump", height, strength, distance, source=output.input("Height")))
 
     def normal_new_geometry(self, output: SocketRef) -> tuple[DetailRef, ...]:
         if output.socket.name != "Normal":

@@ -110,7 +110,7 @@ class SurfaceBakes:
         value: SocketValue,
         note: Warn,
         leaves: node_trees.Leaves | None = None,
-        aov: SocketRef | None = None,
+        source: SocketRef | None = None,
     ) -> tuple[SocketValue, bool]:
         """A channel of a material, and whether its approximations are no matter any more.
 
@@ -119,16 +119,16 @@ class SurfaceBakes:
         value : as it is approximated
         note : called with the reason where it cannot be baked
         leaves : the only shaders that count; None: all do
-        aov : input of an AOV Output node, for the channel of its name
+        source : input that is baked by itself: of an AOV Output node, or the height of a Bump node
         """
         follow = node_trees.follow_channel(name, leaves)
-        output = aov or surface_of(material.node_tree)
+        output = source or surface_of(material.node_tree)
         if output is None or output.groups:  # what is within a group has no place of its own
             return value, False
         found = node_trees.trees(material.node_tree, output.node, follow)
         if _never(found):
             return value, False
-        more: dict[str, Any] = {} if aov is None else {"output": output.node.name}
+        more: dict[str, Any] = {} if source is None else {"output": output.node.name}
         if leaves is not None:
             more["leaves"] = [list(leaf) for leaf in leaves]
         made = self._request(material, name, found, follow, more)
@@ -161,7 +161,9 @@ class SurfaceBakes:
         faces = np.isin(index, numbers)
         attributes = _attributes(mesh, found)
         extra = {f"attribute-{i}": values for i, (_, values) in enumerate(attributes)}
-        placed = any(_is_placed(node) for tree in found for node in tree.nodes)
+        placed = any(
+            _is_placed(node) for tree in found for node in tree.nodes if node.type != "BUMP" or name != "height"
+        )
         used = ["corner_vertices", "starts", *(key for key in arrays if key.startswith("uv-"))]
         used += ["generated"] + (["vertices", "normals"] if placed else [])
         digest = hashlib.blake2b(faces.tobytes(), digest_size=16)

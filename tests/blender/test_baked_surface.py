@@ -185,6 +185,37 @@ def test_numbers_and_what_shines_are_baked_and_the_rest_is_read(scene, bake, job
     assert psnr(seen(frame, "emission"), 5 * shining(obj, shader.inputs["Emission Color"])) > 40
 
 
+def test_procedural_heights_are_baked(scene, bake):
+    """Of each Bump node by itself, also below 0, as floats; the object may move without another bake."""
+    obj = square()
+    made, tree, shader = material()
+    obj.data.materials.append(made)
+    bumps = [tree.nodes.new("ShaderNodeBump") for _ in range(2)]
+    for bump, scale in zip(bumps, (3.0, 7.0)):
+        deeper = tree.nodes.new("ShaderNodeMath")
+        deeper.operation, deeper.inputs[1].default_value = "SUBTRACT", 0.5
+        noise(tree, deeper.inputs[0], "Generated", scale)
+        tree.links.new(deeper.outputs[0], bump.inputs["Height"])
+    tree.links.new(bumps[0].outputs["Normal"], bumps[1].inputs["Normal"])
+    tree.links.new(bumps[1].outputs["Normal"], shader.inputs["Normal"])
+    frame, warnings = bake()
+    (state,) = frame.meshes
+    first, second = state.materials[0].details
+    assert first.kind == second.kind == "bump" and first.texture.image != second.texture.image and not warnings
+    for detail, bump in zip((first, second), bumps):
+        state.materials[0].base_colour_texture, state.materials[0].base_colour = detail.texture, detail.colour
+        heights, expected = seen(frame), shining(obj, bump.inputs["Height"])
+        low = expected.min(axis=2) <= 0  # a surface shines with nothing below
+        assert heights.min() < -0.05 and 0.1 < low.mean() < 0.9
+        np.testing.assert_allclose(heights[~low], expected[~low], atol=0.02)
+    obj.location.x = 0.1
+    again, _ = bake()
+    assert [d.texture.image for d in again.meshes[0].materials[0].details] == [
+        first.texture.image,
+        second.texture.image,
+    ]
+
+
 def test_mixed_shaders_within_groups_are_baked(scene, bake):
     """A noise between a red and a blue surface, the mix in a group; half of the light of a glowing part is its own."""
     obj = square()

@@ -33,8 +33,8 @@ _IMPLICIT = ("TEX_NOISE", "TEX_VORONOI", "TEX_WAVE", "TEX_MAGIC", "TEX_CHECKER",
 def bake(job: dict[str, Any]) -> None:
     """Write ``pixels`` (h, w, 4), row 0 at the top, their ``factor``, and ``uvs`` (loops, 2), empty for the mesh's own.
 
-    Colours are bytes, encoded as sRGB, numbers are bytes, emission and shader AOVs are float32. With ``leaves`` no
-    other shaders count.
+    Colours are bytes, encoded as sRGB, numbers are bytes, emission, shader AOVs and heights are float32. With
+    ``leaves`` no other shaders count.
     """
     channel, size = job["channel"], job["size"]
     leaves = tuple(map(tuple, job["leaves"])) if "leaves" in job else None
@@ -49,8 +49,8 @@ def bake(job: dict[str, Any]) -> None:
         _unwrap(obj)
     for tree in found:
         _generated(tree)
-    if channel.startswith("aov "):
-        _shine_alone(material.node_tree, material.node_tree.nodes[job["output"]].inputs[channel.removeprefix("aov ")])
+    if alone := _input_of(channel):
+        _shine_alone(material.node_tree, material.node_tree.nodes[job["output"]].inputs[alone])
     kinds = {node.type for tree in found for node in tree.nodes}
 
     def weight(counts: Callable[[bpy.types.Node], bool]) -> np.ndarray:
@@ -63,7 +63,7 @@ def bake(job: dict[str, Any]) -> None:
     elif channel in ("base_colour", "emission", "weight"):
         if "BSDF_TRANSPARENT" in kinds:
             whole = weight(lambda node: node.type != "BSDF_TRANSPARENT")
-    elif channel not in ("alpha", "aov Color", "aov Value") and kinds.intersection(node_trees.UNSCATTERED):
+    elif not alone and channel != "alpha" and kinds.intersection(node_trees.UNSCATTERED):
         whole = weight(lambda node: node.type not in node_trees.UNSCATTERED)
     if whole is not None:
         pixels = np.divide(pixels, whole, out=np.zeros_like(pixels), where=whole > 1e-4)
@@ -72,14 +72,19 @@ def bake(job: dict[str, Any]) -> None:
     cycles_scene.write(job, pixels=pixels, factor=np.array(factor), uvs=uvs)
 
 
+def _input_of(channel: str) -> str:
+    """The input that is baked by itself, of the job's node; "" where a channel is of the surface's shaders."""
+    return "Height" if channel == "height" else channel.removeprefix("aov ") if channel.startswith("aov ") else ""
+
+
 def _encoded(channel: str, pixels: np.ndarray) -> tuple[np.ndarray, float]:
     """(h, w, 4) of a channel, as `bake` writes it, and what it is to be multiplied with."""
     values = np.nan_to_num(pixels, posinf=0.0, neginf=0.0)
-    if not channel.startswith("aov "):
+    if not _input_of(channel):
         values = values % 1.0 if channel == "anisotropy_rotation" else np.maximum(values, 0)
     whole = np.ones((*values.shape[:2], 4), np.float32)
     whole[..., :3] = values
-    if channel == "emission" or channel.startswith("aov "):
+    if channel == "emission" or _input_of(channel):
         return whole, 1.0
     factor = 1.0 if channel in _UNIT else max(1.0, float(values.max(initial=0.0)))
     unit = np.minimum(values / factor, 1)
