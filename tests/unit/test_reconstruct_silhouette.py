@@ -16,9 +16,11 @@ from shapes import plain_mesh, sphere_mesh
 
 from drgs_blender.core.errors import UsageError
 from drgs_blender.core.frame import Camera
+from drgs_blender.geometry.normals import VertexNormals
 from drgs_blender.reconstruct.capture.training_views import pixel_rays
 from drgs_blender.reconstruct.meshing import depth_fusion
 from drgs_blender.reconstruct.meshing.silhouette_fit import FARTHEST, fill_silhouettes
+from drgs_blender.reconstruct.meshing.tangential_relaxation import relaxed
 from drgs_blender.reconstruct.meshing.visual_hull import Region, silhouettes
 
 SIZE, RADIUS = 96, 0.7
@@ -65,6 +67,38 @@ def test_exact_depth_maps_make_an_exact_mesh(cameras, monkeypatch):
     assert -0.3 < off(mesh.vertices).mean() < 0  # what the smoothing takes
     filled = off(fill_silhouettes(mesh, cameras, [mask_of(view) for view in cameras]))
     assert abs(filled.mean()) < 0.03 and np.abs(filled).max() < 0.2
+
+
+def test_a_fused_mesh_keeps_its_normals_when_it_is_moved(cameras, monkeypatch):
+    """Edges of a hundredth of a voxel, as marching cubes leaves them, turn over with the first move."""
+    rng = np.random.default_rng(0)
+
+    def noisy(_: object, view: Camera) -> tuple:
+        depth, cosine = hit(view)
+        return depth + (0.3 * PIXEL * rng.normal(size=depth.shape)).astype(np.float32), cosine
+
+    monkeypatch.setattr(depth_fusion, "surface_maps", noisy)
+    low = np.full(3, -RADIUS)
+    region = Region(np.zeros(3), 2 * RADIUS, low, -low, np.zeros((0, 3)), np.zeros((0, 3)), PIXEL)
+    mesh, report = depth_fusion.fuse(None, cameras, region)  # type: ignore[arg-type]
+    edges = np.linalg.norm(mesh.vertices[mesh.faces] - mesh.vertices[np.roll(mesh.faces, 1, axis=1)], axis=-1)
+    assert edges.min() > 0.1 * report["voxel"]
+    filled = fill_silhouettes(mesh, cameras, [mask_of(view) for view in cameras])
+    normals = VertexNormals(mesh.faces, len(filled))(filled)
+    turned = (normals * filled).sum(1) / np.linalg.norm(filled, axis=1) < np.cos(np.radians(45))
+    assert turned.mean() < 5e-4
+
+
+def test_vertices_slide_along_the_surface_and_not_off_it():
+    vertices, faces = sphere_mesh(4)
+    rng = np.random.default_rng(0)
+    edge = np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1).mean()
+    uneven = vertices + rng.uniform(-0.3, 0.3, vertices.shape) * edge
+    uneven /= np.linalg.norm(uneven, axis=1, keepdims=True)
+    moved = relaxed(uneven, faces)
+    length = lambda v: np.linalg.norm(v[faces] - v[np.roll(faces, 1, axis=1)], axis=-1)  # noqa: E731
+    assert np.quantile(length(moved), 0.01) > 2 * np.quantile(length(uneven), 0.01)
+    assert np.abs(np.linalg.norm(moved, axis=1) - 1).max() < 0.1 * edge
 
 
 def test_more_voxels_than_memory_are_refused_with_how_many_fit(cameras, monkeypatch):
