@@ -1,9 +1,7 @@
 """What limits the shape of stage (i): what fusion leaves of true depth maps, and what patches of photographs say of it.
 
 python bench/bench_shape.py --capture scenes/spot [--size 128]
-python bench/bench_shape.py --part chain --capture scenes/spot [--size 256]
 
-The chain has the error of normals after each step from surfels to the mesh; it learns surfels once and keeps them.
 Scenes are those of `drgs evaluate --make-scenes scenes`. Rows are kept, so that captures may be measured one by one.
 """
 
@@ -18,26 +16,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from bench_reconstruct import against_truth, first_hits, trained
+from bench_reconstruct import against_truth, first_hits
 from report import OUT, store_row, table, write_section
 
-from drgs_blender.core.asset.model import Mesh
 from drgs_blender.core.frame import Camera
-from drgs_blender.geometry.normals import unit
 from drgs_blender.reconstruct.capture.capture import Capture
 from drgs_blender.reconstruct.capture.neighbours import neighbours
 from drgs_blender.reconstruct.capture.training_views import composed, pixel_rays
 from drgs_blender.reconstruct.losses.patches import Pair, patch_loss
 from drgs_blender.reconstruct.meshing import depth_fusion
-from drgs_blender.reconstruct.meshing.silhouette_fit import fill_silhouettes
-from drgs_blender.reconstruct.meshing.visual_hull import find_region, silhouettes
-from drgs_blender.reconstruct.model.gaussians import Gaussians
-from drgs_blender.reconstruct.model.thin_structures import normals_of
+from drgs_blender.reconstruct.meshing.visual_hull import find_region
 from drgs_blender.reconstruct.optim.learner import LUMA
-from drgs_blender.reconstruct.optim.schedule import Schedule
 from drgs_blender.reconstruct.readers import read_capture
 
-FOLDER = OUT / "reconstruct"
+FILE = OUT / "reconstruct" / "shape.json"
 #: Voxels of the fusion, pixels.
 VOXELS = (1.0, 0.5)
 #: Name -> metres that the true surface is moved away from the viewer, and degrees that its normals are turned.
@@ -90,83 +82,6 @@ def fusion(capture: Capture, truth: Truth, folder: Path) -> dict[str, float]:
     return found
 
 
-def learned(capture: Capture, name: str) -> Gaussians:
-    """The surfels of a capture after stage (i) as it is by default, kept from the first time on."""
-    file = FOLDER / "surfels" / f"{name}.npz"
-    if not file.exists():
-        training, _ = trained(capture, Schedule(), None)
-        surfels, light = training.gaussians.arrays(), training.gaussians.light
-        assert light is not None
-        file.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(file, light=light.detach().numpy(), **surfels)  # type: ignore[arg-type]
-    with np.load(file) as kept:
-        tensors = {key: torch.from_numpy(kept[key]) for key in kept.files}
-    light = tensors.pop("light")
-    return Gaussians(tensors, light)
-
-
-class Chain:
-    """Errors of normals in the views left out, mean degrees of the pixels that both show."""
-
-    def __init__(self, capture: Capture, truth: Truth) -> None:
-        self._views, self._truth = capture.testing, truth
-        self._maps = [truth.maps(view.camera) for view in self._views]
-
-    def off(self, shown: list[tuple[np.ndarray, np.ndarray]]) -> float:
-        """Of normals (h, w, 3) of each view, where its mask (h, w) says that there are any."""
-        angles = []
-        for (normal, seen), (depth, true) in zip(shown, self._maps, strict=True):
-            both = seen & (depth > 0)
-            angles.append(np.arccos((normal * true).sum(-1)[both].clip(-1, 1)))
-        return float(np.degrees(np.concatenate(angles).mean()))
-
-    def mesh(self, mesh: Mesh) -> float:
-        """Of the smooth normals of a mesh."""
-        return self._hits(mesh.vertices, mesh.faces)
-
-    def facets(self) -> float:
-        """Of the true mesh, faces flat: what no shape can show, as photographs show smooth normals of few faces."""
-        corners = self._truth.vertices[self._truth.faces].reshape(-1, 3)
-        return self._hits(corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
-
-    def surfels(self, gaussians: Gaussians) -> float:
-        """Of the surfels' own normals."""
-        shown = [unit(normals_of(gaussians)(view)) for view in self._views]
-        return self.off([(normal, np.abs(normal).sum(-1) > 0) for normal in shown])
-
-    def _hits(self, vertices: np.ndarray, faces: np.ndarray) -> float:
-        shown = []
-        for view in self._views:
-            normal, hit, _ = first_hits(vertices, faces, view.camera)
-            shape = view.camera.height, view.camera.width
-            shown.append((normal.reshape(*shape, 3), hit.reshape(shape)))
-        return self.off(shown)
-
-
-def chain(capture: Capture, truth: Truth, name: str) -> dict[str, float]:
-    """Degrees after each step from the surfels to the mesh of stage (i)."""
-    judge, region, cameras = Chain(capture, truth), find_region(capture), [v.camera for v in capture.training]
-    masks, gaussians = silhouettes(capture), learned(capture, name)
-    assert masks is not None
-    found = {"the true mesh, faces flat": judge.facets()}
-    with true_depth(truth):
-        for depth_fusion.PIXELS in VOXELS:
-            mesh, _ = depth_fusion.fuse(None, cameras, region, 1024)  # type: ignore[arg-type]
-            found[f"true depth, fused, voxels of {depth_fusion.PIXELS:g} pixels"] = judge.mesh(mesh)
-    found["surfels' own normals"] = judge.surfels(gaussians)
-    even = depth_fusion.relaxed
-    for label, relax in (("triangles as marching cubes leaves them", lambda v, _: v), ("evened", even)):
-        depth_fusion.relaxed = relax
-        try:
-            mesh, _ = depth_fusion.fuse(gaussians, cameras, region)
-        finally:
-            depth_fusion.relaxed = even
-        found[f"learned depth, fused, {label}"] = judge.mesh(mesh)
-        mesh.vertices = fill_silhouettes(mesh, cameras, masks)
-        found[f"{label}, outlines filled"] = judge.mesh(mesh)
-    return found
-
-
 def patches(capture: Capture, truth: Truth) -> dict[str, float]:
     """Mean 1 - NCC of patches of neighbouring views, at the true shape and beside it."""
     views = capture.training
@@ -199,34 +114,20 @@ def patches(capture: Capture, truth: Truth) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--part", choices=("limits", "chain"), default="limits")
     parser.add_argument("--capture", type=Path, required=True)
-    parser.add_argument("--size", type=int, help="default 128, of the chain 256")
+    parser.add_argument("--size", type=int, default=128)
     options = parser.parse_args()
-    size = options.size or (128 if options.part == "limits" else 256)
-    capture, truth = read_capture(options.capture, size, 8), Truth(options.capture)
-    if options.part == "limits":
-        row = fusion(capture, truth, options.capture) | patches(capture, truth)
-        section, title = "reconstruct-shape", "What limits the shape of stage (i)"
-        body = (
-            "Normals, mean degrees in the views left out, of the mesh that is fused of *true* depth maps; then 1 - NCC "
-            "of patches of neighbouring photographs (`losses/patches.py`), all of one weight, at the true shape and "
-            "beside it.\n\n"
-        )
-    else:
-        row = chain(capture, truth, f"{options.capture.name}-{size}")
-        section, title = "reconstruct-chain", "Where stage (i) loses normals"
-        body = (
-            "Mean degrees in the views left out, before materials are learned. Photographs show smooth vertex normals "
-            "of a mesh of few faces: what the true mesh is off with flat faces, no mesh fused of any depth can "
-            "show.\n\n"
-        )
-    file = FOLDER / ("shape.json" if options.part == "limits" else "chain.json")
-    rows = store_row(file, f"{options.capture.name}|{size}|{len(capture.training)}", row)
+    capture, truth = read_capture(options.capture, options.size, 8), Truth(options.capture)
+    row = fusion(capture, truth, options.capture) | patches(capture, truth)
+    rows = store_row(FILE, f"{options.capture.name}|{options.size}|{len(capture.training)}", row)
     head = ("Object", "Pixels", "Views", *row)
-    digits = 3 if options.part == "limits" else 2
-    cells = [(*key.split("|"), *(f"{value:.{digits}f}" for value in values.values())) for key, values in rows.items()]
-    write_section(section, title, body + table(head, cells))
+    cells = [(*key.split("|"), *(f"{value:.3f}" for value in values.values())) for key, values in rows.items()]
+    body = (
+        "Normals, mean degrees in the views left out, of the mesh that is fused of *true* depth maps; then 1 - NCC of "
+        "patches of neighbouring photographs (`losses/patches.py`), all of one weight, at the true shape and beside "
+        "it.\n\n"
+    )
+    write_section("reconstruct-shape", "What limits the shape of stage (i)", body + table(head, cells))
 
 
 if __name__ == "__main__":

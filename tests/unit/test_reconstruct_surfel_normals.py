@@ -8,12 +8,12 @@ from shapes import plain_mesh, sphere_mesh
 
 pytest.importorskip("torch")
 
-from capture_cases import balls  # noqa: E402
+from capture_cases import balls
 
-from drgs_blender.geometry.normals import VertexNormals, unit  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.run import decouple  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
-from drgs_blender.reconstruct.meshing.surfel_normals import with_surfel_normals  # noqa: E402
+from drgs_blender.geometry.normals import VertexNormals, unit
+from drgs_blender.reconstruct.inverse_rendering.run import decouple
+from drgs_blender.reconstruct.inverse_rendering.settings import Settings
+from drgs_blender.reconstruct.meshing.surfel_normals import with_surfel_normals
 
 
 @pytest.fixture(scope="module")
