@@ -145,6 +145,21 @@ def test_parts_that_the_mesh_lacks_do_not_inflate_the_rest(cameras):
     assert np.abs(moved[far]).max() < 0.06 and moved.max() <= FARTHEST + 0.01
 
 
+def test_what_is_around_the_object_in_the_picture_changes_nothing(cameras):
+    """Pictures of which the object fills a part, and wider ones."""
+    vertices, faces = sphere_mesh(4)
+    mesh, add = plain_mesh((RADIUS - 0.8 * PIXEL) * vertices, faces), np.array((31, 17))
+    wide = [
+        replace(v, width=v.width + 2 * add[0], height=v.height + 2 * add[1], cx=v.cx + add[0], cy=v.cy + add[1])
+        for v in cameras
+    ]
+    masks = [mask_of(view) for view in cameras]
+    padded = [np.pad(mask, ((add[1], add[1]), (add[0], add[0]))) for mask in masks]
+    one, other = fill_silhouettes(mesh, cameras, masks), fill_silhouettes(mesh, wide, padded)
+    np.testing.assert_allclose(one, other, atol=1e-3 * PIXEL)
+    assert np.abs(one - mesh.vertices).max() > 0.5 * PIXEL
+
+
 def test_a_mesh_that_no_camera_sees_stays(cameras):
     vertices, faces = sphere_mesh(2)
     mesh = plain_mesh(0.1 * vertices + (0, 0, 50), faces)
