@@ -166,7 +166,7 @@ def write_chain(capture: Capture, folder: Path, name: str, _: int) -> None:
     rows = store_row(FOLDER / "chain.json", name, chain(capture, Truth(folder), name))
     body = (
         "Mean degrees in the views left out, before materials are learned. Photographs show smooth vertex normals of a "
-        "mesh of few faces: what the true mesh with flat faces is off, no mesh fused of any depth can show.\n\n"
+        "mesh of few faces: what the true mesh with flat faces is off is in no shape.\n\n"
     )
     head = ("Object-pixels", *next(iter(rows.values())))
     cells = [(key, *(f"{value:.2f}" for value in values.values())) for key, values in rows.items()]
