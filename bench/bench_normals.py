@@ -180,7 +180,8 @@ def write_relit(capture: Capture, folder: Path, name: str, steps: int) -> None:
         rows = store_row(FOLDER / "relit.json", f"{name}|{label}", cells)
     body = (
         f"The same surfels, {steps} steps of materials and light; camera sees surfels. Normals in mean degrees, PSNR "
-        f"of the foreground in dB, relit under {LIGHT!r} scaled by one factor a channel.\n\n"
+        f"of the foreground in dB, relit under {LIGHT!r} scaled by one factor a channel. Of the fern learning has its "
+        "surfels' normals alone, as it is thin.\n\n"
     )
     head = ("Object-pixels", "Mesh", "Normals deg", "Relit", "Views left out", "Albedo scaled",
             "Roughness / metallic RMSE", "Processor s")  # fmt: skip
