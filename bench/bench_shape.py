@@ -8,6 +8,8 @@ Scenes are those of `drgs evaluate --make-scenes scenes`. Rows are kept, so that
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -50,8 +52,9 @@ class Truth:
         return np.where(hit, depth, 0).reshape(shape).astype(np.float32), normal.reshape(*shape, 3).astype(np.float32)
 
 
-def fusion(capture: Capture, truth: Truth, folder: Path) -> dict[str, float]:
-    """Degrees of normals of the mesh that is fused of true depth maps, by voxel."""
+@contextmanager
+def true_depth(truth: Truth) -> Iterator[None]:
+    """Within it, fusion takes true depth maps in place of those of surfels."""
 
     def true_maps(_: Any, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         depth, normal = truth.maps(camera)
@@ -60,15 +63,22 @@ def fusion(capture: Capture, truth: Truth, folder: Path) -> dict[str, float]:
         seen = depth > 0
         return np.where(seen, depth, np.inf).astype(np.float32), np.where(seen, cosine.clip(0, 1), 1).astype(np.float32)
 
-    kept, found = (depth_fusion.surface_maps, depth_fusion.PIXELS), {}
-    training: Any = SimpleNamespace(region=find_region(capture))
+    kept = depth_fusion.surface_maps, depth_fusion.PIXELS
     try:
         depth_fusion.surface_maps = true_maps
+        yield
+    finally:
+        depth_fusion.surface_maps, depth_fusion.PIXELS = kept
+
+
+def fusion(capture: Capture, truth: Truth, folder: Path) -> dict[str, float]:
+    """Degrees of normals of the mesh that is fused of true depth maps, by voxel."""
+    found = {}
+    training: Any = SimpleNamespace(region=find_region(capture))
+    with true_depth(truth):
         for depth_fusion.PIXELS in VOXELS:
             figures = against_truth(None, training, capture, folder)  # type: ignore[arg-type]
             found[f"fused, voxels of {depth_fusion.PIXELS:g} pixels"] = figures["normal"]
-    finally:
-        depth_fusion.surface_maps, depth_fusion.PIXELS = kept
     return found
 
 

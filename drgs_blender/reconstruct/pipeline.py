@@ -31,6 +31,7 @@ from .losses.photometric import Photograph, structural_similarity
 from .meshing.depth_fusion import fuse, grid
 from .meshing.normal_integration import follow_normals, shaded_by, shaded_by_own
 from .meshing.silhouette_fit import fill_silhouettes
+from .meshing.surfel_normals import with_surfel_normals
 from .meshing.visual_hull import Region, find_region, have_silhouettes, silhouettes
 from .model.attached import attach_learned, bound
 from .model.gaussians import Gaussians
@@ -269,7 +270,9 @@ def _on_mesh(
 
 def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: dict[str, Any]) -> Decoupled:
     """Materials, normals and light."""
-    settings = work.settings.decoupling
+    settings, shown, start = work.settings.decoupling, normals_of(surfels), None
+    if settings.normals and work.settings.variant == "p" and not thin:
+        start = with_surfel_normals(mesh, work.capture.training, shown)
     if (seconds := work.seconds(MATERIAL_TIME_FRACTION)) is not None:
         settings = replace(settings, seconds=seconds)
     found = decouple(
@@ -280,7 +283,8 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: 
         work.cancelled,
         work.file("materials"),
         work.backend,
-        normals_of(surfels) if thin else None,
+        shown if thin else None,
+        start,
     )
     done, of = found.report["iterations"], work.settings.decoupling.iterations
     if done < min(FEW_STEPS, of):

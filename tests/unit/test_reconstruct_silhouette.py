@@ -16,9 +16,11 @@ from shapes import plain_mesh, sphere_mesh
 
 from drgs_blender.core.errors import UsageError
 from drgs_blender.core.frame import Camera
+from drgs_blender.geometry.normals import VertexNormals
 from drgs_blender.reconstruct.capture.training_views import pixel_rays
 from drgs_blender.reconstruct.meshing import depth_fusion
 from drgs_blender.reconstruct.meshing.silhouette_fit import FARTHEST, fill_silhouettes
+from drgs_blender.reconstruct.meshing.tangential_relaxation import relaxed
 from drgs_blender.reconstruct.meshing.visual_hull import Region, silhouettes
 
 SIZE, RADIUS = 96, 0.7
@@ -67,6 +69,38 @@ def test_exact_depth_maps_make_an_exact_mesh(cameras, monkeypatch):
     assert abs(filled.mean()) < 0.03 and np.abs(filled).max() < 0.2
 
 
+def test_a_fused_mesh_keeps_its_normals_when_it_is_moved(cameras, monkeypatch):
+    """Edges of a hundredth of a voxel, as marching cubes leaves them, turn over with the first move."""
+    rng = np.random.default_rng(0)
+
+    def noisy(_: object, view: Camera) -> tuple:
+        depth, cosine = hit(view)
+        return depth + (0.3 * PIXEL * rng.normal(size=depth.shape)).astype(np.float32), cosine
+
+    monkeypatch.setattr(depth_fusion, "surface_maps", noisy)
+    low = np.full(3, -RADIUS)
+    region = Region(np.zeros(3), 2 * RADIUS, low, -low, np.zeros((0, 3)), np.zeros((0, 3)), PIXEL)
+    mesh, report = depth_fusion.fuse(None, cameras, region)  # type: ignore[arg-type]
+    edges = np.linalg.norm(mesh.vertices[mesh.faces] - mesh.vertices[np.roll(mesh.faces, 1, axis=1)], axis=-1)
+    assert edges.min() > 0.1 * report["voxel"]
+    filled = fill_silhouettes(mesh, cameras, [mask_of(view) for view in cameras])
+    normals = VertexNormals(mesh.faces, len(filled))(filled)
+    turned = (normals * filled).sum(1) / np.linalg.norm(filled, axis=1) < np.cos(np.radians(45))
+    assert turned.mean() < 5e-4
+
+
+def test_vertices_slide_along_the_surface_and_not_off_it():
+    vertices, faces = sphere_mesh(4)
+    rng = np.random.default_rng(0)
+    edge = np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1).mean()
+    uneven = vertices + rng.uniform(-0.3, 0.3, vertices.shape) * edge
+    uneven /= np.linalg.norm(uneven, axis=1, keepdims=True)
+    moved = relaxed(uneven, faces)
+    length = lambda v: np.linalg.norm(v[faces] - v[np.roll(faces, 1, axis=1)], axis=-1)  # noqa: E731
+    assert np.quantile(length(moved), 0.01) > 1.5 * np.quantile(length(uneven), 0.01)
+    assert np.abs(np.linalg.norm(moved, axis=1) - 1).max() < 0.1 * edge
+
+
 def test_more_voxels_than_memory_are_refused_with_how_many_fit(cameras, monkeypatch):
     def begun(*_):
         raise LookupError
@@ -109,6 +143,21 @@ def test_parts_that_the_mesh_lacks_do_not_inflate_the_rest(cameras):
     moved = off(fill_silhouettes(plain_mesh(RADIUS * vertices, faces), cameras, masks))
     far = vertices[:, 2] < 0.3
     assert np.abs(moved[far]).max() < 0.06 and moved.max() <= FARTHEST + 0.01
+
+
+def test_what_is_around_the_object_in_the_picture_changes_nothing(cameras):
+    """Pictures of which the object fills a part, and wider ones."""
+    vertices, faces = sphere_mesh(4)
+    mesh, add = plain_mesh((RADIUS - 0.8 * PIXEL) * vertices, faces), np.array((31, 17))
+    wide = [
+        replace(v, width=v.width + 2 * add[0], height=v.height + 2 * add[1], cx=v.cx + add[0], cy=v.cy + add[1])
+        for v in cameras
+    ]
+    masks = [mask_of(view) for view in cameras]
+    padded = [np.pad(mask, ((add[1], add[1]), (add[0], add[0]))) for mask in masks]
+    one, other = fill_silhouettes(mesh, cameras, masks), fill_silhouettes(mesh, wide, padded)
+    np.testing.assert_allclose(one, other, atol=1e-3 * PIXEL)
+    assert np.abs(one - mesh.vertices).max() > 0.5 * PIXEL
 
 
 def test_a_mesh_that_no_camera_sees_stays(cameras):

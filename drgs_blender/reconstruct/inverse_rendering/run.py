@@ -88,6 +88,7 @@ def decouple(
     checkpoint: Path | None = None,
     backend: LearningBackend = CPU,
     normals: Normals | None = None,
+    start: Array | None = None,
     now: Callable[[], float] = time.monotonic,
 ) -> Decoupled:
     """Learn materials and light of an object from photographs and its geometry.
@@ -111,6 +112,8 @@ def decouple(
     normals : callable, optional
         Gives the normals behind pixels in place of the mesh. They count where they are within 60 degrees of the
         face, as for surfels that are rendered; what is learned of normals is added to them.
+    start : (v, 3) float32 array, optional
+        Unit normals of the vertices to begin with, in place of the mesh's smooth ones.
     now : callable
         Monotonic clock, seconds.
 
@@ -129,7 +132,7 @@ def decouple(
         raise UsageError(str(capture.source), "has no training view", "Leave fewer views out for the test")
     if len(capture.training) < 4:
         log.warning("only %d views: light and materials can hardly be separated", len(capture.training))
-    job = Job(capture, mesh, settings, checkpoint, backend, normals, now)
+    job = Job(capture, mesh, settings, checkpoint, backend, normals, start, now)
     schedule = job.schedule
     while schedule.going():
         if cancelled is not None and cancelled():
@@ -187,7 +190,7 @@ class Job:
 
     def __init__(
         self, capture: Capture, mesh: Mesh, settings: Settings, checkpoint: Path | None, backend: LearningBackend,
-        normals: Normals | None, now: Callable[[], float],
+        normals: Normals | None, start: Array | None, now: Callable[[], float],
     ) -> None:  # fmt: skip
         self._mesh, self._settings, self._views = mesh, settings, len(capture.training)
         self.schedule, self.score = Schedule(settings, now), Score()
@@ -205,13 +208,13 @@ class Job:
         # without any detail: light is to explain shading before albedo can.
         mean = self._pixels.colour.mean(axis=0)
         self.lighting = Lighting(gatherer, settings, 2.5 * float(mean.mean()))
-        self.surface = Surface(mesh, settings, mean, normals is not None)
+        self.surface = Surface(mesh, settings, mean, normals is not None, start)
         colours = np.maximum(cache[:, 0] * 0.28209479, 0)
         self._regularisers = Regularisers(mesh.faces, colours, settings)
         #: Logarithm of the brightness of the photographs, one each.
         self._exposure = torch.zeros(len(capture.training)) if settings.exposure else None
         self._adam = Adam(self._learned())
-        shape = _digest(mesh.vertices, mesh.faces, self._pixels.detail_normal)
+        shape = _digest(mesh.vertices, mesh.faces, self._pixels.detail_normal, self.surface.normals())
         key = states.fingerprint(capture, mesh=shape, **asdict(settings))
         self.checkpoint = states.Checkpoint(checkpoint, key, _SAVE, now)
         if (state := self.checkpoint.load()) is not None:

@@ -60,6 +60,8 @@ class Surface:
         Colour of the photographs.
     given_normals : bool
         Whether pixels have normals from elsewhere than the mesh.
+    start : (v, 3) float32 array, optional
+        Unit normals of the vertices to begin with, in place of the mesh's smooth ones.
 
     Attributes
     ----------
@@ -68,8 +70,12 @@ class Surface:
         Name to tensor: those of the materials, and "normals" (v, 3) where they are learned.
     """
 
-    def __init__(self, mesh: Mesh, settings: Settings, mean: Array, given_normals: bool) -> None:
-        self._normals = torch.from_numpy(VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices))
+    def __init__(
+        self, mesh: Mesh, settings: Settings, mean: Array, given_normals: bool, start: Array | None = None
+    ) -> None:
+        if start is None:
+            start = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
+        self._normals = torch.from_numpy(start)
         self._faces = torch.from_numpy(mesh.faces.astype(np.int64))
         self._given_normals = given_normals
         self.materials = Materials(mesh, settings.parametrisation, settings.coarse, mean)
@@ -97,7 +103,7 @@ class Surface:
         return SurfaceSamples(materials, normal, columns, offsets, end_index)
 
     def normals(self) -> Array:
-        """(v, 3) float32 unit: smooth vertex normals with what was learned on top."""
+        """(v, 3) float32 unit: those that learning began with, and what was learned on top."""
         normals = self._normals
         if "normals" in self.parameters:
             normals = normalise(normals + self.parameters["normals"])

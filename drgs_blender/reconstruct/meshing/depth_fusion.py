@@ -18,6 +18,7 @@ from ...geometry.tsdf import DepthMaps, SignedDistanceField
 from ..capture.training_views import pixel_rays
 from ..memory_budget import check_fits
 from ..model.gaussians import Gaussians
+from .tangential_relaxation import relaxed
 from .visual_hull import Region, world_to_pixel
 
 log = logging.getLogger(__name__)
@@ -51,7 +52,7 @@ def fuse(
     Returns
     -------
     mesh : Mesh
-        Watertight, counter-clockwise seen from outside; neutral materials.
+        Watertight, counter-clockwise seen from outside, of even triangles; neutral materials.
     report : dict
         "voxel" (metres), "components_dropped", "volume" (cubic metres), "vertices", "faces".
 
@@ -69,6 +70,7 @@ def fuse(
             group = [c for c in batch if (c.height, c.width) == (height, width)]
             field.add(_depth_maps(gaussians, group))
     mesh, report = field.mesh(1, SMOOTH, "Learn them for longer, or check masks and cameras")
+    mesh.vertices = relaxed(mesh.vertices, mesh.faces)
     log.info("mesh: %s", report)
     return mesh, report
 

@@ -90,21 +90,36 @@ def _lacking(
 ) -> tuple[Array, Array, Array]:
     """Vertices at the outline that `camera` sees: their indices, how many pixels they lack outwards, their depth."""
     eye = np.asarray(camera.matrix_world)[:3, 3].astype(np.float32)
-    seen = _coverage(tree, camera, eye, pixel_rays(camera).numpy()) > 0.5
-    band = binary_dilation(seen, iterations=BAND) & ~binary_erosion(seen, iterations=BAND, border_value=1)
-    outline = uniform_filter(band.astype(np.float32), WINDOW) / (2 * BAND)
-    gap = np.zeros(seen.shape, np.float32)
-    gap[band] = mask[band] - _coverage(tree, camera, eye, pixel_rays(camera).numpy()[band], FINE)
-    gap = uniform_filter(gap, WINDOW)
     position = vertices @ matrix[:, :3].T + matrix[:, 3]
     away = position[:, 2]
     x, y = (np.floor(position[:, k] / np.maximum(away, 1e-9)).astype(int) for k in (0, 1))
+    shown = (away > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    if not shown.any():
+        return np.zeros(0, int), np.zeros(0, np.float32), np.zeros(0)
+    left, top, around = _around(x[shown], y[shown])
+    rays = pixel_rays(camera).numpy()[around]
+    seen = _coverage(tree, camera, eye, rays) > 0.5
+    band = binary_dilation(seen, iterations=BAND) & ~binary_erosion(seen, iterations=BAND, border_value=1)
+    outline = uniform_filter(band.astype(np.float32), WINDOW) / (2 * BAND)
+    gap = np.zeros(seen.shape, np.float32)
+    gap[band] = mask[around][band] - _coverage(tree, camera, eye, rays[band], FINE)
+    gap = uniform_filter(gap, WINDOW)
     towards = eye - vertices
     cosine = np.abs((towards * along).sum(1)) / np.linalg.norm(towards, axis=1)
-    row = np.flatnonzero((cosine < RIM) & (away > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height))
-    row = row[band[y[row], x[row]]]
-    at = y[row], x[row]
+    row = np.flatnonzero((cosine < RIM) & shown)
+    row = row[band[y[row] - top, x[row] - left]]
+    at = y[row] - top, x[row] - left
     return row, gap[at] / outline[at], away[row]
+
+
+def _around(x: Array, y: Array) -> tuple[int, int, tuple[slice, slice]]:
+    """First column and row of the part of the picture that outlines of what covers pixels (x, y) can reach; the part.
+
+    Slices may go beyond the picture's end.
+    """
+    margin = BAND + WINDOW
+    left, top = max(int(x.min()) - margin, 0), max(int(y.min()) - margin, 0)
+    return left, top, np.s_[top : int(y.max()) + margin + 1, left : int(x.max()) + margin + 1]
 
 
 def _coverage(tree: TriangleBVH, camera: Camera, eye: Array, rays: Array, fine: int = 1) -> Array:

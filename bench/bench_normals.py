@@ -1,0 +1,210 @@
+"""Where normals are lost between surfels and mesh, and what that costs relit pictures.
+
+python bench/bench_normals.py --part chain --capture scenes/cat [--size 256]
+python bench/bench_normals.py --part relit --capture scenes/cat [--steps 1000]
+
+Scenes are those of `drgs evaluate --make-scenes scenes`. Surfels are learned once and kept, and so are rows, so that
+captures may be measured one by one.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from bench_evaluate import mean, score, under_other_lights
+from bench_reconstruct import first_hits, trained
+from bench_shape import VOXELS, Truth, true_depth
+from report import OUT, processor_seconds, store_row, table, write_section
+
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.asset.model import Mesh
+from drgs_blender.evaluate.truth import read_truth
+from drgs_blender.geometry.normals import unit
+from drgs_blender.reconstruct import pipeline
+from drgs_blender.reconstruct.capture.capture import Capture
+from drgs_blender.reconstruct.meshing import depth_fusion
+from drgs_blender.reconstruct.meshing.silhouette_fit import fill_silhouettes
+from drgs_blender.reconstruct.meshing.visual_hull import find_region, silhouettes
+from drgs_blender.reconstruct.model.gaussians import Gaussians
+from drgs_blender.reconstruct.model.thin_structures import normals_of
+from drgs_blender.reconstruct.optim.schedule import Schedule
+from drgs_blender.reconstruct.readers import read_capture
+from drgs_blender.reconstruct.settings import Settings
+
+FOLDER = OUT / "reconstruct"
+#: The light of relit pictures.
+LIGHT = "city"
+#: Name -> whether triangles are evened, and whether learning begins with the surfels' normals, too.
+STEPS = {
+    "triangles as marching cubes leaves them": (False, False),
+    "evened": (True, False),
+    "evened, and begun with the surfels' normals": (True, True),
+}
+
+
+def learned(capture: Capture, name: str) -> Gaussians:
+    """The surfels of a capture after stage (i) as it is by default, kept from the first time on."""
+    file = FOLDER / "surfels" / f"{name}.npz"
+    if not file.exists():
+        training, _ = trained(capture, Schedule(), None)
+        surfels, light = training.gaussians.arrays(), training.gaussians.light
+        assert light is not None
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(file, light=light.detach().numpy(), **surfels)  # type: ignore[arg-type]
+    with np.load(file) as kept:
+        tensors = {key: torch.from_numpy(kept[key]) for key in kept.files}
+    light = tensors.pop("light")
+    return Gaussians(tensors, light)
+
+
+class Chain:
+    """Errors of normals in the views left out, mean degrees of the pixels that both show."""
+
+    def __init__(self, capture: Capture, truth: Truth) -> None:
+        self._views, self._truth = capture.testing, truth
+        self._maps = [truth.maps(view.camera) for view in self._views]
+
+    def off(self, shown: list[tuple[np.ndarray, np.ndarray]]) -> float:
+        """Of normals (h, w, 3) of each view, where its mask (h, w) says that there are any."""
+        angles = []
+        for (normal, seen), (depth, true) in zip(shown, self._maps, strict=True):
+            both = seen & (depth > 0)
+            angles.append(np.arccos((normal * true).sum(-1)[both].clip(-1, 1)))
+        return float(np.degrees(np.concatenate(angles).mean()))
+
+    def mesh(self, mesh: Mesh) -> float:
+        """Of the smooth normals of a mesh."""
+        return self._hits(mesh.vertices, mesh.faces)
+
+    def facets(self) -> float:
+        """Of the true mesh, faces flat: what no shape can show, as photographs show smooth normals of few faces."""
+        corners = self._truth.vertices[self._truth.faces].reshape(-1, 3)
+        return self._hits(corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
+
+    def surfels(self, gaussians: Gaussians) -> float:
+        """Of the surfels' own normals."""
+        shown = [unit(normals_of(gaussians)(view)) for view in self._views]
+        return self.off([(normal, np.abs(normal).sum(-1) > 0) for normal in shown])
+
+    def _hits(self, vertices: np.ndarray, faces: np.ndarray) -> float:
+        shown = []
+        for view in self._views:
+            normal, hit, _ = first_hits(vertices, faces, view.camera)
+            shape = view.camera.height, view.camera.width
+            shown.append((normal.reshape(*shape, 3), hit.reshape(shape)))
+        return self.off(shown)
+
+
+def chain(capture: Capture, truth: Truth, name: str) -> dict[str, float]:
+    """Degrees after each step from the surfels to the mesh of stage (i)."""
+    judge, region, cameras = Chain(capture, truth), find_region(capture), [v.camera for v in capture.training]
+    masks, gaussians = silhouettes(capture), learned(capture, name)
+    assert masks is not None
+    found = {"the true mesh, faces flat": judge.facets()}
+    with true_depth(truth):
+        for depth_fusion.PIXELS in VOXELS:
+            mesh, _ = depth_fusion.fuse(None, cameras, region, 1024)  # type: ignore[arg-type]
+            found[f"true depth, fused, voxels of {depth_fusion.PIXELS:g} pixels"] = judge.mesh(mesh)
+    found["surfels' own normals"] = judge.surfels(gaussians)
+    even = depth_fusion.relaxed
+    for label, relax in (("triangles as marching cubes leaves them", lambda v, _: v), ("evened", even)):
+        depth_fusion.relaxed = relax
+        try:
+            mesh, _ = depth_fusion.fuse(gaussians, cameras, region)
+        finally:
+            depth_fusion.relaxed = even
+        found[f"learned depth, fused, {label}"] = judge.mesh(mesh)
+        mesh.vertices = fill_silhouettes(mesh, cameras, masks)
+        found[f"{label}, outlines filled"] = judge.mesh(mesh)
+    return found
+
+
+def relit(capture: Capture, folder: Path, name: str, steps: int) -> dict[str, list[str]]:
+    """Figures of the finished asset with and without the steps, from the same surfels."""
+    gaussians, truth = learned(capture, name), read_truth(folder)
+    assert truth is not None
+    known = (LIGHT, truth.training_light)
+    truth = replace(truth, sets=[item for item in truth.sets if not item.posed and item.light in known])
+    settings = Settings()
+    settings = replace(settings, decoupling=replace(settings.decoupling, iterations=steps))
+    kept = depth_fusion.relaxed, pipeline.with_surfel_normals, pipeline._Work.learn
+    found = {}
+    for label, (evened, shown) in STEPS.items():
+        depth_fusion.relaxed = kept[0] if evened else lambda vertices, _: vertices
+        pipeline.with_surfel_normals = kept[1] if shown else lambda *_: None
+        pipeline._Work.learn = lambda *_: gaussians  # type: ignore[method-assign]
+        begun = processor_seconds()
+        try:
+            asset = pipeline.reconstruct(capture, settings)
+        finally:
+            depth_fusion.relaxed, pipeline.with_surfel_normals, pipeline._Work.learn = kept
+        spent = processor_seconds() - begun
+        path = FOLDER / f"{name}.drgs"
+        write_asset(path, asset)
+        report = score(path, folder, "surfels", 32, truth)
+        novel, materials = report["novel"], report["materials"]
+        found[label] = [
+            f"{report['geometry']['normal_degrees']:.2f}",
+            f"{mean(under_other_lights(report, False), 'scaled', 'foreground'):.2f}",
+            f"{novel['psnr_foreground']:.2f}",
+            f"{materials['albedo_psnr_scaled']:.2f}",
+            f"{materials['roughness_rmse']:.3f} / {materials['metallic_rmse']:.3f}",
+            f"{spent:.0f}",
+        ]
+        print(name, label, *found[label], flush=True)
+    return found
+
+
+def write_chain(capture: Capture, folder: Path, name: str, _: int) -> None:
+    """Measure and write the chain."""
+    rows = store_row(FOLDER / "chain.json", name, chain(capture, Truth(folder), name))
+    body = (
+        "Mean degrees in the views left out, before materials are learned. Photographs show smooth vertex normals of a "
+        "mesh of few faces: what the true mesh with flat faces is off is in no shape.\n\n"
+    )
+    head = ("Object-pixels", *next(iter(rows.values())))
+    cells = [(key, *(f"{value:.2f}" for value in values.values())) for key, values in rows.items()]
+    write_section("reconstruct-chain", "Where stage (i) loses normals", body + table(head, cells))
+
+
+def write_relit(capture: Capture, folder: Path, name: str, steps: int) -> None:
+    """Measure and write what the steps bring."""
+    rows: dict[str, Any] = {}
+    for label, cells in relit(capture, folder, name, steps).items():
+        rows = store_row(FOLDER / "relit.json", f"{name}|{label}", cells)
+    body = (
+        f"The same surfels, {steps} steps of materials and light; camera sees surfels. Normals in mean degrees, PSNR "
+        f"of the foreground in dB, relit under {LIGHT!r} scaled by one factor a channel. Of the fern learning has its "
+        "surfels' normals alone, as it is thin.\n\n"
+    )
+    head = ("Object-pixels", "Mesh", "Normals deg", "Relit", "Views left out", "Albedo scaled",
+            "Roughness / metallic RMSE", "Processor s")  # fmt: skip
+    write_section(
+        "reconstruct-normals",
+        "What even triangles and normals of surfels bring",
+        body + table(head, [(*key.split("|"), *cells) for key, cells in rows.items()]),
+    )
+
+
+PARTS: dict[str, Callable[[Capture, Path, str, int], None]] = {"chain": write_chain, "relit": write_relit}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--part", choices=tuple(PARTS), default="chain")
+    parser.add_argument("--capture", type=Path, required=True)
+    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--steps", type=int, default=1000, help="of materials and light")
+    options = parser.parse_args()
+    capture = read_capture(options.capture, options.size)
+    PARTS[options.part](capture, options.capture, f"{options.capture.name}-{options.size}", options.steps)
+
+
+if __name__ == "__main__":
+    main()

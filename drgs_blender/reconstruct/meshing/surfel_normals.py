@@ -1,0 +1,50 @@
+"""Normals of a fused mesh from the surfels': both are estimates of the same, with errors of their own.
+
+The mesh has the slopes of depth maps, which many views even out; surfels have normals that photographs taught them,
+flat on facets and sharp at edges. The mean of both is nearer to the truth than either.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...core.arrays import Array
+from ...core.asset.model import Mesh
+from ...geometry.normals import VertexNormals, unit
+from ...render.scene.triangle_bvh import TriangleBVH
+from ..capture.capture import View
+from ..inverse_rendering.pixels import Normals, pixels_of
+
+#: Least cosine between both; a surfel's normal that is farther off is of something else.
+ALIKE = 0.5
+
+
+def with_surfel_normals(mesh: Mesh, views: list[View], normals: Normals) -> Array:
+    """Mean of the smooth vertex normals of `mesh` and of the `normals` that `views` show there.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    views : list of View
+    normals : callable
+        Gives those of a view's pixels.
+
+    Returns
+    -------
+    (v, 3) float32 array
+        Unit; those of the mesh where no view shows a vertex, or something else.
+    """
+    tree = TriangleBVH()
+    tree.build(mesh.vertices, mesh.faces)
+    own = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
+    total = np.zeros((len(own), 3))
+    for index, view in enumerate(views):
+        pixels = pixels_of(index, view, mesh, tree, normals)
+        weight = pixels.corners * (pixels.flat * pixels.towards).sum(axis=1, keepdims=True)
+        corner = mesh.faces[pixels.face].ravel()
+        for axis in range(3):
+            values = (weight * pixels.detail_normal[:, axis, None]).ravel()
+            total[:, axis] += np.bincount(corner, values, len(own))
+    shown = unit(total, (0, 0, 0))
+    alike = (shown * own).sum(axis=1, keepdims=True) > ALIKE
+    return unit(own + np.where(alike, shown, 0)).astype(np.float32)
