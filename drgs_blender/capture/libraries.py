@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import signal
 import sys
+import threading
 from typing import Any, NamedTuple
 
 # Before pycolmap, because it loads the system's zlib: if pycolmap is the first to do so, that zlib calls functions of
@@ -41,6 +43,7 @@ def load(name: str) -> Any:
         It is not installed; the message has the command that installs it.
     """
     library = LIBRARIES[name]
+    terminated = signal.getsignal(signal.SIGTERM)
     try:
         module = importlib.import_module(library.module)
     except ImportError as error:
@@ -50,6 +53,8 @@ def load(name: str) -> Any:
             f'Install it: "{sys.executable}" -m pip install "{library.package}"',
         ) from error
     if name == "pycolmap":
+        if threading.current_thread() is threading.main_thread() and terminated is not None:
+            signal.signal(signal.SIGTERM, terminated)  # its log library takes it for a crash
         module.logging.minloglevel = module.logging.Level.FATAL.value  # its errors arrive as exceptions
     return module
 

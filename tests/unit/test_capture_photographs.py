@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -133,3 +134,20 @@ def test_pillow_works_after_structure_from_motion_was_loaded_first():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, cwd=ROOT)
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM that one can catch")
+def test_structure_from_motion_leaves_sigterm_to_who_had_it():
+    """COLMAP's log library takes it for a crash: no state is saved, and what it prints is a stack trace."""
+    pytest.importorskip("pycolmap", reason="structure from motion needs pycolmap")
+    program = (
+        "import os, signal\n"
+        "from drgs_blender.capture import libraries\n"
+        "from drgs_blender.cli.interrupt import interruptible\n"
+        "with interruptible() as cancelled:\n"
+        "    libraries.load('pycolmap')\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    assert cancelled()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, cwd=ROOT)
+    assert done.returncode == 0 and "stopping after the current step" in done.stderr, done.stderr[-2000:]
