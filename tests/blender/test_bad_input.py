@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import sys
 from pathlib import Path
 
@@ -256,6 +257,26 @@ def test_a_cut_off_exr_is_no_light(scene, tmp_path):
     errors, choose = part("drgs_blender.core.errors"), part("addon.world_setup").choose_light
     with pytest.raises(errors.AssetError, match="is cut off"):
         choose(scene, tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize("make", [around, lambda scene, image: textured(image)], ids=["world", "surface"])
+def test_a_file_that_did_not_change_is_not_opened_again(scene, export, tmp_path, monkeypatch, make):
+    make(scene, picture(tmp_path / "a.exr", "OPEN_EXR"))
+    opened: list[str] = []
+    given = builtins.open
+
+    def spy(file, *args, **options):
+        opened.append(str(file))
+        return given(file, *args, **options)
+
+    monkeypatch.setattr(builtins, "open", spy)
+    for count in (True, False):
+        assert not export()[1]
+        assert (str(tmp_path / "a.exr") in opened) == count
+        opened.clear()
+    path = tmp_path / "a.exr"
+    path.write_bytes(path.read_bytes()[:-100])
+    assert any("cut off" in text or "cannot be read" in text for text in export()[1])
 
 
 @pytest.mark.parametrize("packed", [False, True])
