@@ -301,15 +301,52 @@ def test_an_image_larger_than_blender_gives_away_is_made_smaller(scene, export, 
     assert len(bpy.data.images) == 1, "no copy is left behind"
 
 
-def test_an_image_that_memory_has_no_room_for_is_named(scene, export, tmp_path, monkeypatch):
-    def full(image: bpy.types.Image) -> None:
+def smart(image: bpy.types.Image) -> None:
+    textured(image)
+    bpy.data.materials["Bad"].node_tree.nodes["Image Texture"].interpolation = "Smart"
+
+
+def inverted(image: bpy.types.Image) -> None:
+    """Nodes give the image a curve."""
+    textured(image)
+    tree = bpy.data.materials["Bad"].node_tree
+    change = add(tree, "Invert")
+    tree.links.new(tree.nodes["Image Texture"].outputs[0], change.node.inputs["Color"])
+    tree.links.new(change, tree.nodes["Principled BSDF"].inputs["Base Color"])
+
+
+def tiled(image: bpy.types.Image) -> None:
+    image.name = "a.png"
+    image.source, image.filepath = "TILED", image.filepath.replace("a.1001", "a.<UDIM>")
+    textured(image)
+
+
+@pytest.mark.parametrize(
+    ("show", "place", "name", "count"),
+    [
+        (textured, "image_pixels", "_given", 0),
+        (tiled, "image_grid", "grid", 0),
+        (smart, "image_cubic", "finer", 1),
+        (inverted, "images", "Image", 1),
+    ],
+)
+def test_an_image_that_memory_has_no_room_for_is_named_until_there_is_room(
+    scene, export, tmp_path, monkeypatch, show, place, name, count
+):
+    def full(*args: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(part("addon.export.image_pixels"), "_given", full)
-    textured(picture(tmp_path / "a.png", "PNG"))
+    show(picture(tmp_path / "a.1001.png", "PNG"))
+    bpy.data.images[0].name = "a.png"
+    with monkeypatch.context() as patch:
+        patch.setattr(part(f"addon.export.{place}"), name, full)
+        frame, warnings = export()
+    assert warnings[0].startswith('Image "a.png": there is no memory for its pixels. Use a smaller image')
+    assert len(frame.images) == count and len(frame.meshes) == 1
     frame, warnings = export()
-    assert warnings[0].startswith('Image "a.png": there is no memory for its 64 x 64 pixels. Use a smaller image')
-    assert not frame.images and len(frame.meshes) == 1
+    assert not any("memory" in text for text in warnings), warnings
+    (made,) = frame.images
+    assert made.pixels.size > 4
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit for files")
