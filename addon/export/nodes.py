@@ -15,6 +15,7 @@ import numpy as np
 from mathutils import Euler, Matrix
 
 from ...drgs_blender.core.color import LUMINANCE as REC709
+from ..bakes import node_trees
 from .node_math import BLENDS, OPERATIONS, blackbody, by_row, divide, hsl, hsv, hue_saturation, in_system
 from .socket_value import Array, SocketValue, Warn, constant, once, tracked, uniform
 from .sockets import SocketRef
@@ -58,6 +59,16 @@ class Walker:
             self._warned.add(text)
             say(text)
         return text
+
+    def name_lost_groups(self, tree: bpy.types.NodeTree, output: bpy.types.Node) -> None:
+        """Name group nodes without a group in all trees behind an output: no sockets are left that lead to them."""
+        for each in node_trees.trees(tree, output):
+            for node in each.tree.nodes:
+                if node.type == "GROUP" and node.node_tree is None:
+                    within = "" if each.tree.is_embedded_data else f' (in "{each.tree.name}")'
+                    self.note(
+                        node, f"{hollow(node)}{within}; what it fed is as if unlinked. Choose one, or remove the node"
+                    )
 
     # What a subclass knows of its textures
 

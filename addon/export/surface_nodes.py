@@ -41,13 +41,12 @@ class SurfaceWalker(MixingWalker):
         # From Blender 5.0 on every material has nodes, and the switch is deprecated.
         if material.node_tree is None or (bpy.app.version < (5, 0, 0) and not material.use_nodes):
             return _plain(uniform(material.diffuse_color[:3]), uniform(material.roughness), uniform(material.metallic))
-        for node in material.node_tree.nodes:
-            if node.type == "GROUP" and node.node_tree is None:  # which has no sockets, so that nothing leads to it
-                self.note(node, f"{hollow(node)}; what it fed is as if unlinked. Choose one, or remove the node")
         ref = surface_of(material.node_tree)
         origin = None if ref is None else ref.origin()
         linked = origin is not None and origin.socket.is_output
         output = ref and ref.node
+        if output:
+            self.name_lost_groups(material.node_tree, output)
         if output and output.inputs["Displacement"].is_linked:
             self.note(output, "displacement is not rendered")
         if output and output.inputs["Volume"].is_linked:

@@ -145,6 +145,59 @@ def removed_group(scene, folder: Path, drgs) -> None:
     bpy.data.node_groups.remove(bpy.data.node_groups["Hollow"])
 
 
+def lost_group(tree: bpy.types.NodeTree, kind: str = "NodeSocketColor") -> bpy.types.Node:
+    """A node of a group that holds a node of a group that is gone."""
+    made = bpy.data.node_groups.new("Outer", "ShaderNodeTree")
+    made.interface.new_socket("Out", in_out="OUTPUT", socket_type=kind)
+    made.nodes.new("NodeGroupOutput")
+    made.nodes.new("ShaderNodeGroup").name = "Lost"
+    node = tree.nodes.new("ShaderNodeGroup")
+    node.node_tree = made
+    return node
+
+
+def hollow_group(tree: bpy.types.NodeTree) -> bpy.types.Node:
+    """A node of a group of shaders that is empty."""
+    node = lost_group(tree, "NodeSocketShader")
+    node.node_tree.nodes.clear()
+    return node
+
+
+def light_tree() -> bpy.types.NodeTree:
+    light = bpy.data.objects["Bad"].data
+    light.use_nodes = True
+    return light.node_tree
+
+
+def nested_group(scene, folder: Path, drgs) -> None:
+    tree, principled = material("Bad")
+    tree.links.new(lost_group(tree).outputs[0], principled.inputs["Base Color"])
+    swatch(bpy.data.materials["Bad"])
+
+
+def world_group(scene, folder: Path, drgs) -> None:
+    tree, background = new_world(scene)
+    tree.links.new(lost_group(tree).outputs[0], background.inputs["Color"])
+
+
+def world_shader_group(scene, folder: Path, drgs) -> None:
+    tree, _ = new_world(scene)
+    tree.links.new(hollow_group(tree).outputs[0], tree.get_output_node("ALL").inputs["Surface"])
+
+
+def light_group(scene, folder: Path, drgs) -> None:
+    lamp(scene, "POINT")
+    tree = light_tree()
+    (emission,) = (node for node in tree.nodes if node.type == "EMISSION")
+    tree.links.new(lost_group(tree).outputs[0], emission.inputs["Color"])
+
+
+def light_shader_group(scene, folder: Path, drgs) -> None:
+    lamp(scene, "POINT")
+    tree = light_tree()
+    tree.links.new(hollow_group(tree).outputs[0], tree.get_output_node("ALL").inputs["Surface"])
+
+
 def lamp(scene, kind: str, **values: float) -> None:
     light = bpy.data.lights.new("Bad", kind)
     for name, value in values.items():
@@ -191,6 +244,8 @@ CUT_OFF = "its file is cut off; as much of it is shown as can be read. Copy or e
 LOOP = 'the link to "{}" is part of a loop; it is left out'
 OFF = 'Light "Bad": its colour, power or size is not finite; it is off. Check its values and their drivers'
 HOLLOW = 'Material "Bad", node "Group": its node group "Hollow" has no output; '
+LOST = 'node "Lost": has no node group (in "Outer"); what it fed is as if unlinked. Choose one'
+EMPTY = 'node "Group": its node group "Outer" has no output'
 CASES = {
     surface_exr: f'Image "a.exr": {CUT_OFF}',
     odd_exr: f'Image "a.exr": {CUT_OFF}',
@@ -207,6 +262,11 @@ CASES = {
     hollow_colour: f"{HOLLOW}it is black in Cycles. Mend or replace it",
     hollow_shader: f"{HOLLOW}a surface of its colour is used",
     removed_group: 'Material "Bad", node "Group": has no node group; what it fed is as if unlinked. Choose one',
+    nested_group: f'Material "Bad", {LOST}',
+    world_group: f'World "World", {LOST}',
+    world_shader_group: f'World "World", {EMPTY}; it is black in Cycles, here a dim grey. Mend or replace it',
+    light_group: f'Light "Bad", {LOST}',
+    light_shader_group: f'Light "Bad", {EMPTY}; its own colour is used',
     point: OFF,
     area: OFF,
     sun: OFF,
@@ -347,6 +407,21 @@ def test_an_image_that_memory_has_no_room_for_is_named_until_there_is_room(
     assert not any("memory" in text for text in warnings), warnings
     (made,) = frame.images
     assert made.pixels.size > 4
+
+
+def test_a_painted_image_larger_than_blender_gives_away_is_not_baked_and_named(scene, monkeypatch):
+    tree, principled = material("Bad")
+    image = bpy.data.images.new("Painted", 32, 32)
+    change = add(tree, "TexVoronoi", add(tree, "TexImage", image=image))
+    tree.links.new(change, principled.inputs["Base Color"])
+    swatch(bpy.data.materials["Bad"])
+    manager = part("addon.bakes.manager").manager
+    monkeypatch.setattr(part("addon.bakes.node_trees"), "_MOST", 32 * 32)
+    wanted = part("addon.bakes.requests").Wanted.of(scene)
+    part("addon.export").export_frame(bpy.context.evaluated_depsgraph_get(), str, lambda text: None, wanted=wanted)
+    (request,) = wanted.requests
+    manager.wait(object(), [request], lambda text, part: None, lambda: False)
+    assert 'image "Painted": its 32 x 32 pixels are more than Blender gives away' in manager.failed[request.key]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit for files")
