@@ -11,9 +11,9 @@ import numpy as np
 from ...drgs_blender.core.frame import Light
 from .instances import Visible
 from .node_math import rgb
-from .nodes import Walker, hollow
+from .nodes import Walker
 from .socket_value import SocketValue, once, uniform
-from .sockets import SocketRef, surface_of
+from .sockets import SocketRef, hollow, surface_of
 
 Warn = Callable[[str], None]
 

@@ -18,7 +18,7 @@ from ...drgs_blender.core.color import LUMINANCE as REC709
 from ..bakes import node_trees
 from .node_math import BLENDS, OPERATIONS, blackbody, by_row, divide, hsl, hsv, hue_saturation, in_system
 from .socket_value import Array, SocketValue, Warn, constant, once, tracked, uniform
-from .sockets import SocketRef
+from .sockets import SocketRef, hollow
 
 #: Luminance weights of Rec.709.
 LUMINANCE = np.array(REC709)
@@ -368,16 +368,6 @@ class Walker:
         return self.combine(output.node, joined, *(self.number(output.input(i)) for i in range(3)))
 
     node_combrgb = node_combxyz = node_combine_color
-
-
-def hollow(node: bpy.types.Node) -> str:
-    """What is wrong with a group node whose outputs nothing feeds."""
-    tree = node.node_tree
-    if tree is None:
-        return "has no node group"
-    if tree.original.is_missing:  # which an evaluated one does not say
-        return f'its node group "{tree.name}" is missing from {tree.original.library.filepath}'
-    return f'its node group "{tree.name}" has no output'
 
 
 def _fixed_but(value: SocketValue, texture: Hashable, means: dict[Hashable, Array]) -> SocketValue:

@@ -11,10 +11,9 @@ from ..bakes.node_trees import COLOURS, SHADERS, leaf_of
 from .bsdfs import Bsdf, MixingWalker, Part, Surface
 from .layers import LayerRef
 from .node_math import conductor
-from .nodes import hollow
 from .normal_nodes import DetailRef
 from .socket_value import SocketValue, constant, once, uniform
-from .sockets import SocketRef, surface_of
+from .sockets import SocketRef, hollow, surface_of
 
 #: Least alpha of a surface that gives off light and lets all light pass, which no alpha says.
 _LEAST_ADDED = 0.25

@@ -19,9 +19,9 @@ from ..bakes.requests import Wanted
 from . import world_bake
 from .images import MISSING, linear_pixels
 from .node_math import rgb
-from .nodes import Walker, euler, hollow, vector_rotate
+from .nodes import Walker, euler, vector_rotate
 from .socket_value import SocketValue, once, uniform
-from .sockets import SocketRef, surface_of
+from .sockets import SocketRef, hollow, surface_of
 
 Warn = Callable[[str], None]
 

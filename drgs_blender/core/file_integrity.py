@@ -53,7 +53,8 @@ def is_whole(file: str | os.PathLike[str] | bytes) -> bool:
 
     Parameters
     ----------
-    file : its path, or its bytes
+    file : str, path-like or bytes
+        Its path, or its bytes.
     """
     with _opened(file) as stream:
         reader = _Reader(stream)
@@ -70,7 +71,8 @@ def crashes_blender(file: str | os.PathLike[str] | bytes) -> bool:
 
     Parameters
     ----------
-    file : its path, or its bytes
+    file : str, path-like or bytes
+        Its path, or its bytes.
     """
     with _opened(file) as stream:
         start = stream.read(4)
