@@ -35,7 +35,7 @@ def choose_light(scene: bpy.types.Scene, path: Path, rotation: float = 0.0, stre
         raise UsageError(f'Scene "{scene.name}"', "comes from a library and cannot be changed here", "Make it local")
     if not os.path.isfile(path):
         raise AssetError(str(path), "does not exist", "Choose another image")
-    if crashes_blender(Path(path).read_bytes()):
+    if crashes_blender(path):
         raise AssetError(str(path), "is cut off", "Copy it again, or choose another image")
     try:
         image = bpy.data.images.load(str(path), check_existing=True)

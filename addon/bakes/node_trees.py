@@ -21,6 +21,8 @@ _COMMON = {p.identifier for p in bpy.types.Node.bl_rna.properties} - {"mute"}
 _SCALARS = {"BOOLEAN", "INT", "FLOAT", "STRING", "ENUM"}
 #: Nested structures that are followed: a node's curves, their points.
 _DEEPEST = 4
+#: Numbers that Blender hands out of one image at most: it counts them in 32 bits.
+_MOST = 2**31 - 1
 
 
 Follow = Callable[[bpy.types.NodeSocket], bool]
@@ -144,6 +146,8 @@ def image_identity(image: bpy.types.Image) -> dict[str, Any]:
     """What an image's pixels depend on."""
     settings = image.source, image.colorspace_settings.name, image.alpha_mode
     if is_loose(image):
+        if _is_too_large(image):  # it is not baked, whatever it shows
+            return {"pixels": image.name_full}
         return {"pixels": _digest(pixels_of(image).tobytes()), "settings": [*settings, *image.size]}
     # Not the size of others: to say it, Blender reads the file.
     if image.packed_file is not None:
@@ -159,11 +163,20 @@ def image_identity(image: bpy.types.Image) -> dict[str, Any]:
 
 
 def pixels_of(image: bpy.types.Image) -> np.ndarray:
-    """(n,) float32, as Blender holds them."""
+    """(n,) float32, as Blender holds them; RuntimeError where it does not hand them out."""
+    if _is_too_large(image):
+        size = " x ".join(map(str, image.size))
+        raise RuntimeError(
+            f'image "{image.name}": its {size} pixels are more than Blender gives away. Use a smaller one'
+        )
     pixels = np.empty(len(image.pixels), np.float32)
     if len(pixels):
         image.pixels.foreach_get(pixels)
     return pixels
+
+
+def _is_too_large(image: bpy.types.Image) -> bool:
+    return image.size[0] * image.size[1] * image.channels > _MOST
 
 
 def _digest(data: bytes) -> str:

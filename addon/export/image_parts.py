@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 
 import bpy
 
@@ -49,23 +50,30 @@ def tile_file(image: bpy.types.Image, number: int) -> str:
     return path.replace("<UDIM>", str(number)).replace("<UVTILE>", f"u{column + 1}_v{row + 1}")
 
 
-def file_data(image: bpy.types.Image) -> bytes:
-    """The file that Blender reads an image from, packed or on disk, of a tiled image that of its first tile.
+def ask_file(image: bpy.types.Image, question: Callable[[str | bytes], bool]) -> bool | None:
+    """What a question of `file_integrity` says of the file that Blender reads an image from, of a tiled its first's.
 
-    Empty where there is none, and of a movie.
+    None where there is none, packed or on disk, and of a movie. Of those on disk answers are remembered.
     """
     if image.source not in ("FILE", "SEQUENCE", "TILED") or image.is_dirty:
-        return b""
+        return None
     packed = [file.packed_file for file in image.packed_files if file.packed_file is not None]
     if packed:
-        return packed[0].data
+        return question(packed[0].data)
     tiled = image.source == "TILED" and len(image.tiles)
     path = tile_file(image, image.tiles[0].number) if tiled else image.filepath
+    path = bpy.path.abspath(path, library=image.library)
     try:
-        with open(bpy.path.abspath(path, library=image.library), "rb") as file:
-            return file.read()
+        facts = os.stat(path)
+        return _answer(question, path, facts.st_mtime_ns, facts.st_size) if facts.st_size else None
     except OSError:
-        return b""
+        return None
+
+
+@lru_cache(maxsize=4096)
+def _answer(question: Callable[[str | bytes], bool], path: str, changed: int, size: int) -> bool:
+    """Of a file on disk as it was when it was changed last."""
+    return question(path)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...drgs_blender.core.arrays import shareable
 from ...drgs_blender.core.color import linear_to_srgb, srgb_to_linear
-from ...drgs_blender.core.file_integrity import crashes_blender, is_whole_data
+from ...drgs_blender.core.file_integrity import crashes_blender, is_whole
 from ...drgs_blender.core.materials import Image
 from . import image_parts
 
@@ -28,13 +28,12 @@ _MOST = 2**31 - 1
 
 def is_empty(image: bpy.types.Image) -> bool:
     """Whether Blender has no pixels of an image, or cannot be asked for them."""
-    return crashes_blender(image_parts.file_data(image)) or 0 in image.size[:]
+    return bool(image_parts.ask_file(image, crashes_blender)) or 0 in image.size[:]
 
 
 def problems(image: bpy.types.Image) -> list[str]:
     """What is wrong with an image that was just read, for the user."""
-    data = image_parts.file_data(image)
-    if data and not is_whole_data(data):
+    if image_parts.ask_file(image, is_whole) is False:
         return ["its file is cut off; as much of it is shown as can be read. Copy or export it again"]
     if (times := _reduction(image)) > 1:
         size = " x ".join(map(str, image.size))

@@ -28,6 +28,8 @@ KEPT_EXPORTS = 4
 _known: dict[tuple[object, ...], tuple[int, Any]] = {}
 _export = 0
 _MAGENTA_TEXEL = np.array([[[255, 0, 255, 255]]], np.uint8)
+#: In place of pixels for which there is no memory any more.
+LOST = Image("no memory", _MAGENTA_TEXEL, "linear")
 #: Frame of the scene that is exported.
 _now = 0
 #: Whether the export read a sequence or a movie.
@@ -76,7 +78,7 @@ def linear_pixels(image: bpy.types.Image, warn: Warn) -> Array | None:
     if image.source == "TILED" and len(image.tiles) > 1:
         warn(f'Image "{image.name}": of its {len(image.tiles)} UDIM tiles only the first is used')
     _check(image, warn)
-    return _told(image, _remembered(image, "light", _with_problems(image_pixels.linear)), warn)
+    return _made(image, "light", _with_problems(image_pixels.linear), warn)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,22 +126,23 @@ def show(image: bpy.types.Image, straight: bool, warn: Warn, lookup: Lookup) -> 
         _moving = True
         picture = _still(image, kind, make, f"{name} (frame {lookup.frame})", lookup, warn)
     else:
-        picture = _told(image, _remembered(image, kind, _with_problems(lambda i: _named(make(i), name))), warn)
+        picture = _made(image, kind, _with_problems(lambda i: _named(make(i), name)), warn)
     if picture is None:
         return None
     shown = Shown(picture, np.eye(4), lookup.extension)
     if not lookup.is_cubic:
         return shown
 
-    def spline(_: bpy.types.Image) -> Shown:
+    def spline(_: bpy.types.Image) -> tuple[Shown, list[str]]:
         finer = image_cubic.finer(picture, lookup.extension)
         if finer is None:
-            return shown
+            return shown, []
         named = replace(finer, name=f"{picture.name} (cubic {lookup.extension})")
         size = picture.pixels.shape[1], picture.pixels.shape[0]
-        return Shown(named, image_cubic.placement(size, lookup.extension), lookup.extension, True)
+        return Shown(named, image_cubic.placement(size, lookup.extension), lookup.extension, True), []
 
-    return _remembered(image, f"{kind} {lookup.extension} {lookup.frame} cubic", spline, lookup.frame)
+    name = f"{kind} {lookup.extension} {lookup.frame} cubic"
+    return _made(image, name, spline, warn, lookup.frame) or shown
 
 
 def _tiled(
@@ -169,7 +172,7 @@ def _tiled(
             problems.append(f"its {len(found)} tiles are too large together and are reduced {reduced:.3g} times")
         return _named(picture, f"{name} ({lookup.extension} {'closest' if closest else 'linear'} tiles)"), problems
 
-    return _told(image, _remembered(image, f"{kind} {lookup.extension} {closest}", stitch), warn)
+    return _made(image, f"{kind} {lookup.extension} {closest}", stitch, warn)
 
 
 def _still(
@@ -179,35 +182,36 @@ def _still(
 
     def read(image: bpy.types.Image) -> tuple[Image | None, list[str]]:
         with image_parts.still(image, lookup.frame) as shown:
-            return _with_problems(lambda i: _named(make(i), name))(shown)
+            picture, problems = _with_problems(make)(shown)
+        if picture is None:
+            path = image_parts.frame_file(image, lookup.frame)
+            problems.append(f"frame {lookup.frame}, {path}, cannot be read. See that the file is there")
+        return _named(picture, name), problems
 
-    picture = _told(image, _remembered(image, f"{kind} {lookup.frame}", read, lookup.frame), warn)
-    if picture is None:
-        path = image_parts.frame_file(image, lookup.frame)
-        warn(f'Image "{image.name}": frame {lookup.frame}, {path}, cannot be read. See that the file is there')
-    return picture
+    return _made(image, f"{kind} {lookup.frame}", read, warn, lookup.frame)
 
 
 def _with_problems(
     make: Callable[[bpy.types.Image], T | None],
 ) -> Callable[[bpy.types.Image], tuple[T | None, list[str]]]:
     """`make`, with what is wrong with the image."""
-
-    def made(image: bpy.types.Image) -> tuple[T | None, list[str]]:
-        try:
-            return make(image), image_pixels.problems(image)
-        except MemoryError:
-            size = " x ".join(map(str, image.size))
-            return None, [f"there is no memory for its {size} pixels. Use a smaller image, or close other programs"]
-
-    return made
+    return lambda image: (make(image), image_pixels.problems(image))
 
 
-def _told(image: bpy.types.Image, found: tuple[T, list[str]], warn: Warn) -> T:
-    """What was made of an image; what is wrong with it is told."""
-    for problem in found[1]:
+def _made(
+    image: bpy.types.Image, kind: str, make: Callable[..., tuple[T, list[str]]], warn: Warn, frame: int = 0
+) -> T | None:
+    """What `make` makes of an image, remembered; what is wrong with it is told. None where there is no memory for it.
+
+    That is not remembered: the next export tries again.
+    """
+    try:
+        found, problems = _remembered(image, kind, make, frame)
+    except MemoryError:
+        found, problems = None, ["there is no memory for its pixels. Use a smaller image, or close other programs"]
+    for problem in problems:
         warn(f'Image "{image.name}": {problem}')
-    return found[0]
+    return found
 
 
 def _named(picture: Image | None, name: str) -> Image | None:
@@ -254,22 +258,23 @@ def export_curved(
     data : keep the values as they are; else colours are encoded as sRGB
     """
     plain = export_image(image, straight, warn, lookup)
-    assert plain is not None, "a curve is made of pixels"
+    if plain is None:  # which was there when it was looked for
+        return LOST
     values = np.frombuffer(curve, np.float32).reshape(256, 3)
     number = data or (bool((np.ptp(values, axis=1) < 1e-6).all()) and source != "rgb")
     table = np.rint(255 * (values if number else linear_to_srgb(values))).astype(np.uint8)
 
-    def make(_: bpy.types.Image) -> Image:
+    def make(_: bpy.types.Image) -> tuple[Image, list[str]]:
         given = plain.rgba
         pixels = given.copy()
         for i in range(3):
             pixels[..., i] = table[:, i][given[..., i if source == "rgb" else "rgba".index(source)]]
         pixels.flags.writeable = False
         mark = hashlib.blake2b(source.encode() + b"data" * data + curve, digest_size=6).hexdigest()
-        return Image(f"{plain.name} ({mark})", pixels, "linear" if number else "srgb")
+        return Image(f"{plain.name} ({mark})", pixels, "linear" if number else "srgb"), []
 
     kind = f"{plain.name} {source} {data} {hashlib.blake2b(curve).hexdigest()}"
-    return _remembered(image, kind, make, lookup.frame)
+    return _made(image, kind, make, warn, lookup.frame) or LOST
 
 
 def is_grey(picture: Image) -> bool:
@@ -318,9 +323,11 @@ def _remembered(image: bpy.types.Image, kind: str, make: Callable[[bpy.types.Ima
     key = (kind, *key)
     if key not in _known:
         was_there = image.has_data or image.source != "FILE"
-        _known[key] = _export, make(image)
-        if not was_there:
-            image.buffers_free()
+        try:
+            _known[key] = _export, make(image)
+        finally:
+            if not was_there:
+                image.buffers_free()
     result = _known[key][1]
     _known[key] = _export, result
     return result

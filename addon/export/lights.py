@@ -13,7 +13,7 @@ from .instances import Visible
 from .node_math import rgb
 from .nodes import Walker
 from .socket_value import SocketValue, once, uniform
-from .sockets import SocketRef, surface_of
+from .sockets import SocketRef, hollow, surface_of
 
 Warn = Callable[[str], None]
 
@@ -89,7 +89,10 @@ class _Tree(Walker):
     def emission(self) -> np.ndarray:
         """(3,): colour times strength; black without an output, as in Blender."""
         surface = surface_of(self.tree)
-        return np.zeros(3) if surface is None else self.shader(surface)
+        if surface is None:
+            return np.zeros(3)
+        self.name_lost_groups(self.tree, surface.node)
+        return self.shader(surface)
 
     @once(lambda self: np.ones(3))
     def shader(self, ref: SocketRef) -> np.ndarray:
@@ -105,7 +108,8 @@ class _Tree(Walker):
         if node.type == "MIX_SHADER":
             share = float(np.clip(self.value(origin.input(0)), 0, 1))
             return (1 - share) * self.shader(origin.input(1)) + share * self.shader(origin.input(2))
-        self.warn(node, f"{node.bl_label} is not supported in a light; its own colour is used")
+        problem = hollow(node) if node.type == "GROUP" else f"{node.bl_label} is not supported in a light"
+        self.warn(node, f"{problem}; its own colour is used")
         return np.ones(3)
 
     def node_light_falloff(self, output: SocketRef) -> SocketValue:

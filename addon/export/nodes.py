@@ -15,9 +15,10 @@ import numpy as np
 from mathutils import Euler, Matrix
 
 from ...drgs_blender.core.color import LUMINANCE as REC709
+from ..bakes import node_trees
 from .node_math import BLENDS, OPERATIONS, blackbody, by_row, divide, hsl, hsv, hue_saturation, in_system
 from .socket_value import Array, SocketValue, Warn, constant, once, tracked, uniform
-from .sockets import SocketRef
+from .sockets import SocketRef, hollow
 
 #: Luminance weights of Rec.709.
 LUMINANCE = np.array(REC709)
@@ -58,6 +59,16 @@ class Walker:
             self._warned.add(text)
             say(text)
         return text
+
+    def name_lost_groups(self, tree: bpy.types.NodeTree, output: bpy.types.Node) -> None:
+        """Name group nodes without a group in all trees behind an output: no sockets are left that lead to them."""
+        for each in node_trees.trees(tree, output):
+            for node in each.tree.nodes:
+                if node.type == "GROUP" and node.node_tree is None:
+                    within = "" if each.tree.is_embedded_data else f' (in "{each.tree.name}")'
+                    self.note(
+                        node, f"{hollow(node)}{within}; what it fed is as if unlinked. Choose one, or remove the node"
+                    )
 
     # What a subclass knows of its textures
 
@@ -357,16 +368,6 @@ class Walker:
         return self.combine(output.node, joined, *(self.number(output.input(i)) for i in range(3)))
 
     node_combrgb = node_combxyz = node_combine_color
-
-
-def hollow(node: bpy.types.Node) -> str:
-    """What is wrong with a group node whose outputs nothing feeds."""
-    tree = node.node_tree
-    if tree is None:
-        return "has no node group"
-    if tree.original.is_missing:  # which an evaluated one does not say
-        return f'its node group "{tree.name}" is missing from {tree.original.library.filepath}'
-    return f'its node group "{tree.name}" has no output'
 
 
 def _fixed_but(value: SocketValue, texture: Hashable, means: dict[Hashable, Array]) -> SocketValue:

@@ -62,6 +62,16 @@ class SocketRef(NamedTuple):
         return own
 
 
+def hollow(node: bpy.types.Node) -> str:
+    """What is wrong with a group node whose outputs nothing feeds."""
+    tree = node.node_tree
+    if tree is None:
+        return "has no node group"
+    if tree.original.is_missing:  # which an evaluated one does not say
+        return f'its node group "{tree.name}" is missing from {tree.original.library.filepath}'
+    return f'its node group "{tree.name}" has no output'
+
+
 def _same(sockets: bpy.types.bpy_prop_collection, socket: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
     """The socket on the other side of a group's border."""
     return next(s for s in sockets if s.identifier == socket.identifier)

@@ -11,10 +11,9 @@ from ..bakes.node_trees import COLOURS, SHADERS, leaf_of
 from .bsdfs import Bsdf, MixingWalker, Part, Surface
 from .layers import LayerRef
 from .node_math import conductor
-from .nodes import hollow
 from .normal_nodes import DetailRef
 from .socket_value import SocketValue, constant, once, uniform
-from .sockets import SocketRef, surface_of
+from .sockets import SocketRef, hollow, surface_of
 
 #: Least alpha of a surface that gives off light and lets all light pass, which no alpha says.
 _LEAST_ADDED = 0.25
@@ -41,13 +40,12 @@ class SurfaceWalker(MixingWalker):
         # From Blender 5.0 on every material has nodes, and the switch is deprecated.
         if material.node_tree is None or (bpy.app.version < (5, 0, 0) and not material.use_nodes):
             return _plain(uniform(material.diffuse_color[:3]), uniform(material.roughness), uniform(material.metallic))
-        for node in material.node_tree.nodes:
-            if node.type == "GROUP" and node.node_tree is None:  # which has no sockets, so that nothing leads to it
-                self.note(node, f"{hollow(node)}; what it fed is as if unlinked. Choose one, or remove the node")
         ref = surface_of(material.node_tree)
         origin = None if ref is None else ref.origin()
         linked = origin is not None and origin.socket.is_output
         output = ref and ref.node
+        if output:
+            self.name_lost_groups(material.node_tree, output)
         if output and output.inputs["Displacement"].is_linked:
             self.note(output, "displacement is not rendered")
         if output and output.inputs["Volume"].is_linked:

@@ -63,10 +63,8 @@ class TextureRef:
         return images.export_curved(self.image, self.straight, self.source, self.curve, warn, self.data, self.lookup)
 
     def _plain(self, warn: Warn) -> Image:
-        """The pixels before the curve. What has none is no texture: whoever makes a `TextureRef` has looked."""
-        exported = images.export_image(self.image, self.straight, warn, self.lookup)
-        assert exported is not None, self.image
-        return exported
+        """The pixels before the curve, which whoever made the `TextureRef` has seen."""
+        return images.export_image(self.image, self.straight, warn, self.lookup) or images.LOST
 
     def texture(self, name: str, layer: str = "") -> Texture:
         """What it is on the surface; `name` is that of the exported image, `layer` that of the exported layer."""

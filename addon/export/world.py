@@ -21,7 +21,7 @@ from .images import MISSING, linear_pixels
 from .node_math import rgb
 from .nodes import Walker, euler, vector_rotate
 from .socket_value import SocketValue, once, uniform
-from .sockets import SocketRef, surface_of
+from .sockets import SocketRef, hollow, surface_of
 
 Warn = Callable[[str], None]
 
@@ -182,6 +182,7 @@ class _Tree(Walker):
         surface = surface_of(self.world.node_tree)
         if surface is None:
             return BLACK
+        self.name_lost_groups(self.world.node_tree, surface.node)
         if surface.node.inputs["Volume"].is_linked:
             self.note(surface.node, "the volume is not rendered")
         return self.shader(surface)
@@ -214,7 +215,10 @@ class _Tree(Walker):
             return self.sum(node, shaders[0].times(1 - share), shaders[1].times(share))
         if node.type == "ADD_SHADER":
             return self.sum(node, self.shader(origin.input(0)), self.shader(origin.input(1)))
-        self.warn(node, f"{node.bl_label} is not supported as light of the world; a dim grey is used")
+        if node.type == "GROUP":
+            self.note(node, f"{hollow(node)}; it is black in Cycles, here a dim grey. Mend or replace it")
+        else:
+            self.warn(node, f"{node.bl_label} is not supported as light of the world; a dim grey is used")
         return uniform(FALLBACK)
 
     def sum(self, node: bpy.types.Node, first: SocketValue, second: SocketValue) -> SocketValue:

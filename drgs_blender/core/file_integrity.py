@@ -1,61 +1,96 @@
 """File integrity: whether a picture was written to its end, without decoding it.
 
 Where a disk is full, Blender leaves what fitted; and what reads pictures, shows what there is of them or crashes.
-Layouts after the file format pages of OpenEXR, PNG (ISO 15948), JPEG (T.81), WebP (RFC 9649) and TIFF 6.0.
+Layouts after the file format pages of OpenEXR, PNG (ISO 15948), JPEG (T.81), WebP (RFC 9649) and TIFF 6.0. Of a file
+only what says where the rest lies is read; of a JPEG, which does not say it, what comes before its end.
 """
 
 from __future__ import annotations
 
+import io
 import os
+import re
 import struct
-from pathlib import Path
+from typing import Any, BinaryIO
 
 _EXR, _PNG, _JPEG, _RIFF = b"\x76\x2f\x31\x01", b"\x89PNG", b"\xff\xd8\xff", b"RIFF"
 _TIFF = {b"II*\0": "<", b"MM\0*": ">"}
 #: Tags of the places and sizes of a TIFF's strips, and of its tiles; how their numbers are stored, by type.
 _TIFF_PIECES, _TIFF_NUMBERS = ((273, 279), (324, 325)), {3: "H", 4: "I"}
-_PNG_END, _JPEG_END = b"IEND\xae\x42\x60\x82", b"\xff\xd9"
 _TILED, _DEEP, _PARTS = 0x200, 0x800, 0x1000
-_JPEG_SCAN = b"\xff\xda"
+#: A marker of a JPEG, but for those within a scan: escaped bytes, restarts and filling.
+_JPEG_MARKER, _JPEG_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]"), 0xD9
 #: Numbers before the size of a chunk: of scan lines their first, of a tile its place and level.
 _PLACES = {b"scanlineimage": 1, b"tiledimage": 4}
+#: Bytes of an EXR's names at most, with their zeros; bytes that are searched at once, at first and at most.
+_NAMES, _FIRST_BLOCK, _LARGEST_BLOCK = 512, 1 << 12, 1 << 20
 
 
-def is_whole(path: str | os.PathLike[str]) -> bool:
-    """Whether nothing is missing at the end of a file; of other formats than those above whether there is anything."""
-    return is_whole_data(Path(path).read_bytes())
+class _Reader:
+    """A file by places, of which only what is asked for is read; ValueError where it ends before that."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self.size = stream.seek(0, os.SEEK_END)
+
+    def upto(self, position: int, count: int) -> bytes:
+        """What there is of some bytes."""
+        self._stream.seek(position)
+        return self._stream.read(count)
+
+    def bytes(self, position: int, count: int) -> bytes:
+        if position + count > self.size:
+            raise ValueError("the file ends before")
+        return self.upto(position, count)
+
+    def numbers(self, layout: str, position: int) -> tuple[Any, ...]:
+        """As `struct.unpack` has them."""
+        return struct.unpack(layout, self.bytes(position, struct.calcsize(layout)))
 
 
-def crashes_blender(data: bytes) -> bool:
-    """Whether a file is an EXR that was cut off, at which Blender 5.0 crashes as soon as it is asked for the size."""
-    return data[:4] == _EXR and not is_whole_data(data)
+def is_whole(file: str | os.PathLike[str] | bytes) -> bool:
+    """Whether nothing is missing at the end of a file; of other formats than those above whether there is anything.
 
-
-def is_whole_data(data: bytes) -> bool:
-    """`is_whole` of the bytes of a file."""
-    looks = _is_whole_exr if data[:4] == _EXR else _is_whole_tiff if data[:4] in _TIFF else None
-    if looks is not None:
+    Parameters
+    ----------
+    file : str, path-like or bytes
+        Its path, or its bytes.
+    """
+    with _opened(file) as stream:
+        reader = _Reader(stream)
+        start = reader.upto(0, 4)
+        looks = _LOOKS.get(start, _is_whole_jpeg if start[:3] == _JPEG else None)
         try:
-            return looks(data)
+            return reader.size > 0 if looks is None else looks(reader)
         except (struct.error, ValueError, IndexError, KeyError):
             return False
-    if data[:4] == _PNG:
-        return data.endswith(_PNG_END)
-    if data[:3] == _JPEG:
-        return data.rfind(_JPEG_END) > data.rfind(_JPEG_SCAN)  # some programs write more behind the end
-    if data[:4] == _RIFF:
-        return len(data) >= 8 + int.from_bytes(data[4:8], "little")
-    return len(data) > 0
 
 
-def _is_whole_exr(data: bytes) -> bool:
+def crashes_blender(file: str | os.PathLike[str] | bytes) -> bool:
+    """Whether a file is an EXR that was cut off, at which Blender 5.0 crashes as soon as it is asked for the size.
+
+    Parameters
+    ----------
+    file : str, path-like or bytes
+        Its path, or its bytes.
+    """
+    with _opened(file) as stream:
+        start = stream.read(4)
+    return start == _EXR and not is_whole(file)
+
+
+def _opened(file: str | os.PathLike[str] | bytes) -> BinaryIO:
+    return io.BytesIO(file) if isinstance(file, bytes) else open(file, "rb", buffering=0)
+
+
+def _is_whole_exr(file: _Reader) -> bool:
     """Whether every chunk is where the tables in front of them say, and ends within the file."""
-    (flags,) = struct.unpack_from("<I", data, 4)
+    (flags,) = file.numbers("<I", 4)
     if flags & _DEEP:
         return True
     parts, position = [], 8
     while True:
-        header, position = _header(data, position)
+        header, position = _header(file, position)
         if header or not flags & _PARTS:
             parts.append(header)
         if not header or not flags & _PARTS:
@@ -65,11 +100,11 @@ def _is_whole_exr(data: bytes) -> bool:
         front = 4 * (places + bool(flags & _PARTS))
         count = int.from_bytes(header.get(b"chunkCount", b""), "little")
         # A lone part need not say how many chunks it has. The first of them follows the table.
-        first = position + 8 * count if b"chunkCount" in header else len(data)
+        first = position + 8 * count if b"chunkCount" in header else file.size
         while position < first:
-            (offset,) = struct.unpack_from("<Q", data, position)
-            (size,) = struct.unpack_from("<I", data, offset + front)
-            if offset == 0 or offset + front + 4 + size > len(data):
+            (offset,) = file.numbers("<Q", position)
+            (size,) = file.numbers("<I", offset + front)
+            if offset == 0 or offset + front + 4 + size > file.size:
                 return False
             position += 8
             if b"chunkCount" not in header:
@@ -77,32 +112,68 @@ def _is_whole_exr(data: bytes) -> bool:
     return True
 
 
-def _is_whole_tiff(data: bytes) -> bool:
+def _header(file: _Reader, position: int) -> tuple[dict[bytes, bytes], int]:
+    """Name -> value of the attributes at `position`, and where they end."""
+    found = {}
+    while (names := file.upto(position, _NAMES))[0]:
+        name, kind, _ = names.split(b"\0", 2)
+        position += len(name) + len(kind) + 2
+        (size,) = file.numbers("<I", position)
+        found[name] = file.bytes(position + 4, size)
+        position += 4 + size
+    return found, position + 1
+
+
+def _is_whole_png(file: _Reader) -> bool:
+    """Whether its chunks go on to the last."""
+    position, kind = 8, b""
+    while kind != b"IEND":
+        size, kind = file.numbers(">I4s", position)
+        position += 12 + size
+    return position <= file.size
+
+
+def _is_whole_jpeg(file: _Reader) -> bool:
+    """Whether an end follows the segments of the first picture; thumbnails lie within segments, or behind it."""
+    position, block = 2, _FIRST_BLOCK
+    while position < file.size:
+        data = file.upto(position, block)
+        found = _JPEG_MARKER.search(data)
+        if found is None:
+            position += max(1, len(data) - 1)  # whose last byte may begin a marker
+            block = min(2 * block, _LARGEST_BLOCK)
+            continue
+        if data[found.start() + 1] == _JPEG_END:
+            return True
+        (size,) = file.numbers(">H", position + found.end())
+        position += found.end() + size
+        block = _FIRST_BLOCK
+    return False
+
+
+def _is_whole_webp(file: _Reader) -> bool:
+    """Whether there is as much as it says; other RIFF files say it, too."""
+    (size,) = file.numbers("<I", 4)
+    return file.size >= 8 + size
+
+
+def _is_whole_tiff(file: _Reader) -> bool:
     """Whether the strips or tiles of the first picture end within the file."""
-    order = _TIFF[data[:4]]
-    (place,) = struct.unpack_from(f"{order}I", data, 4)
-    (count,) = struct.unpack_from(f"{order}H", data, place)
+    order = _TIFF[file.bytes(0, 4)]
+    (place,) = file.numbers(f"{order}I", 4)
+    (count,) = file.numbers(f"{order}H", place)
     found: dict[int, tuple[int, ...]] = {}
     for entry in range(place + 2, place + 2 + 12 * count, 12):
-        tag, kind, many = struct.unpack_from(f"{order}HHI", data, entry)
+        tag, kind, many = file.numbers(f"{order}HHI", entry)
         if any(tag in pieces for pieces in _TIFF_PIECES):
             numbers = f"{order}{many}{_TIFF_NUMBERS[kind]}"
             at = entry + 8
             if struct.calcsize(numbers) > 4:
-                (at,) = struct.unpack_from(f"{order}I", data, at)
-            found[tag] = struct.unpack_from(numbers, data, at)
+                (at,) = file.numbers(f"{order}I", at)
+            found[tag] = file.numbers(numbers, at)
     ends = [a + b for places, sizes in _TIFF_PIECES for a, b in zip(found.get(places, ()), found.get(sizes, ()))]
-    return max(ends, default=0) <= len(data)
+    return max(ends, default=0) <= file.size
 
 
-def _header(data: bytes, position: int) -> tuple[dict[bytes, bytes], int]:
-    """Name -> value of the attributes at `position`, and where they end."""
-    found = {}
-    while data[position]:
-        name, kind = data.index(b"\0", position), data.index(b"\0", data.index(b"\0", position) + 1)
-        (size,) = struct.unpack_from("<I", data, kind + 1)
-        found[data[position:name]] = data[kind + 5 : kind + 5 + size]
-        position = kind + 5 + size
-        if position >= len(data):
-            raise ValueError("the header does not end")
-    return found, position + 1
+#: By the first four bytes.
+_LOOKS = {_EXR: _is_whole_exr, _PNG: _is_whole_png, _RIFF: _is_whole_webp, **dict.fromkeys(_TIFF, _is_whole_tiff)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import sys
 from pathlib import Path
 
@@ -144,6 +145,59 @@ def removed_group(scene, folder: Path, drgs) -> None:
     bpy.data.node_groups.remove(bpy.data.node_groups["Hollow"])
 
 
+def lost_group(tree: bpy.types.NodeTree, kind: str = "NodeSocketColor") -> bpy.types.Node:
+    """A node of a group that holds a node of a group that is gone."""
+    made = bpy.data.node_groups.new("Outer", "ShaderNodeTree")
+    made.interface.new_socket("Out", in_out="OUTPUT", socket_type=kind)
+    made.nodes.new("NodeGroupOutput")
+    made.nodes.new("ShaderNodeGroup").name = "Lost"
+    node = tree.nodes.new("ShaderNodeGroup")
+    node.node_tree = made
+    return node
+
+
+def hollow_group(tree: bpy.types.NodeTree) -> bpy.types.Node:
+    """A node of a group of shaders that is empty."""
+    node = lost_group(tree, "NodeSocketShader")
+    node.node_tree.nodes.clear()
+    return node
+
+
+def light_tree() -> bpy.types.NodeTree:
+    light = bpy.data.objects["Bad"].data
+    light.use_nodes = True
+    return light.node_tree
+
+
+def nested_group(scene, folder: Path, drgs) -> None:
+    tree, principled = material("Bad")
+    tree.links.new(lost_group(tree).outputs[0], principled.inputs["Base Color"])
+    swatch(bpy.data.materials["Bad"])
+
+
+def world_group(scene, folder: Path, drgs) -> None:
+    tree, background = new_world(scene)
+    tree.links.new(lost_group(tree).outputs[0], background.inputs["Color"])
+
+
+def world_shader_group(scene, folder: Path, drgs) -> None:
+    tree, _ = new_world(scene)
+    tree.links.new(hollow_group(tree).outputs[0], tree.get_output_node("ALL").inputs["Surface"])
+
+
+def light_group(scene, folder: Path, drgs) -> None:
+    lamp(scene, "POINT")
+    tree = light_tree()
+    (emission,) = (node for node in tree.nodes if node.type == "EMISSION")
+    tree.links.new(lost_group(tree).outputs[0], emission.inputs["Color"])
+
+
+def light_shader_group(scene, folder: Path, drgs) -> None:
+    lamp(scene, "POINT")
+    tree = light_tree()
+    tree.links.new(hollow_group(tree).outputs[0], tree.get_output_node("ALL").inputs["Surface"])
+
+
 def lamp(scene, kind: str, **values: float) -> None:
     light = bpy.data.lights.new("Bad", kind)
     for name, value in values.items():
@@ -190,6 +244,8 @@ CUT_OFF = "its file is cut off; as much of it is shown as can be read. Copy or e
 LOOP = 'the link to "{}" is part of a loop; it is left out'
 OFF = 'Light "Bad": its colour, power or size is not finite; it is off. Check its values and their drivers'
 HOLLOW = 'Material "Bad", node "Group": its node group "Hollow" has no output; '
+LOST = 'node "Lost": has no node group (in "Outer"); what it fed is as if unlinked. Choose one'
+EMPTY = 'node "Group": its node group "Outer" has no output'
 CASES = {
     surface_exr: f'Image "a.exr": {CUT_OFF}',
     odd_exr: f'Image "a.exr": {CUT_OFF}',
@@ -206,6 +262,11 @@ CASES = {
     hollow_colour: f"{HOLLOW}it is black in Cycles. Mend or replace it",
     hollow_shader: f"{HOLLOW}a surface of its colour is used",
     removed_group: 'Material "Bad", node "Group": has no node group; what it fed is as if unlinked. Choose one',
+    nested_group: f'Material "Bad", {LOST}',
+    world_group: f'World "World", {LOST}',
+    world_shader_group: f'World "World", {EMPTY}; it is black in Cycles, here a dim grey. Mend or replace it',
+    light_group: f'Light "Bad", {LOST}',
+    light_shader_group: f'Light "Bad", {EMPTY}; its own colour is used',
     point: OFF,
     area: OFF,
     sun: OFF,
@@ -258,6 +319,26 @@ def test_a_cut_off_exr_is_no_light(scene, tmp_path):
         choose(scene, tmp_path / "a.exr")
 
 
+@pytest.mark.parametrize("make", [around, lambda scene, image: textured(image)], ids=["world", "surface"])
+def test_a_file_that_did_not_change_is_not_opened_again(scene, export, tmp_path, monkeypatch, make):
+    make(scene, picture(tmp_path / "a.exr", "OPEN_EXR"))
+    opened: list[str] = []
+    given = builtins.open
+
+    def spy(file, *args, **options):
+        opened.append(str(file))
+        return given(file, *args, **options)
+
+    monkeypatch.setattr(builtins, "open", spy)
+    for count in (True, False):
+        assert not export()[1]
+        assert (str(tmp_path / "a.exr") in opened) == count
+        opened.clear()
+    path = tmp_path / "a.exr"
+    path.write_bytes(path.read_bytes()[:-100])
+    assert any("cut off" in text or "cannot be read" in text for text in export()[1])
+
+
 @pytest.mark.parametrize("packed", [False, True])
 def test_an_image_larger_than_blender_gives_away_is_made_smaller(scene, export, tmp_path, monkeypatch, packed):
     """It counts numbers in 32 bits: 30000 x 30000 pixels have more."""
@@ -280,15 +361,67 @@ def test_an_image_larger_than_blender_gives_away_is_made_smaller(scene, export, 
     assert len(bpy.data.images) == 1, "no copy is left behind"
 
 
-def test_an_image_that_memory_has_no_room_for_is_named(scene, export, tmp_path, monkeypatch):
-    def full(image: bpy.types.Image) -> None:
+def smart(image: bpy.types.Image) -> None:
+    textured(image)
+    bpy.data.materials["Bad"].node_tree.nodes["Image Texture"].interpolation = "Smart"
+
+
+def inverted(image: bpy.types.Image) -> None:
+    """Nodes give the image a curve."""
+    textured(image)
+    tree = bpy.data.materials["Bad"].node_tree
+    change = add(tree, "Invert")
+    tree.links.new(tree.nodes["Image Texture"].outputs[0], change.node.inputs["Color"])
+    tree.links.new(change, tree.nodes["Principled BSDF"].inputs["Base Color"])
+
+
+def tiled(image: bpy.types.Image) -> None:
+    image.name = "a.png"
+    image.source, image.filepath = "TILED", image.filepath.replace("a.1001", "a.<UDIM>")
+    textured(image)
+
+
+@pytest.mark.parametrize(
+    ("show", "place", "name", "count"),
+    [
+        (textured, "image_pixels", "_given", 0),
+        (tiled, "image_grid", "grid", 0),
+        (smart, "image_cubic", "finer", 1),
+        (inverted, "images", "Image", 1),
+    ],
+)
+def test_an_image_that_memory_has_no_room_for_is_named_until_there_is_room(
+    scene, export, tmp_path, monkeypatch, show, place, name, count
+):
+    def full(*args: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(part("addon.export.image_pixels"), "_given", full)
-    textured(picture(tmp_path / "a.png", "PNG"))
+    show(picture(tmp_path / "a.1001.png", "PNG"))
+    bpy.data.images[0].name = "a.png"
+    with monkeypatch.context() as patch:
+        patch.setattr(part(f"addon.export.{place}"), name, full)
+        frame, warnings = export()
+    assert warnings[0].startswith('Image "a.png": there is no memory for its pixels. Use a smaller image')
+    assert len(frame.images) == count and len(frame.meshes) == 1
     frame, warnings = export()
-    assert warnings[0].startswith('Image "a.png": there is no memory for its 64 x 64 pixels. Use a smaller image')
-    assert not frame.images and len(frame.meshes) == 1
+    assert not any("memory" in text for text in warnings), warnings
+    (made,) = frame.images
+    assert made.pixels.size > 4
+
+
+def test_a_painted_image_larger_than_blender_gives_away_is_not_baked_and_named(scene, monkeypatch):
+    tree, principled = material("Bad")
+    image = bpy.data.images.new("Painted", 32, 32)
+    change = add(tree, "TexVoronoi", add(tree, "TexImage", image=image))
+    tree.links.new(change, principled.inputs["Base Color"])
+    swatch(bpy.data.materials["Bad"])
+    manager = part("addon.bakes.manager").manager
+    monkeypatch.setattr(part("addon.bakes.node_trees"), "_MOST", 32 * 32)
+    wanted = part("addon.bakes.requests").Wanted.of(scene)
+    part("addon.export").export_frame(bpy.context.evaluated_depsgraph_get(), str, lambda text: None, wanted=wanted)
+    (request,) = wanted.requests
+    manager.wait(object(), [request], lambda text, part: None, lambda: False)
+    assert 'image "Painted": its 32 x 32 pixels are more than Blender gives away' in manager.failed[request.key]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit for files")

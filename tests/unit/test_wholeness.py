@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -60,10 +61,39 @@ def test_exr_of_tiles(tmp_path: Path, parts: int) -> None:
     assert_complete(tmp_path / "a.exr", exr(tmp_path / "a.exr", "ZIP", parts, OpenEXR.tiledimage))
 
 
-def test_jpeg_with_more_behind_its_end(tmp_path: Path) -> None:
-    """Cameras and editors put thumbnails and padding there."""
-    (tmp_path / "a").write_bytes(other("JPEG") + bytes(64) + b"more")
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "WebP", "TIFF"])
+@pytest.mark.parametrize("more", [b"\n", bytes(64) + b"more", b"\xff\xd9\xff\xda", b"\xff\xda\xff"], ids=range(4))
+def test_more_behind_the_end(tmp_path: Path, kind: str, more: bytes) -> None:
+    """Cameras and editors put thumbnails, films and padding there."""
+    (tmp_path / "a").write_bytes(other(kind) + more)
     assert is_whole(tmp_path / "a")
+
+
+@pytest.mark.parametrize("progressive", [False, True])
+def test_jpeg_with_a_thumbnail_before_its_picture(tmp_path: Path, progressive: bool) -> None:
+    """Which has an end of its own; scans of more than a block follow."""
+    thumbnail, data = other("JPEG"), io.BytesIO()
+    pixels = np.random.default_rng(3).integers(0, 256, (300, 400, 3), np.uint8)
+    Image.fromarray(pixels).save(data, "JPEG", quality=95, progressive=progressive, exif=b"Exif\0\0" + thumbnail)
+    assert thumbnail in data.getvalue()
+    assert_complete(tmp_path / "a", data.getvalue())
+
+
+def test_only_what_says_where_the_rest_lies_is_read(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(4).integers(0, 256, (1500, 1500, 3), np.uint8)
+    for kind in ("TIFF", "PNG", "WebP", "JPEG"):
+        options = {"lossless": True, "method": 0} if kind == "WebP" else {"compress_level": 1} if kind == "PNG" else {}
+        Image.fromarray(pixels).save(large := io.BytesIO(), kind, **options)
+        (tmp_path / kind).write_bytes(large.getvalue() + (bytes(1 << 23) if kind == "JPEG" else b""))
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"R": pixels[..., 0].astype(np.float32)}) as file:
+        file.write(str(tmp_path / "EXR"))
+    for path in tmp_path.iterdir():
+        tracemalloc.start()
+        try:
+            assert is_whole(path)
+            assert tracemalloc.get_traced_memory()[1] < min(path.stat().st_size // 2, 3 << 20), path.name
+        finally:
+            tracemalloc.stop()
 
 
 def test_exr_whose_table_was_never_written(tmp_path: Path) -> None:
