@@ -364,7 +364,7 @@ def test_a_name_that_openexr_cannot_open_is_said_before_the_work(tmp_path, capsy
 def test_a_full_disk_below_standard_output_is_said(monkeypatch, capsys, size):
     from drgs_blender.cli import inspect_file
 
-    monkeypatch.setattr(inspect_file, "inspect_file", lambda path: {"kind": "x" * size})
+    monkeypatch.setattr(inspect_file, "inspect_file", lambda path, axes, up: {"kind": "x" * size})
     with open("/dev/full", "w") as full:
         monkeypatch.setattr(sys, "stdout", full)
         assert main(["inspect", "a.drgs"]) == errors.EXIT_CANNOT_WRITE
