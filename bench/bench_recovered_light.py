@@ -40,7 +40,7 @@ def directions(rows: int) -> tuple[Array, Array]:
 
 
 def reduced(radiance: Array, rows: int = ROWS) -> Array:
-    """(rows, 2 rows, 3) means of a lat-long map, by boxes; its rows must be so many times a whole number, or parts."""
+    """(rows, 2 rows, 3) means of a lat-long map, by boxes; its rows must be a multiple of them, or divide them."""
     times = -(-rows // len(radiance))
     grown = radiance.repeat(times, 0).repeat(times, 1)
     if len(grown) % rows or grown.shape[1] != 2 * len(grown):

@@ -89,7 +89,7 @@ class DRGS_OT_import_cameras(DrgsOperator, bpy.types.Operator):
             return ""
         path = Path(camera["image"])
         try:
-            if crashes_blender(path.read_bytes()):
+            if crashes_blender(path):
                 return f"{path.name} (cut off)"
             image = bpy.data.images.load(str(path), check_existing=True)
         except (RuntimeError, OSError):

@@ -22,7 +22,7 @@ _SCALARS = {"BOOLEAN", "INT", "FLOAT", "STRING", "ENUM"}
 #: Nested structures that are followed: a node's curves, their points.
 _DEEPEST = 4
 #: Numbers that Blender hands out of one image at most: it counts them in 32 bits.
-_MOST = 2**31 - 1
+MOST_NUMBERS = 2**31 - 1
 
 
 Follow = Callable[[bpy.types.NodeSocket], bool]
@@ -176,7 +176,7 @@ def pixels_of(image: bpy.types.Image) -> np.ndarray:
 
 
 def _is_too_large(image: bpy.types.Image) -> bool:
-    return image.size[0] * image.size[1] * image.channels > _MOST
+    return image.size[0] * image.size[1] * image.channels > MOST_NUMBERS
 
 
 def _digest(data: bytes) -> str:

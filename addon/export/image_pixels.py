@@ -12,6 +12,7 @@ from ...drgs_blender.core.arrays import shareable
 from ...drgs_blender.core.color import linear_to_srgb, srgb_to_linear
 from ...drgs_blender.core.file_integrity import crashes_blender, is_whole
 from ...drgs_blender.core.materials import Image
+from ..bakes import node_trees
 from . import image_parts
 
 Array = np.ndarray
@@ -22,8 +23,6 @@ LINEAR = {"Linear Rec.709", "Linear", "Non-Color", "Raw", "scene_linear"}
 DATA = {"Non-Color", "Raw"}
 #: Rows that are worked on at once: whole copies of a large image are larger than all the rest.
 _STRIP = 32
-#: Numbers that Blender hands out of one image at most: it counts them in 32 bits.
-_MOST = 2**31 - 1
 
 
 def is_empty(image: bpy.types.Image) -> bool:
@@ -43,7 +42,7 @@ def problems(image: bpy.types.Image) -> list[str]:
 
 def _reduction(image: bpy.types.Image) -> int:
     """How many times an image has to be made smaller for Blender to hand out its pixels."""
-    return math.ceil(math.sqrt(image.size[0] * image.size[1] * 4 / _MOST))
+    return math.ceil(math.sqrt(image.size[0] * image.size[1] * 4 / node_trees.MOST_NUMBERS))
 
 
 def _read(image: bpy.types.Image) -> Array | None:

@@ -201,7 +201,7 @@ def _with_problems(
 def _made(
     image: bpy.types.Image, kind: str, make: Callable[..., tuple[T, list[str]]], warn: Warn, frame: int = 0
 ) -> T | None:
-    """What `make` makes of an image, remembered; what is wrong with it is told. None where there is no memory for it.
+    """What `make` makes of an image, remembered; warns of what is wrong with it. None where there is no memory for it.
 
     That is not remembered: the next export tries again.
     """
@@ -218,9 +218,13 @@ def _named(picture: Image | None, name: str) -> Image | None:
     return None if picture is None else replace(picture, name=name)
 
 
-def has_file(image: bpy.types.Image, frame: int) -> bool:
-    """Whether there is a file of what a node shows of an image, packed or on disk, readable or not."""
-    return image.packed_file is not None or os.path.isfile(image_parts.frame_file(image, frame))
+def unreadable(image: bpy.types.Image | None, frame: int) -> tuple[str, bool]:
+    """What is said of a node's image without pixels, and whether its file is there, of which Cycles may read a part."""
+    if image is None:
+        return "has no image; as in Cycles it is magenta", False
+    damaged = image.packed_file is not None or os.path.isfile(image_parts.frame_file(image, frame))
+    seen = "what Cycles makes of it is shown" if damaged else "as in Cycles it is magenta"
+    return f'image "{image.name}" cannot be read; {seen}', damaged
 
 
 def mean_colour(picture: Image) -> Array:

@@ -103,25 +103,22 @@ class Materials:
         found = _Paints(surface)
         done: set[str] = set()
         left: set[str] = set()
+
+        def baked(channel: str, value: SocketValue, possible: bool = True, **more: Any) -> SocketValue:
+            """The value, or what a bake has in its place."""
+            result, solved = value, False
+            if bakes is not None and value.approximations and possible:
+                result, solved = bakes.channel(tree.material, channel, value, self._warn, **more)
+            (done if solved else left).update(value.approximations)
+            return result
+
         for values, name, leaves in found.all():
-            value, solved = values[name], False
-            if bakes is not None and value.approximations and found.are_apart:
-                values[name], solved = bakes.channel(tree.material, name, value, self._warn, leaves)
-            (done if solved else left).update(value.approximations)
-        given: dict[str, SocketValue] = {}
-        for name, (ref, value) in aovs.items():
-            given[name], solved = value, False
-            if bakes is not None and value.approximations:
-                channel = f"aov {ref.socket.name}"
-                given[name], solved = bakes.channel(tree.material, channel, value, self._warn, source=ref)
-            (done if solved else left).update(value.approximations)
-        details = []
-        for detail in surface.details:
-            value, solved = detail.value, False
-            if bakes is not None and value.approximations and detail.source is not None:
-                value, solved = bakes.channel(tree.material, "height", value, self._warn, source=detail.source)
-            (done if solved else left).update(detail.value.approximations)
-            details.append(replace(detail, value=value))
+            values[name] = baked(name, values[name], found.are_apart, leaves=leaves)
+        given = {name: baked(f"aov {ref.socket.name}", value, source=ref) for name, (ref, value) in aovs.items()}
+        details = [
+            replace(one, value=baked("height", one.value, one.source is not None, source=one.source))
+            for one in surface.details
+        ]
         surface.details = tuple(one for one in details if one.kind != "bump" or one.value.texture is not None)
         self._say([text for text in approximations if text in left or text not in done])
         textures = [values[name].texture for values, name, _ in found.all() if values[name].texture]

@@ -55,10 +55,8 @@ class TextureWalker(Walker):
         lookup = images.Lookup.of(node)
         shown = None if image is None else images.show(image, straight, self._warn, lookup)
         if shown is None:
-            name = "has no image" if image is None else f'image "{image.name}" cannot be read'
-            damaged = image is not None and images.has_file(image, lookup.frame)  # of which Cycles may read a part
-            seen = "what Cycles makes of it is shown" if damaged else "as in Cycles it is magenta"
-            self.note(node, f"{name}; {seen}. Choose another, or find its file", approximated=damaged)
+            problem, damaged = images.unreadable(image, lookup.frame)
+            self.note(node, f"{problem}. Choose another, or find its file", approximated=damaged)
             return uniform(1) if output.socket.name == "Alpha" else SocketValue(np.array(images.MISSING))
         if node.projection != "FLAT":
             self.warn(node, f"the {node.projection.title()} projection is not supported; the UV map is used")

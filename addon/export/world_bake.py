@@ -14,7 +14,7 @@ from ..bakes import node_trees
 from ..bakes.requests import Request, request
 from ..bakes.store import Baked
 from .image_pixels import is_empty
-from .images import has_file
+from .images import unreadable
 from .node_math import rgb
 from .sockets import surface_of
 
@@ -82,12 +82,7 @@ def missing_image(node: bpy.types.Node) -> str:
     image = node.image
     if image is not None and not is_empty(image):
         return ""
-    name = "has no image" if image is None else f'image "{image.name}" cannot be read'
-    damaged = image is not None and has_file(image, 0)
-    return (
-        f"{name}; {'what Cycles makes of it is shown' if damaged else 'as in Cycles it is magenta'}. Choose one, or "
-        "File > External Data > Find Missing Files"
-    )
+    return f"{unreadable(image, 0)[0]}. Choose one, or File > External Data > Find Missing Files"
 
 
 def baked_suns(found: Baked, factor: float, name: str) -> list[Light]:

@@ -348,7 +348,7 @@ def test_an_image_larger_than_blender_gives_away_is_made_smaller(scene, export, 
     textured(image)
     (whole,) = export()[0].images
     image.name = "b.png"  # which is another
-    monkeypatch.setattr(part("addon.export.image_pixels"), "_MOST", 64 * 64)
+    monkeypatch.setattr(part("addon.bakes.node_trees"), "MOST_NUMBERS", 64 * 64)
     frame, warnings = export()
     assert set(warnings) == {
         'Image "b.png": its 64 x 64 pixels are more than Blender gives away; it is reduced 2 times. Use a smaller one'
@@ -416,7 +416,7 @@ def test_a_painted_image_larger_than_blender_gives_away_is_not_baked_and_named(s
     tree.links.new(change, principled.inputs["Base Color"])
     swatch(bpy.data.materials["Bad"])
     manager = part("addon.bakes.manager").manager
-    monkeypatch.setattr(part("addon.bakes.node_trees"), "_MOST", 32 * 32)
+    monkeypatch.setattr(part("addon.bakes.node_trees"), "MOST_NUMBERS", 32 * 32)
     wanted = part("addon.bakes.requests").Wanted.of(scene)
     part("addon.export").export_frame(bpy.context.evaluated_depsgraph_get(), str, lambda text: None, wanted=wanted)
     (request,) = wanted.requests

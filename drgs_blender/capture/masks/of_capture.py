@@ -97,7 +97,9 @@ def _by_model(model: SegmentationModel, capture: Capture, cv2: Any, sheet: Path,
     """Masks of all views by a model, where they fit each other."""
     views = [_mask_view(view, np.asarray(view.camera.matrix_world, np.float64)) for view in capture.views]
     masks, _ = masks_by_model(model, cv2, views, sheet, str(capture.source), tell, cancelled)
-    for view, mask in zip(capture.views, masks or (), strict=masks is not None):
+    if masks is None:
+        return
+    for view, mask in zip(capture.views, masks, strict=True):
         view.mask = mask.astype(np.float32) / 255
 
 

@@ -70,15 +70,14 @@ def _home() -> Path:
     return Path(os.path.expanduser(os.environ.get("U2NET_HOME") or f"{os.environ.get('XDG_DATA_HOME') or '~'}/.u2net"))
 
 
-def check_model(given: str, modes: tuple[str, ...]) -> None:
-    """Raise UsageError where `given` is neither one of the `modes` nor a model that is there."""
-    if given in modes or find_model(given):
-        return
-    raise UsageError(
-        "masks",
-        f"is {given!r}: no file of that name, nor a model in {_home()}",
-        f"Choose from {', '.join(modes)}, or give a segmentation model in ONNX format",
-    )
+def model_file(given: str, modes: tuple[str, ...] = ()) -> Path:
+    """`find_model`; UsageError where there is none, which names the `modes` that may stand in its place."""
+    path = find_model(given)
+    if path is None:
+        problem = f"is {given!r}: no file of that name, nor a model in {_home()}"
+        choice = f"Choose from {', '.join(modes)}, or give" if modes else "Give"
+        raise UsageError("masks", problem, f"{choice} a segmentation model in ONNX format")
+    return path
 
 
 @functools.cache
@@ -106,11 +105,7 @@ class SegmentationModel:
     """
 
     def __init__(self, given: str) -> None:
-        path = find_model(given)
-        if path is None:
-            check_model(given, ())
-        assert path is not None
-        self.path = path
+        self.path = path = model_file(given)
         runtime: Any = libraries.load("onnxruntime")
         options = runtime.SessionOptions()
         options.log_severity_level = 4  # its errors arrive as exceptions

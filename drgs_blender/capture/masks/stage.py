@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from ..world_alignment import GUESSED, LOWEST
 from .contact_sheet import draw_contact_sheet
 from .hull_check import Fit, check_masks
 from .mask_view import MaskView
-from .segmentation_model import check_model, load_model, masks_by_model
+from .segmentation_model import load_model, masks_by_model, model_file
 from .settling import REMEDY, hull_of_masks, resized, whole
 
 logger = logging.getLogger(__name__)
@@ -54,10 +54,11 @@ class Masked:
 
 def check_mode(mode: str) -> None:
     """Raise an error where `mode` is neither one of `MODES` nor a segmentation model that can be loaded."""
-    check_model(mode, MODES)
-    if mode not in MODES:
-        libraries.load("opencv")  # without which masks are not made, with a warning
-        load_model(mode)
+    if mode in MODES:
+        return
+    model_file(mode, MODES)
+    libraries.load("opencv")  # without which masks are not made, with a warning
+    load_model(mode)
 
 
 def mode_on_ground(mode: str, given: Path | None, ground: str, subject: str) -> str:
@@ -133,6 +134,7 @@ def make_or_check(mode: str, found: Registration, by_file: dict[str, Picture], c
             logger.warning(MODEL_UNUSED, subject, mode)
         return _check_given(cv2, views, files, given, sheet, subject)
     pictures = [by_file[file] for file in files]
+    drawn: Iterable[Array] | None
     if mode in MODES:
         drawn, fits = _learned(cv2, views, pictures, sheet, found, subject, tell, cancelled)
     else:
@@ -158,8 +160,11 @@ def _view(file: str, picture: Picture, found: Registration, copies: Path) -> Mas
 
 
 def _learned(cv2: Any, views: list[MaskView], pictures: list[Picture], sheet: Path, found: Registration, subject: str,
-             tell: Tell, cancelled: Callable[[], bool]) -> tuple[list[Array] | None, list[Fit]]:  # fmt: skip
-    """Masks of the learned object; none, with a warning, where no object is found or they do not fit together."""
+             tell: Tell, cancelled: Callable[[], bool]) -> tuple[Iterator[Array] | None, list[Fit]]:  # fmt: skip
+    """Masks of the learned object, drawn one by one, as those of many photographs are large.
+
+    None, with a warning, where no object is found or they do not fit together.
+    """
     try:
         libraries.load("torch")
     except DeviceError as error:
@@ -170,7 +175,7 @@ def _learned(cv2: Any, views: list[MaskView], pictures: list[Picture], sheet: Pa
     made, fits = make_masks(cv2, views, found.points, sheet, subject, tell, cancelled)
     if made is None:
         return None, fits
-    return [made.whole(k, view.shape, pictures[k].size) for k, view in enumerate(views)], fits
+    return (made.whole(k, view.shape, pictures[k].size) for k, view in enumerate(views)), fits
 
 
 def _doubts(doubtful: list[str], subject: str, sheet: Path) -> list[str]:

@@ -21,8 +21,8 @@ GAP = 3.0
 #: Blending stops once no more than this part of the background is left.
 MIN_TRANSMITTANCE = 1e-4
 #: Where surfels smaller than the filter cover a sample before their weights, less than their coverage, are used up, it
-#: goes on behind that depth: so many pixels times the root of the samples per pixel, the depth that a slope of 2 has
-#: within the filter; and to so many contributions.
+#: goes on behind that depth: by these pixels over the root of the samples per pixel, the depth that a slope of 2 has
+#: within the filter; and to this number of contributions.
 BEHIND, MOST_BEHIND = 9.4, 512
 
 Array = np.ndarray

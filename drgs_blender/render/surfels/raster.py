@@ -16,7 +16,8 @@ it is full, blending ends (`blending.BEHIND`).
 
 Order. Contributions are blended by the depth at which the ray meets them, not by that of the surfels' centres: every
 sample lists its contributions and sorts them once all are there. A list that is full is sorted early and cut where the
-sample is opaque, and only when that does not make room it grows; as 1/255 is the least strength, it stays short.
+sample is opaque, and only when that does not make room it grows; as 1/255 is the least coverage, and
+`blending.MOST_BEHIND` contributions the most once that is full, it stays short.
 
 Depth gaps. Where a ray passes the edge of one surface and meets another, the mean of both would be a point between
 them. Contributions are therefore split into clusters where the depth jumps by more than `GAP` standard deviations of
@@ -38,7 +39,20 @@ from ...compute.jit import inlined, njit
 from ...compute.threads import over_strided
 from ..camera import CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, lattice, pixel_shift
 from ..surfel_columns import OPACITY, SAMPLE, SPLAT
-from .blending import BEHIND, GAP, LANES, MIN_TRANSMITTANCE, contributions, mean, prune, scratch_for, sort, weigh, widen
+from .blending import (
+    BEHIND,
+    GAP,
+    LANES,
+    MIN_TRANSMITTANCE,
+    behind_of,
+    contributions,
+    mean,
+    prune,
+    scratch_for,
+    sort,
+    weigh,
+    widen,
+)
 from .splats import (
     CUT,
     DIM,
@@ -204,12 +218,14 @@ def gaussian(q):  # type: ignore[no-untyped-def]
 
 @njit
 def _meet(screen, i, opacity, view, state, first, last):  # type: ignore[no-untyped-def]
-    """Splat i at the lanes first .. last of a block: strength (0 where it has no part) and depth; how many have one.
+    """Splat i at the lanes first .. last of a block: strength (0 where it has no part), coverage and depth.
+
+    Returns how many have a part.
 
     One array, constant distances, no branch: the loop becomes vector code.
     """
     big, zero, one, stop = np.float32(1e30), np.float32(0.0), np.float32(1.0), np.float32(MIN_TRANSMITTANCE)
-    near, far, wide, slope = view.near, view.far, view.behind * view.pixel_base, view.behind * view.pixel
+    near, far = view.near, view.far
     rx, ry, zc = screen[i, RX], screen[i, RY], screen[i, ZC]
     cut, low, dim, share = screen[i, CUT], screen[i, LOW], screen[i, DIM], screen[i, SHARE]
     a0, a1, a2 = screen[i, A], screen[i, A + 1], screen[i, A + 2]
@@ -230,22 +246,22 @@ def _meet(screen, i, opacity, view, state, first, last):  # type: ignore[no-unty
         take = exact <= filtered
         q = exact if take else filtered
         z = z if take else zc
-        before, clear, farthest = state[at + _LEFT], state[at + _CLEAR], state[at + _FARTHEST]
+        before, clear = state[at + _LEFT], state[at + _CLEAR]
+        farthest, behind = state[at + _FARTHEST], state[at + _BEHIND]
         inside = (np.int32(j) >= first) & (np.int32(j) < last)
-        counts = ((before >= stop) | (z < farthest)) & (z < state[at + _BEHIND])
+        counts = ((before >= stop) | (z < farthest)) & (z < behind)
         seen = inside & (q < cut) & (z > near) & (z < far) & counts
         cover = min(opacity * gaussian(q), np.float32(MAX_ALPHA)) if seen else zero
         alpha = cover if take else share * cover
         farthest = z if seen & (z > farthest) else farthest
-        left = clear * (one - cover)
-        covered = (clear >= stop) & (left < stop)
+        clear = clear * (one - cover)
         state[at + _ALPHA] = alpha
         state[at + _COVER] = cover
         state[at + _DEPTH] = z
         state[at + _LEFT] = before * (one - alpha)
-        state[at + _CLEAR] = left
+        state[at + _CLEAR] = clear
         state[at + _FARTHEST] = farthest
-        state[at + _BEHIND] = farthest + (wide + slope * farthest) if covered else state[at + _BEHIND]
+        state[at + _BEHIND] = behind_of(clear, behind, farthest, view.pixel_base, view.pixel, view.behind)
         hits = np.int32(hits + np.int32(seen))
     return hits
 
