@@ -208,4 +208,4 @@ def test_stl_that_blender_writes_becomes_an_object(scene, tmp_path, text):
 def test_endings_of_other_formats_are_refused_or_told(ball, scene, tmp_path):
     with pytest.raises(RuntimeError, match=r"a\.abc: cannot be written; understood: \.ply"):
         bpy.ops.drgs.export(filepath=str(tmp_path / "a.abc"))
-    assert not list(tmp_path.glob("a*"))
+    assert not list(tmp_path.glob("a.*"))
