@@ -317,7 +317,7 @@ class Session:
         cache = self._scene_cache
         needy = bool(frame.meshes) or any(item.captured is None for item in cache.objects)
         shines = cache.lights.count or cache.scene.mesh_materials.table.emissive or cache.emission is not None
-        if not needy or shines or cache.environment.texels[..., :3].any():
+        if not needy or shines or cache.environment is None or cache.environment.texels[..., :3].any():
             return []
         return [
             "nothing lights the scene: its environment is black, there is no lamp that shines, and no surface emits "
