@@ -142,7 +142,7 @@ class SceneCache:
         """Jobs of `compute.manifest` that a frame needs for what its assets are."""
         known = [self._assets.get(state.asset) for state in frame.objects]
         given = [loaded.asset for loaded in known if loaded is not None]
-        return ("lights",) if len(given) == len(known) and may_need(frame, given) else ()
+        return ("lights", "mesh") if len(given) == len(known) and may_need(frame, given) else ()
 
     def snapshot(self, frame: Frame) -> Frame:
         """Copy of a frame that is safe from later changes of its arrays; those of the scene are copies already."""
@@ -218,6 +218,12 @@ class SceneCache:
         self.emission = emission_of(objects if along_rays else visible)
         lit = [item.posed for item in visible if item.posed is not None]
         return self._joined(lit, backend)
+
+    def as_seen(self, frame: Frame) -> Frame:
+        """The frame that was posed last, as it is drawn: as of meshes where the camera sees nothing else."""
+        if any(item.state.visibility.camera and not item.seen_by_mesh for item in self.objects):
+            return frame
+        return replace(frame, settings=replace(frame.settings, camera_sees="mesh"))
 
     def _poser(self, backend: RenderBackend) -> Callable[..., PosedSurfels]:
         """Who poses surfels: `MeshDriven.pose`, or a device as long as it can."""

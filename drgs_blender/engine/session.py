@@ -237,9 +237,8 @@ class Session:
         timer = _StageTimer(cancelled)
         backend = view.backend
         prepared = self._prepare(view.frame, timer, progress, backend)  # other views may have changed the scene
-        passes = view.advance(
-            prepared, lambda frame, prepared, report: self._draw(frame, prepared, report, cancelled, backend), cancelled
-        )
+        draw = lambda frame, prepared, report: self._draw(frame, prepared, report, cancelled, backend)  # noqa: E731
+        passes = view.advance(self._scene_cache.as_seen(view.frame), prepared, draw, cancelled)
         timer("render")
         return self._with_statistics(view, passes, prepared, timer)
 
@@ -258,6 +257,7 @@ class Session:
         backend: RenderBackend,
     ) -> Passes:
         """The frame's picture as a whole, part of a sequence where it names one."""
+        frame = self._scene_cache.as_seen(frame)
         sequence, statistics = None, {}
         if frame.history and frame.settings.denoise == "svgf":
             self._lights = reuse_equal(frame.lights, self._lights)
@@ -322,7 +322,7 @@ class Session:
 def jobs_of(frame: Frame) -> list[str]:
     """Jobs of `compute.manifest` whose kernels a frame needs, in the order of the stages."""
     settings, jobs = frame.settings, ["frame"]
-    if settings.camera_sees == "mesh":
+    if settings.camera_sees == "mesh" or not any(state.visibility.camera for state in frame.objects):
         jobs.append("mesh")
     if any(state.captured_colours for state in frame.objects):
         jobs += ["captured", "lights"]
