@@ -29,7 +29,7 @@ class SocketRef(NamedTuple):
     def is_cut(self) -> bool:
         """Whether it is an input whose link is not followed, as links of loops are not."""
         socket = self.socket
-        return not socket.is_output and socket.is_linked and not socket.links[0].is_valid
+        return not socket.is_output and any(not link.is_valid for link in _links(socket))
 
     def origin(self) -> SocketRef:
         """The output that feeds this input, through reroutes, muted nodes and groups.
@@ -37,8 +37,8 @@ class SocketRef(NamedTuple):
         Where nothing does, the input whose own value counts.
         """
         own = ref = self
-        while ref.socket.is_linked:
-            link = ref.socket.links[0]
+        while links := _links(ref.socket):
+            link = links[0]
             if link.is_muted or not link.is_valid:  # a loop has a link that is not valid
                 return own
             source = SocketRef(link.from_socket, ref.groups)
@@ -60,6 +60,11 @@ class SocketRef(NamedTuple):
             else:
                 return source
         return own
+
+
+def _links(socket: bpy.types.NodeSocket) -> tuple[bpy.types.NodeLink, ...]:
+    """The links of a socket: Blender 4.2 still calls one linked whose link went with its node group."""
+    return socket.links if socket.is_linked else ()  # links are searched in the whole tree
 
 
 def hollow(node: bpy.types.Node) -> str:

@@ -164,7 +164,7 @@ class Session:
         x0, y0, x1, y1 = frame.camera.window
         passes.statistics |= self._statistics(frame, prepared, timer)
         passes.statistics["samples"] = float((x1 - x0) * (y1 - y0) * frame.settings.sample_count)
-        passes.warnings = self._warnings(frame.settings) + _ignored_settings(frame.settings)
+        passes.warnings = self._warnings(frame) + _ignored_settings(frame.settings)
         return passes
 
     def prepare(self, frame: Frame, progress: OnProgress | None = None) -> tuple[PreparedScene, list[PosedObject]]:
@@ -245,7 +245,7 @@ class Session:
     def _with_statistics(self, view: View, passes: Passes, prepared: PreparedScene, timer: _StageTimer) -> Passes:
         passes.statistics |= self._statistics(view.frame, prepared, timer)
         passes.statistics |= {"view.fraction": view.fraction, "view.pixel": float(view.pixel)}
-        passes.warnings = self._warnings(view.frame.settings)
+        passes.warnings = self._warnings(view.frame)
         return passes
 
     def _draw(
@@ -302,12 +302,12 @@ class Session:
             emission=cache.emission,
         )  # fmt: skip
 
-    def _warnings(self, settings: RenderSettings) -> list[str]:
-        trouble = cache_folder().trouble
+    def _warnings(self, frame: Frame) -> list[str]:
+        settings, trouble = frame.settings, cache_folder().trouble
         lights = self._scene_cache.lights
         linked = lights.linked is not None or lights.grouped is not None
         device = self._backends.warnings(settings, linked, needs_paths(self._scene_cache.scene, settings))
-        found = self._scene_cache.warnings() + device
+        found = self._scene_cache.warnings(frame.passes) + device
         return found + _ignored_lobes(settings, self._scene_cache.meshes) + ([trouble] if trouble else [])
 
     def _statistics(self, frame: Frame, prepared: PreparedScene, timer: _StageTimer) -> dict[str, float]:
