@@ -287,7 +287,7 @@ class SceneCache:
         vertices, instances = self.scene.at(moved, [*step.meshes, *[None] * others])
         return SceneState(vertices, instances, camera_parameters(step.camera, frame.settings, frame.noise_index))
 
-    def warnings(self, passes: Collection[str]) -> list[str]:
+    def warnings(self, passes: Collection[str] = ()) -> list[str]:
         """Warnings about meshes and light of the last frame, of which `passes` were made."""
         found = []
         if not self.objects and not self.meshes:
