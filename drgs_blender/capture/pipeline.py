@@ -249,7 +249,8 @@ def _by_features(ready: Prepared, photos: list[Photo], ordered: bool, subject: s
     affine = (False,) if ordered or len(photos) > features.EXHAUSTIVE else (False, True)
     for again in affine:
         part = _part(tell, 0.6, 1.0) if again else _part(tell, 0.0, 0.6)
-        database, models = (ready.folder.with_name(name + "_affine" * again) for name in ("database", "models"))
+        suffix = "_affine" if again else ""
+        database, models = (ready.folder.with_name(name) for name in (f"database{suffix}.db", f"models{suffix}"))
         features.extract(database, ready.folder, ready.masks, photos, _part(part, 0.0, 0.3), cancelled, again)
         features.match(database, photos, ordered, ready.masks is not None, _part(part, 0.3, 0.75), cancelled)
         try:
@@ -258,7 +259,7 @@ def _by_features(ready: Prepared, photos: list[Photo], ordered: bool, subject: s
             if again == affine[-1] and best is None:
                 raise
             continue
-        found.method += ", affine features" * again
+        found.method += ", affine features" if again else ""
         if best is None or len(found.matrices) > len(best.matrices):
             best = found
         if len(best.matrices) == len(photos):
