@@ -12,6 +12,7 @@ from PIL import Image
 
 from drgs_blender.capture import capture_folder, libraries, pipeline, soundness
 from drgs_blender.capture.features import Photo, pairs
+from drgs_blender.capture.pictures import Picture
 from drgs_blender.capture.pipeline import Settings, make_capture
 from drgs_blender.capture.preparation import Prepared
 from drgs_blender.capture.registration import Registration, register
@@ -267,6 +268,18 @@ def test_missing_pictures_are_sought_by_affine_features(monkeypatch, tmp_path, f
     photos = [Photo(name, ("one",), None, (800, 600)) for name in cameras]
     made = pipeline._by_features(Prepared(tmp_path / "pictures"), photos, False, "photos", tell, never)
     assert tuple(asked) == affine and made.method == method and len(made.matrices) == max(found)
+
+
+def test_left_out_cameras_are_named_with_their_reason(caplog, tmp_path):
+    cameras = ring(6)
+    photos = [Photo(name, ("one",), None, (800, 600)) for name in cameras]
+    by_file = {name: Picture(tmp_path / f"IMG_{name}", name) for name in cameras}
+    kept = dict(list(cameras.items())[2:])
+    found = replace(registration(kept, scene(table=True)), unsound={"01.jpg": "90% of its matches contradict"})
+    pipeline._tell_left_out(found, photos, by_file, tmp_path)
+    strange, unsound = [record.getMessage() for record in caplog.records]
+    assert "1 of 6 pictures do not fit the others and are left out: IMG_00.jpg" in strange and "IMG_01" not in strange
+    assert "IMG_01.jpg (90% of its matches contradict)" in unsound and "IMG_00" not in unsound
 
 
 def test_a_missing_library_is_named_with_the_command_that_installs_it(monkeypatch):
