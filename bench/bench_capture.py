@@ -20,7 +20,8 @@ from report import OUT, store_row, table, write_section
 from drgs_blender.capture.world_alignment import similarity
 
 COLUMNS = [
-    "Scene", "Pictures", "Place, median / largest", "Direction, median", "Up", "Masks", "IoU, mean", "IoU, lowest",
+    "Scene", "Pictures", "Place, median / largest", "Direction, median / largest", "Up", "Masks", "IoU, mean",
+    "IoU, lowest",
 ]  # fmt: skip
 
 
@@ -80,9 +81,9 @@ def main() -> None:
     print(f"up {row['up']:.2f} degrees off ({report['up']})")
     true_focal = json.loads(args.truth.read_text()).get("focal", "not known")
     print(f"focal length {report['cameras'][0]['focal']:.1f} px, true {true_focal}")
-    figures = ["none", "", ""]
+    made = {path.stem: path for path in sorted((args.capture / "masks").glob("*.png"))}
+    figures = ["given" if "masks" in report else "none", "", ""]
     if args.masks:
-        made = {path.stem: path for path in sorted((args.capture / "masks").glob("*.png"))}
         scores = {stem: overlap(path, args.masks / f"{stem}.png") for stem, path in made.items()}
         if scores:
             lowest = min(scores, key=lambda stem: scores[stem])
@@ -94,14 +95,16 @@ def main() -> None:
     if args.scene:
         cells = [
             f"{count} of {len(truth)}", f"{row['place']:.2%} / {row['largest place']:.2%}",
-            f"{row['direction']:.3f}°", f"{row['up']:.2f}°", *figures,
+            f"{row['direction']:.3f}° / {row['largest direction']:.2f}°",
+            "guessed" if "up" in report["guessed"] else f"{row['up']:.2f}°", *figures,
         ]  # fmt: skip
         rows = store_row(OUT / "capture.json", args.scene, cells)
         write_section(
             "capture", "Photographs without cameras",
-            "Scenes of `bench/capture_scene.py`, rendered by Cycles. Cameras after a similarity, places in parts of "
-            "their distance from their centre. Masks are made of the photographs alone (`--masks auto`); IoU is the "
-            "intersection over union with the object's true coverage.\n\n"
+            "Scenes on tables of noise are those of `bench/capture_scene.py`, rendered by Cycles. Cameras after a "
+            "similarity, places in parts of their distance from their centre. A number of masks: made of the "
+            "photographs alone (`--masks auto`); IoU is the intersection over union with the object's true coverage. "
+            "The true cameras of the real head are COLMAP's as its photographers published them.\n\n"
             + table(COLUMNS, [[name, *cells] for name, cells in rows.items()]),
         )  # fmt: skip
 

@@ -140,7 +140,7 @@ def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, can
     alignment.apply(found)
     for photo in photos:
         if photo.file not in found.matrices:
-            left_out[by_file[photo.file].path.name] = "not registered"
+            left_out[by_file[photo.file].path.name] = found.unsound.get(photo.file, "not registered")
     made = Made(folder, len(found.matrices), len(given), left_out, found.method, 0.0, alignment)
     made.error = sum(found.errors.values()) / len(found.errors)
     mode = mask_stage.mode_on_ground(settings.masks, ready.masks, alignment.ground_from, str(source))
@@ -219,20 +219,8 @@ def _cameras(ready: Prepared, photos: list[Photo], ups: dict[str, gravity.Vector
         enough = len(marked.matrices) >= max(FEWEST, _MARKED * len(photos))
         if settings.poses == "markers" or enough:
             return marked, _of_sheet(sheet)
-    database = ready.folder.with_name("database.db")
-    masked = ready.masks is not None
     try:
-        features.extract(database, ready.folder, ready.masks, photos, _part(tell, 0.0, 0.3), cancelled)
-        features.match(database, photos, ordered, masked, _part(tell, 0.3, 0.75), cancelled)
-        found = register(
-            database,
-            ready.folder,
-            ready.folder.with_name("models"),
-            photos,
-            str(source),
-            _part(tell, 0.75, 1.0),
-            cancelled,
-        )
+        found = _by_features(ready, photos, ordered, str(source), tell, cancelled)
     except AssetError as error:
         if marked is None or sheet is None or len(marked.matrices) < FEWEST:
             raise
@@ -249,6 +237,35 @@ def _cameras(ready: Prepared, photos: list[Photo], ups: dict[str, gravity.Vector
         alignment = align_to_ground(found, settings.distance, gravity.measured_up(found, ups, str(source)))
         _tell_guesses(alignment, source)
     return found, alignment
+
+
+def _by_features(ready: Prepared, photos: list[Photo], ordered: bool, subject: str, tell: Tell,
+                 cancelled: Callable[[], bool]) -> Registration:  # fmt: skip
+    """Cameras by features; where pictures are missing once more, by features that views farther apart share.
+
+    Of frames, and of so many pictures that not all are matched, missing ones are not worth the time.
+    """
+    best: Registration | None = None
+    affine = (False,) if ordered or len(photos) > features.EXHAUSTIVE else (False, True)
+    for again in affine:
+        part = _part(tell, 0.6, 1.0) if again else _part(tell, 0.0, 0.6)
+        suffix = "_affine" if again else ""
+        database, models = (ready.folder.with_name(name) for name in (f"database{suffix}.db", f"models{suffix}"))
+        features.extract(database, ready.folder, ready.masks, photos, _part(part, 0.0, 0.3), cancelled, again)
+        features.match(database, photos, ordered, ready.masks is not None, _part(part, 0.3, 0.75), cancelled)
+        try:
+            found = register(database, ready.folder, models, photos, subject, _part(part, 0.75, 1.0), cancelled)
+        except AssetError:
+            if again == affine[-1] and best is None:
+                raise
+            continue
+        found.method += ", affine features" if again else ""
+        if best is None or len(found.matrices) > len(best.matrices):
+            best = found
+        if len(best.matrices) == len(photos):
+            break
+    assert best is not None
+    return best
 
 
 def _tell_guesses(alignment: Alignment, source: Path) -> None:
@@ -277,11 +294,18 @@ def _of_sheet(sheet: MarkerSheet) -> Alignment:
 
 
 def _tell_left_out(found: Registration, photos: list[Photo], by_file: dict[str, Picture], source: Path) -> None:
-    missing = [by_file[photo.file].path.name for photo in photos if photo.file not in found.matrices]
+    out = {photo.file: by_file[photo.file].path.name for photo in photos if photo.file not in found.matrices}
+    missing = [name for file, name in out.items() if file not in found.unsound]
     if missing:
         logger.warning(
             "%s: %d of %d pictures do not fit the others and are left out: %s",
             source, len(missing), len(photos), ", ".join(missing),
+        )  # fmt: skip
+    if found.unsound:
+        logger.warning(
+            "%s: %d of %d pictures are left out, their cameras may be wrong: %s. Add pictures between them and the "
+            "others", source, len(found.unsound), len(photos),
+            ", ".join(f"{out[file]} ({why})" for file, why in found.unsound.items()),
         )  # fmt: skip
     for group in found.apart:
         logger.warning(

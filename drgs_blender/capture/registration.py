@@ -15,7 +15,7 @@ from ..core.arrays import Array
 from ..core.errors import AssetError, Cancelled
 from ..reconstruct.readers.layout import OPENCV_TO_BLENDER, invert
 from ..reconstruct.readers.lens import Lens
-from . import libraries
+from . import libraries, soundness
 from .features import Photo, Tell
 
 logger = logging.getLogger(__name__)
@@ -24,8 +24,6 @@ logger = logging.getLogger(__name__)
 FEWEST, PART = 5, 0.5
 #: Reprojection error, pixels, above which a further attempt is made although all pictures are registered.
 _GOOD_ERROR = 1.5
-#: A camera with fewer points is no camera.
-_LEAST_POINTS = 12
 #: Pictures that must share a lens before its second radial coefficient and its principal point are refined.
 _FOR_DISTORTION = 15
 _SEED = 0
@@ -53,6 +51,8 @@ class Registration:
         What found them.
     apart : list of list of str
         Files of further models that share nothing with this one.
+    unsound : dict of str to str
+        File that was registered and is left out -> why its camera cannot be trusted.
     """
 
     matrices: dict[str, Array]
@@ -63,6 +63,7 @@ class Registration:
     colours: Array
     method: str
     apart: list[list[str]] = field(default_factory=list)
+    unsound: dict[str, str] = field(default_factory=dict)
 
 
 def _default(options: Any) -> None:
@@ -93,7 +94,7 @@ def register(database: Path, pictures: Path, work: Path, photos: Sequence[Photo]
              cancelled: Callable[[], bool]) -> Registration:  # fmt: skip
     """Find cameras of matched pictures: attempts until one has all pictures, then the best.
 
-    Best is what has most pictures, and of equal ones the lowest reprojection error.
+    Best is what has most pictures whose cameras are sound, and of equal ones the lowest reprojection error.
 
     Parameters
     ----------
@@ -112,8 +113,9 @@ def register(database: Path, pictures: Path, work: Path, photos: Sequence[Photo]
         `cancelled` said so.
     """
     colmap = libraries.load("pycolmap")
+    matches = soundness.read_matches(colmap, database)
     best: Any = None
-    method, apart = "", []
+    method, apart, unsound = "", [], dict[str, str]()
     for index, (name, settings, goes_on) in enumerate(_ATTEMPTS):
         if goes_on and best is None:
             continue
@@ -127,13 +129,16 @@ def register(database: Path, pictures: Path, work: Path, photos: Sequence[Photo]
         models = _attempt(
             colmap, database, pictures, folder, settings, start if goes_on else None, len(photos), name, tell, cancelled
         )
-        models.sort(key=_rank, reverse=True)
-        for model in models[:1]:
-            logger.info("%s: %d of %d pictures, %.2f px", name, model.num_reg_images(), len(photos),
-                        model.compute_mean_reprojection_error())  # fmt: skip
-            if best is None or _rank(model) > _rank(best):
-                best, method = model, f"{method} + {name}" if goes_on else name
-                apart = _apart(models)
+        left_out = {id(model): soundness.leave_out_unsound(model, matches) for model in models}
+        models = sorted((model for model in models if model.num_reg_images()), key=_rank, reverse=True)
+        if models:
+            out = left_out[id(models[0])]
+            logger.info("%s: %d of %d pictures, %.2f px; left out: %s", name, models[0].num_reg_images(), len(photos),
+                        models[0].compute_mean_reprojection_error(), out)  # fmt: skip
+        if models and (best is None or _rank(models[0]) > _rank(best)):
+            best, method = models[0], f"{method} + {name}" if goes_on else name
+            unsound = (unsound if goes_on else {}) | out
+            apart = _apart(models)
         if (
             best is not None
             and best.num_reg_images() == len(photos)
@@ -143,8 +148,13 @@ def register(database: Path, pictures: Path, work: Path, photos: Sequence[Photo]
     if best is None:
         _refuse([], photos, subject)
     tell("adjusting cameras", 0.95)
-    _refine(libraries.load("pycolmap"), best)  # mapping sets its messages back to all
+    colmap = libraries.load("pycolmap")  # mapping sets its messages back to all
+    _refine(colmap, best)
+    while more := soundness.leave_out_unsound(best, matches):
+        unsound |= more
+        _refine(colmap, best)
     found = _read(best, method, apart)
+    found.unsound = {name: why for name, why in unsound.items() if name not in found.matrices}
     if len(found.matrices) < max(FEWEST, PART * len(photos)):
         _refuse(list(found.matrices), photos, subject)
     return found
@@ -230,8 +240,6 @@ def _read(model: Any, method: str, apart: list[list[str]]) -> Registration:
     for number in model.reg_image_ids():
         image = model.image(number)
         seen = [point.point3D_id for point in image.points2D if point.has_point3D()]
-        if len(seen) < _LEAST_POINTS:
-            continue
         matrix = np.eye(4)
         matrix[:3] = image.cam_from_world().matrix()
         found.matrices[image.name] = invert(matrix) @ OPENCV_TO_BLENDER

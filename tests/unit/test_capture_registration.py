@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from drgs_blender.capture import capture_folder, libraries
+from drgs_blender.capture import capture_folder, libraries, pipeline, soundness
 from drgs_blender.capture.features import Photo, pairs
+from drgs_blender.capture.pictures import Picture
 from drgs_blender.capture.pipeline import Settings, make_capture
+from drgs_blender.capture.preparation import Prepared
 from drgs_blender.capture.registration import Registration, register
 from drgs_blender.capture.world_alignment import align_to_ground, align_to_markers, ground_plane, similarity
 from drgs_blender.core.errors import AssetError, Cancelled, DeviceError, UsageError
@@ -186,6 +188,98 @@ def test_too_few_matched_pictures_are_refused_with_their_names(colmap, tmp_path)
     strangers = [replace(photos[0], file=f"other_{k}.jpg") for k in range(9)]
     with pytest.raises(AssetError, match=r"6 of 15 pictures fit together. Not registered: other_0.jpg"):
         register(tmp_path / "database.db", tmp_path, tmp_path / "models", photos + strangers, "photos", tell, never)
+
+
+def model_of(colmap, folder, cameras: int = 9, points: int = 200):
+    """A true model of synthetic pictures, and their verified matches."""
+    truth, _ = synthetic(colmap, folder / "database.db", cameras, points)
+    return truth, soundness.read_matches(colmap, folder / "database.db")
+
+
+def turned_to(model, file: str, like: str) -> None:
+    """Give a picture another one's camera."""
+    one, other = model.find_image_with_name(file), model.find_image_with_name(like)
+    one.frame.rig_from_world = other.cam_from_world()
+
+
+def names(model) -> set[str]:
+    return {model.image(number).name for number in model.reg_image_ids()}
+
+
+def test_true_cameras_are_sound(colmap, tmp_path):
+    model, matches = model_of(colmap, tmp_path)
+    assert soundness.leave_out_unsound(model, matches) == {} and model.num_reg_images() == 9
+
+
+def test_a_camera_that_matches_contradict_is_left_out_alone(colmap, tmp_path):
+    model, matches = model_of(colmap, tmp_path)
+    wrong, *_, other = sorted(names(model))
+    turned_to(model, wrong, other)
+    number = model.find_image_with_name(wrong).image_id
+    for point in list(model.points3D.values()):  # its own points, as of a side that looks alike
+        if number in {element.image_id for element in point.track.elements}:
+            model.delete_observation(number, next(e.point2D_idx for e in point.track.elements if e.image_id == number))
+    out = soundness.leave_out_unsound(model, matches)
+    assert list(out) == [wrong] and "contradict" in out[wrong]
+    assert wrong not in names(model) and model.num_reg_images() == 8
+
+
+@pytest.mark.parametrize(("bridge", "kept"), [(soundness.LEAST_POINTS - 1, 6), (soundness.LEAST_POINTS, 9)])
+def test_pictures_that_few_points_tie_to_the_others_are_left_out(colmap, tmp_path, bridge, kept):
+    model, _ = model_of(colmap, tmp_path)
+    group = {model.find_image_with_name(name).image_id for name in sorted(names(model))[:3]}
+    left = bridge
+    for k, point in enumerate(list(model.points3D.values())):
+        elements = [(element.image_id, element.point2D_idx) for element in point.track.elements]
+        if left and {number for number, _ in elements} >= set(model.reg_image_ids()):
+            left -= 1
+            continue
+        for number, index in elements:  # every other point is seen by the group, the rest by the others
+            if (number in group) != k % 2 and model.image(number).points2D[index].has_point3D():
+                model.delete_observation(number, index)
+    assert left == 0
+    out = soundness.leave_out_unsound(model, [])
+    assert model.num_reg_images() == kept and len(out) == 9 - kept
+    assert all(f"fewer than {soundness.LEAST_POINTS} points" in why for why in out.values())
+
+
+@pytest.mark.parametrize(("found", "affine", "method"), [
+    ((8,), (False,), "mapping"),
+    ((6, 7), (False, True), "mapping, affine features"),
+    ((7, 6), (False, True), "mapping"),
+    ((0, 6), (False, True), "mapping, affine features"),
+    ((6, 0), (False, True), "mapping"),
+])  # fmt: skip
+def test_missing_pictures_are_sought_by_affine_features(monkeypatch, tmp_path, found, affine, method):
+    cameras, asked, counts = ring(8), [], list(found)
+
+    def extract(database, folder, masks, photos, tell, cancelled, affine):
+        asked.append(affine)
+
+    def register(database, folder, work, photos, subject, tell, cancelled):
+        count = counts.pop(0)
+        if not count:
+            raise AssetError(subject, "cannot be calibrated", "Add pictures")
+        return replace(registration(dict(list(cameras.items())[:count]), scene(table=True)), method="mapping")
+
+    monkeypatch.setattr(pipeline.features, "extract", extract)
+    monkeypatch.setattr(pipeline.features, "match", lambda *args: None)
+    monkeypatch.setattr(pipeline, "register", register)
+    photos = [Photo(name, ("one",), None, (800, 600)) for name in cameras]
+    made = pipeline._by_features(Prepared(tmp_path / "pictures"), photos, False, "photos", tell, never)
+    assert tuple(asked) == affine and made.method == method and len(made.matrices) == max(found)
+
+
+def test_left_out_cameras_are_named_with_their_reason(caplog, tmp_path):
+    cameras = ring(6)
+    photos = [Photo(name, ("one",), None, (800, 600)) for name in cameras]
+    by_file = {name: Picture(tmp_path / f"IMG_{name}", name) for name in cameras}
+    kept = dict(list(cameras.items())[2:])
+    found = replace(registration(kept, scene(table=True)), unsound={"01.jpg": "90% of its matches contradict"})
+    pipeline._tell_left_out(found, photos, by_file, tmp_path)
+    strange, unsound = [record.getMessage() for record in caplog.records]
+    assert "1 of 6 pictures do not fit the others and are left out: IMG_00.jpg" in strange and "IMG_01" not in strange
+    assert "IMG_01.jpg (90% of its matches contradict)" in unsound and "IMG_00" not in unsound
 
 
 def test_a_missing_library_is_named_with_the_command_that_installs_it(monkeypatch):
