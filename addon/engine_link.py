@@ -121,8 +121,11 @@ def output_of(arguments: list[str]) -> str:
         os.close(reading)
         os.close(writing)
     if done.returncode:
-        lines = done.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {done.returncode}"]
-        raise UsageError("", lines[-1].removeprefix("drgs: ").rstrip("."), "")
+        last = (done.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+        if last.startswith("ModuleNotFoundError") or "No module named" in last:
+            problem = f"{command[0]} cannot run it ({last})"
+            raise EngineError("Engine", problem, "Press Set Up Engine in the preferences, or install DR-GS there")
+        raise UsageError("", last.removeprefix("drgs: ").rstrip("."), "")
     return done.stdout.decode().replace("\r\n", "\n")
 
 

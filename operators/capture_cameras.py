@@ -34,7 +34,7 @@ class DRGS_OT_import_cameras(DrgsOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
 
     filepath: StringProperty(
-        description="Folder of the capture, or its transforms.json", subtype="FILE_PATH", options={"SKIP_SAVE"}
+        description="Folder of the capture, or a file in it", subtype="FILE_PATH", options={"SKIP_SAVE"}
     )
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     filter_glob: StringProperty(default="*.json", options={"HIDDEN"})
@@ -62,9 +62,13 @@ class DRGS_OT_import_cameras(DrgsOperator, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context) -> set[str]:
         path = Path(bpy.path.abspath(self.chosen("Import Cameras"))).absolute()
+        if path.is_file() and path.suffix.lower() != ".json":  # a photograph, poses_bounds.npy, cameras.bin
+            path = path.parent
         found = json.loads(engine_link.output_of(["inspect", str(path), "--json", "--axes", self.axes]))
         if found.get("kind") != "capture":
-            raise AssetError(str(path), f"is no capture, but {found.get('kind')}", "Choose photographs with cameras")
+            raise AssetError(
+                str(path), f"is no capture, but {found.get('kind')}", "Choose the folder of the photographs"
+            )
         cameras = found["cameras"]
         into = bpy.data.collections.new(f"Cameras of {path.parent.name if path.is_file() else path.name}")
         context.scene.collection.children.link(into)

@@ -17,6 +17,8 @@ _HELD = {"splats": "Splats", "mesh": "Mesh with materials", "environment": "The 
 # Blender evaluates annotations apart from this module: no loops in them.
 _FORMATS = tuple((name, f"{name} ({t.extensions[0]})", _HELD[t.kind]) for name, t in WRITTEN.items())
 _ENDINGS = tuple(dict.fromkeys(e for t in WRITTEN.values() for e in t.extensions))
+#: Endings of what other programs export. Others may be parts of a name.
+_FOREIGN = (".abc", ".blend", ".dae", ".drgs", ".fbx", ".stl", ".vdb", ".x3d")
 _GLOB = ";".join(f"*{e}" for e in _ENDINGS)
 
 
@@ -92,8 +94,11 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context) -> set[str]:
         self.chosen("Export")
-        self.check(context)  # gives the path the format's ending
-        kind = WRITTEN[self.format]
+        given, kind = Path(self.filepath), WRITTEN[self.format]
+        if given.suffix.lower() in _FOREIGN:
+            raise UsageError(given.name, f"cannot be written; understood: {' '.join(_ENDINGS)}", "Choose one of these")
+        if self.check(context) and given.suffix.lower() in _ENDINGS:
+            self.warn(f"{given.name}: its format is {self.format}; written as {Path(self.filepath).name}")
         target = Path(bpy.path.abspath(self.filepath)).absolute()
         frames = range(self.frame_start, self.frame_end + 1, self.frame_step) if self.use_animation else None
         if frames is not None and not frames:

@@ -23,7 +23,7 @@ The tables are written by `tools/settings_page.py` from the dataclasses of the s
   with what each is and may be, as other options, `--config` and `--set` that are given with it have changed them.
 - **`--set NAME=VALUE`** changes one, with the name as below; lists and texts as in TOML, texts without quotes, too.
   Options and `--set` come before the file.
-- **The asset keeps them all**: `drgs inspect` shows them under `provenance`, and `--config A.drgs` uses them again. The
+- **The asset keeps them all**: `drgs inspect --all` shows them, and `--config A.drgs` uses them again. The
   same photographs then give the same asset, bit for bit, unless time decides (`minutes`, `decoupling.seconds`).
 - Unknown names are refused with the nearest one there is, values with what they may be (exit code 64). What is set and
   has no effect because of another setting is told.

@@ -28,14 +28,15 @@ EXAMPLES = """examples:
 
 _ZIP = b"PK\x03\x04"
 _EXR = b"\x76\x2f\x31\x01"
-#: Items of a list that a person is shown.
-_FEW = 16
+#: Items of a list that a person is shown, and values within values, without --all.
+_FEW, _FEW_WITHIN = 16, 2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs inspect``."""
     parser.add_argument("file", type=Path, metavar="FILE", help="any file (or folder) that DR-GS reads or writes")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--json", action="store_true", help="print JSON, of all that is known")
+    parser.add_argument("--all", action="store_true", dest="whole", help="print all: settings, tensors, cameras")
     parser.add_argument("--axes", choices=tuple(CAMERAS), default="opengl", help="of a capture, as drgs reconstruct")
     parser.add_argument("--up", choices=tuple(UP_AXES), help="of a capture, as drgs reconstruct")
 
@@ -43,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the description."""
     report = {"file": str(args.file), **inspect_file(args.file, args.axes, args.up)}
-    print(json.dumps(report, indent=2, allow_nan=False) if args.json else "\n".join(as_lines(report)))
+    print(json.dumps(report, indent=2, allow_nan=False) if args.json else "\n".join(as_lines(report, whole=args.whole)))
     return 0
 
 
@@ -172,8 +173,11 @@ def describe(value: Any) -> Any:
     return value if isinstance(value, bool | int | float | str | None) else str(value)
 
 
-def as_lines(value: Any, depth: int = 0) -> Iterator[str]:
-    """Indented lines for a person; short lists and array summaries stay on one line."""
+def as_lines(value: Any, depth: int = 0, whole: bool = True) -> Iterator[str]:
+    """Indented lines for a person; short lists and array summaries stay on one line.
+
+    Unless it is to be `whole`, what lies deeper and is long is counted only.
+    """
     pad = "  " * depth
     named = isinstance(value, dict)
     for key, item in value.items() if named else enumerate(value):
@@ -182,13 +186,25 @@ def as_lines(value: Any, depth: int = 0) -> Iterator[str]:
             bad = f", {item['not_finite']} not finite" if item.get("not_finite") else ""
             yield f"{pad}{key}: {' x '.join(map(str, item['shape']))} {item['dtype']}{low_high}{bad}"
         elif isinstance(item, dict | list) and item and not is_short(item):
+            nested = isinstance(item, list) and any(isinstance(part, dict) for part in item)
+            if not whole and (depth or nested) and count_values(item) > _FEW_WITHIN:
+                count = f"{len(item)}, " if nested else f"{count_values(item)} values, "
+                yield f"{pad}{key}: {count}see --all"
+                continue
             yield f"{pad}{key}:"
-            yield from as_lines(item, depth + 1)
+            yield from as_lines(item, depth + 1, whole)
         elif isinstance(item, list):
             more = f", ... ({len(item)} in all)" if len(item) > _FEW else ""
             yield f"{pad}{key}: {', '.join(format_value(part) for part in item[:_FEW]) or 'none'}{more}"
         else:
             yield f"{pad}{key}: {format_value(item)}" if named else f"{pad}- {format_value(item)}"
+
+
+def count_values(value: Any) -> int:
+    """How many lines of values `as_lines` makes of a value."""
+    if isinstance(value, dict) and not ("shape" in value and "dtype" in value):
+        return sum(map(count_values, value.values()))
+    return sum(map(count_values, value)) if isinstance(value, list) and value and not is_short(value) else 1
 
 
 def is_short(value: Any) -> bool:

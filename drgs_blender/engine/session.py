@@ -155,6 +155,7 @@ class Session:
         >>> passes["Depth"][4, 4].round(3)
         array([2.], dtype=float32)
         """
+        frame = _as_drawn(frame)
         self._compile(frame, (), progress, cancelled)
         timer, backend = _StageTimer(cancelled), self._backends.select(frame.settings.device)
         prepared = self._prepare(frame, timer, progress, backend)
@@ -164,7 +165,7 @@ class Session:
         x0, y0, x1, y1 = frame.camera.window
         passes.statistics |= self._statistics(frame, prepared, timer)
         passes.statistics["samples"] = float((x1 - x0) * (y1 - y0) * frame.settings.sample_count)
-        passes.warnings = self._warnings(frame.settings) + _ignored_settings(frame.settings)
+        passes.warnings = self._warnings(frame) + _ignored_settings(frame.settings)
         return passes
 
     def prepare(self, frame: Frame, progress: OnProgress | None = None) -> tuple[PreparedScene, list[PosedObject]]:
@@ -204,6 +205,7 @@ class Session:
         AssetError, UsageError, Cancelled
             As `render`.
         """
+        frame = _as_drawn(frame)
         self._views.pop(name, None)
         self._compile(frame, ("viewport",), progress, cancelled)
         timer, backend = _StageTimer(cancelled), self._backends.select(frame.settings.device)
@@ -246,7 +248,7 @@ class Session:
     def _with_statistics(self, view: View, passes: Passes, prepared: PreparedScene, timer: _StageTimer) -> Passes:
         passes.statistics |= self._statistics(view.frame, prepared, timer)
         passes.statistics |= {"view.fraction": view.fraction, "view.pixel": float(view.pixel)}
-        passes.warnings = self._warnings(view.frame.settings)
+        passes.warnings = self._warnings(view.frame)
         return passes
 
     def _draw(
@@ -302,13 +304,25 @@ class Session:
             emission=cache.emission,
         )  # fmt: skip
 
-    def _warnings(self, settings: RenderSettings) -> list[str]:
-        trouble = cache_folder().trouble
+    def _warnings(self, frame: Frame) -> list[str]:
+        settings, trouble = frame.settings, cache_folder().trouble
         lights = self._scene_cache.lights
         linked = lights.linked is not None or lights.grouped is not None
         device = self._backends.warnings(settings, linked, needs_paths(self._scene_cache.scene, settings))
-        found = self._scene_cache.warnings() + device
+        found = self._scene_cache.warnings() + device + self._darkness(frame)
         return found + _ignored_lobes(settings, self._scene_cache.meshes) + ([trouble] if trouble else [])
+
+    def _darkness(self, frame: Frame) -> list[str]:
+        """What to do where nothing lights what needs light."""
+        cache = self._scene_cache
+        needy = bool(frame.meshes) or any(item.captured is None for item in cache.objects)
+        shines = cache.lights.count or cache.scene.mesh_materials.table.emissive or cache.emission is not None
+        if not needy or shines or cache.environment is None or cache.environment.texels[..., :3].any():
+            return []
+        return [
+            "nothing lights the scene: its environment is black, there is no lamp that shines, and no surface emits "
+            "light. Give the world a colour or a picture, or add a light"
+        ]
 
     def _statistics(self, frame: Frame, prepared: PreparedScene, timer: _StageTimer) -> dict[str, float]:
         return timer.seconds | {
@@ -317,6 +331,13 @@ class Session:
             "triangles": float(len(self._scene_cache.scene.faces)),
             "surfels": float(len(prepared.surfels) + sum(len(item.rest) for item in prepared.captured)),
         }
+
+
+def _as_drawn(frame: Frame) -> Frame:
+    """The frame; as one of meshes where no object has surfels to show, for as many sub-pixel samples as edges need."""
+    if frame.objects or frame.settings.camera_sees != "surfels":
+        return frame
+    return replace(frame, settings=replace(frame.settings, camera_sees="mesh"))
 
 
 def jobs_of(frame: Frame) -> list[str]:

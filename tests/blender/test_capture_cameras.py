@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 
 import bpy
 import numpy as np
@@ -36,6 +38,25 @@ def capture(tmp_path):
     text = {"camera_model": "OPENCV", "orientation_override": "none", "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(text))
     return folder, frames
+
+
+def test_a_file_beside_the_photographs_stands_for_their_folder(scene, capture):
+    folder, _ = capture
+    for name in ("transforms.json", "cover.jpg"):
+        (folder / name).touch()
+        assert bpy.ops.drgs.import_cameras(filepath=str(folder / name)) == {"FINISHED"}
+    with pytest.raises(RuntimeError, match="images: is no capture"):
+        bpy.ops.drgs.import_cameras(filepath=str(folder / "images" / "photo_0.png"))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell script stands for a Python without DR-GS")
+def test_a_python_without_the_engine_is_named(scene, capture, tmp_path, monkeypatch):
+    bare = tmp_path / "python"
+    bare.write_text(f'#!/bin/sh\nexec "{sys.executable}" -I -S "$@"\n')
+    bare.chmod(0o755)
+    monkeypatch.setenv("DRGS_ENGINE", str(bare))
+    with pytest.raises(RuntimeError, match=r"python cannot run it \(ModuleNotFoundError.*Set Up Engine"):
+        bpy.ops.drgs.import_cameras(filepath=str(capture[0]))
 
 
 def test_cameras_see_what_the_photographs_show(scene, capture):

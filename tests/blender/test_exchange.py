@@ -203,3 +203,9 @@ def test_stl_that_blender_writes_becomes_an_object(scene, tmp_path, text):
     assert len(points) == len(wanted)  # the corners of triangles are joined again
     apart = np.abs(points[:, None] - wanted[None]).max(axis=2)
     assert apart.min(axis=1).max() < 1e-5 and apart.min(axis=0).max() < 1e-5
+
+
+def test_endings_of_other_formats_are_refused_or_told(ball, scene, tmp_path):
+    with pytest.raises(RuntimeError, match=r"a\.abc: cannot be written; understood: \.ply"):
+        bpy.ops.drgs.export(filepath=str(tmp_path / "a.abc"))
+    assert not list(tmp_path.glob("a.*"))

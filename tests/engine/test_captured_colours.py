@@ -227,6 +227,18 @@ def test_a_first_picture_has_captured_colours_too(captured_path, asset_path, fra
     assert np.allclose(np.median(picture[inside, :3], axis=0), srgb_to_linear(np.array(COLOUR)), atol=2e-3)
 
 
+def test_it_needs_no_light_and_shines_on_others(captured_path, asset_path, frame_of):
+    """So that no message says that nothing lights the scene."""
+    frame, session = frame_of(captured_path), session_of(captured_path, asset_path)
+    frame.world = World(colour=(0.0, 0.0, 0.0))
+    assert session.render(frame).warnings == []
+    beside(frame, asset_path)
+    assert session.render(frame).warnings == []
+    frame.objects[0].captured_colours = False
+    (text,) = session.render(frame).warnings
+    assert text.startswith("nothing lights the scene")
+
+
 def test_the_denoiser_brings_no_light_to_it(tmp_path, frame_of):
     """Beside a lit wall in one plane with it, where nothing else tells one from the other."""
     corners = np.float32([[0, 0, -1], [1, 0, -1], [1, 0, 1], [0, 0, 1]])

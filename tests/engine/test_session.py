@@ -458,3 +458,35 @@ def test_lobes_that_the_papers_shading_leaves_out_are_named(session, make_frame)
     assert "Lacquer" in text and "Plain" not in text
     frame.meshes[1].materials = [Material("Plain")]
     assert not any("Cook-Torrance" in text for text in session.render(frame).warnings)
+
+
+def test_a_scene_of_meshes_alone_has_the_sub_pixel_samples_of_meshes(session, make_frame):
+    """Whatever the camera sees of objects that are not there."""
+    pictures = []
+    for sees in ("surfels", "mesh"):
+        frame = with_meshes(make_frame(camera_sees=sees))
+        frame.objects.clear()
+        pictures.append(session.render(frame))
+    assert_same_bits(*pictures)
+
+
+def dark(frame):
+    frame.world = World(colour=(0.0, 0.0, 0.0))
+    return frame
+
+
+def test_a_scene_that_nothing_lights_is_named(session, make_frame):
+    frame = dark(make_frame())
+    (text,) = session.render(frame).warnings
+    assert text.startswith("nothing lights the scene")
+    assert session.view("a", frame).warnings == [text]
+    lamp = Light("Lamp", "point", np.eye(4), power=10.0)
+    assert text in session.render(replace(frame, lights=[replace(lamp, power=0.0)])).warnings
+    assert session.render(replace(frame, lights=[lamp])).warnings == []
+    vertices = frame.objects[0].vertices
+    glowing = dark(make_frame())
+    glowing.objects[0].emission = np.ones((len(vertices), 3), np.float32)
+    lit = with_meshes(dark(make_frame()))
+    lit.meshes[0].materials = [Material("Lit", emission=(1.0, 1.0, 1.0))]
+    for shining in (glowing, lit, replace(frame, world=World(strength=0.1))):
+        assert not any("lights the scene" in text for text in session.render(shining).warnings)

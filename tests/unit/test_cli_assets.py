@@ -183,6 +183,17 @@ def test_inspect_shows_the_first_of_many_names_and_counts_them():
     assert line == f"learned_from: {', '.join(names[:16])}, ... (100 in all)"
 
 
+def test_inspect_counts_what_is_long_unless_all_is_asked_for():
+    report = {
+        "kind": "asset",
+        "settings": {"a": {"b": 1, "c": 2, "d": {"e": 3}}, "f": [1, 2]},
+        "views": [{"x": 1.5}] * 3,
+    }
+    short, whole = ("\n".join(as_lines(report, whole=whole)) for whole in (False, True))
+    assert "a: 3 values, see --all" in short and "f: 1, 2" in short and "views: 3, see --all" in short
+    assert "see --all" not in whole and "e: 3" in whole and whole.count("x: 1.5") == 3
+
+
 def test_inspect_counts_what_is_not_finite(tmp_path, capsys):
     picture = np.ones((2, 2, 4), np.float32)
     picture[0, 0] = np.nan

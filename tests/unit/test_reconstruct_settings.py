@@ -182,7 +182,7 @@ def test_the_asset_keeps_its_settings_and_a_run_can_be_repeated_from_it(tmp_path
     kept = inspect_asset(first)["provenance"]["settings"]
     assert kept["schedule"]["iterations"] == 4 and kept["capture"]["resolution"] == 30 and kept["fixed"] == ["offset"]
     assert printed(capsys, "--config", str(first)) == printed(capsys, *words)
-    assert main(["inspect", str(first)]) == 0
+    assert main(["inspect", "--all", str(first)]) == 0
     assert "mesh_resolution: 16" in capsys.readouterr().out
     assert main(["reconstruct", str(photographs), "--out", str(second), "--config", str(first)]) == 0
     assert first.read_bytes() == second.read_bytes()

@@ -153,7 +153,8 @@ def _central_directory(data: Array, subject: str) -> tuple[list[Member], int]:
     if signature != b"PK\5\6":
         if data[:4].tobytes() == b"PK\3\4":
             raise AssetError(subject, "is truncated: the directory at its end is missing", _RESTORE)
-        raise AssetError(subject, "is not a .drgs file", "Import the source files to make one")
+        hint = "`drgs make` makes one of a mesh, as Convert to DR-GS does in Blender; `drgs import` of splats"
+        raise AssetError(subject, "is not a .drgs file", hint)
     if disk or first_disk or here != count or comment or count > MEMBER_LIMIT:
         raise AssetError(subject, "is a zip, but not laid out as a .drgs file", _RESTORE)
     if start + length != len(data) - _END.size:
