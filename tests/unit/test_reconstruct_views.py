@@ -17,7 +17,7 @@ from drgs_blender.reconstruct.capture import training_views  # noqa: E402
 from drgs_blender.reconstruct.capture.capture import Capture, View  # noqa: E402
 from drgs_blender.reconstruct.capture.training_views import composed, half_size, pixel_rays, targets  # noqa: E402
 from drgs_blender.reconstruct.meshing.visual_hull import find_region  # noqa: E402
-from drgs_blender.reconstruct.model.initialisation import on_hull  # noqa: E402
+from drgs_blender.reconstruct.model.initialisation import FEWEST, MOST, PER_PIXEL, on_hull, surfel_limit  # noqa: E402
 from drgs_blender.reconstruct.optim.learner import Learner  # noqa: E402
 from drgs_blender.reconstruct.optim.schedule import Schedule  # noqa: E402
 
@@ -89,3 +89,14 @@ def test_a_crop_teaches_what_the_whole_picture_teaches(capture, monkeypatch):
     for name, (one, other) in (pairs | {"pull": (counted.gradient, also_counted.gradient)}).items():
         # the consistency of normals is a mean without the outermost pixels: 1.7 % of its own
         assert (one - other).norm() < 0.02 * one.norm(), name
+
+
+def test_larger_pictures_get_more_surfels_and_short_runs_fewer(capture):
+    full, half = targets(capture)
+    shown = np.mean([target.mask.sum() for target in full])
+    assert surfel_limit(full) == int(PER_PIXEL * shown) == pytest.approx(4 * surfel_limit(half), rel=0.02)
+    assert surfel_limit(full, 100) == 100
+    large = [replace(target, mask=torch.ones(1000, 1000)) for target in full]
+    assert surfel_limit(large) == MOST and surfel_limit(large, 100_000) == 100_000
+    few, some, many = (surfel_limit(large, seconds=seconds) for seconds in (1.0, 300.0, 1e5))
+    assert FEWEST == few < some < many == MOST

@@ -43,8 +43,8 @@ class Target:
     background : (h, w, 3) tensor or None
         What is behind the surfels, sRGB; None: the one colour of `background_of`.
     share : float
-        Part of the view that is left of it, 0..1: means over the crop count as much, so that a pixel of each view counts
-        the same.
+        Part of the view that is left of it, 0..1. Means over the crop count as much: a pixel of each view counts the
+        same.
     """
 
     camera: Camera
@@ -94,7 +94,10 @@ def targets(capture: Capture) -> list[list[Target]]:
     for view, mask, (x0, y0, x1, y1) in zip(views, masks, windows, strict=True):
         whole = view.camera
         camera = replace(whole, width=x1 - x0, height=y1 - y0, cx=whole.cx - x0, cy=whole.cy - y0)
-        colour, share = composed(view, capture)[y0:y1, x0:x1], camera.width * camera.height / (whole.width * whole.height)
+        colour, share = (
+            composed(view, capture)[y0:y1, x0:x1],
+            camera.width * camera.height / (whole.width * whole.height),
+        )
         if mask is not None:
             mask = np.ascontiguousarray(mask[y0:y1, x0:x1], np.float32)
         full.append(_target(camera, colour, mask, keep, share))
@@ -110,9 +113,9 @@ def _window(camera: Camera, mask: Array | None) -> tuple[int, int, int, int]:
         return whole
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     margin = max(LEAST_MARGIN, math.ceil(MARGIN * max(np.ptp(rows), np.ptp(columns))))
-    low = (max(int(at[0]) - margin, 0) // 2 * 2 for at in (columns, rows))
-    high = (min(int(at[-1]) + 1 + margin, size) for at, size in ((columns, camera.width), (rows, camera.height)))
-    return (*low, *high)
+    x0, y0 = (max(int(at[0]) - margin, 0) // 2 * 2 for at in (columns, rows))
+    x1, y1 = (min(int(at[-1]) + 1 + margin, size) for at, size in ((columns, camera.width), (rows, camera.height)))
+    return x0, y0, x1, y1
 
 
 def _target(camera: Camera, colour: Array, mask: Array | None, keep: bool, share: float) -> Target:
