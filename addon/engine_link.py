@@ -7,6 +7,7 @@ serves one request at a time, from any thread, and starts the process again when
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import threading
 from collections.abc import Callable
@@ -106,7 +107,7 @@ def output_of(arguments: list[str]) -> str:
     EngineError
         It cannot be started or does not answer.
     DeviceError
-        See `command_line`.
+        See `command_line`; or DR-GS is not installed there.
     """
     command = drgs_command()
     reading, writing = os.pipe()  # its standard input, which stays open
@@ -122,11 +123,24 @@ def output_of(arguments: list[str]) -> str:
         os.close(writing)
     if done.returncode:
         last = (done.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-        if last.startswith("ModuleNotFoundError") or "No module named" in last:
-            problem = f"{command[0]} cannot run it ({last})"
-            raise EngineError("Engine", problem, "Press Set Up Engine in the preferences, or install DR-GS there")
+        check_installed(command[0], last)
         raise UsageError("", last.removeprefix("drgs: ").rstrip("."), "")
     return done.stdout.decode().replace("\r\n", "\n")
+
+
+def check_installed(python: str, last: str) -> None:
+    """Raise DeviceError where the `last` line of a program that has failed says that its Python lacks a module."""
+    found = re.search(r"No module named '?([\w.]+)", last)
+    if found is None or last.startswith("drgs: "):  # which says itself what to do
+        return
+    what = "DR-GS" if found[1].partition(".")[0] == "drgs_blender" else f"{found[1]}, which DR-GS needs,"
+    named = VARIABLE if os.environ.get(VARIABLE) else "preferences" * bool(preferences.read("engine_python", ""))
+    remedy = f"Install it there, name another Python in {named}, or name none and press Set Up Engine (sidebar > DR-GS)"
+    raise DeviceError(
+        f"engine {python}{f' (named in {named})' if named else ''}",
+        f"{what} is not installed in it ({found[0]})",
+        remedy if named else SET_UP,
+    )
 
 
 def lacks_reconstruction() -> bool:

@@ -18,8 +18,8 @@ def forget_everything(*_: object) -> None:
 
 @bpy.app.handlers.persistent
 def begin_render(*_: object) -> None:
-    """A picture or an animation begins: each warning is given once, not with every frame."""
-    messages.warned.clear()
+    """A picture or an animation begins."""
+    messages.begin_render()
 
 
 def register() -> None:

@@ -55,8 +55,22 @@ def named_in(text: str, known: Container[str]) -> str:
     return next((name for name in (*re.findall(r'"([^"]+)"', text), text.partition(": ")[0]) if name in known), "")
 
 
-#: What the render under way has warned of, in this frame or in those before.
+#: What the render under way has warned of, in this frame or in those before, and what the one before it had.
 warned: set[str] = set()
+_before: set[str] = set()
+
+
+def begin_render() -> None:
+    """A picture or an animation begins: each warning is given once, not with every frame."""
+    _before.update(warned)
+    warned.clear()
+
+
+def end_picture() -> None:
+    """A picture is there: take back what was warned of the render before it and holds no longer."""
+    for text in _before - warned:
+        withdraw("WARNING", text)
+    _before.clear()
 
 
 class Warnings:

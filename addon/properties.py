@@ -116,8 +116,9 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     subpixel_samples: IntProperty(
         name="Sub-Pixel Samples",
-        description="Positions per pixel among which samples are divided: edges and textures get smoother. 0 is an "
-        "eighth of the samples, from 4 to 16, for surfels; for meshes half of them, up to 16, and a quarter beyond 64",
+        description="Positions per pixel among which samples are divided: edges and textures get smoother. 0 chooses: "
+        "an eighth of the samples where the camera sees surfels, from 4 to 16; where it sees meshes alone half, "
+        "up to 16, and of more than 64 a quarter, up to 64",
         min=0,
         soft_max=64,
         max=1024,

@@ -112,6 +112,7 @@ class Submission:
         engine = engine_link.command_line()
         python = engine[: engine.index("-m")]
         words = [*python, "-m", "drgs_blender.cli.main", "--no-progress", "submit", *arguments(scene)]
+        self._python = python[0]
         self._program = f"drgs submit of {python[0]}"
         self._expected = output_check.ExpectedFiles(
             [Path(bpy.path.abspath(settings.folder)).absolute() / JOB_FILES[settings.manager]]
@@ -164,6 +165,10 @@ class Submission:
         else:
             last = log[-1] if log else f"ended with code {self._process.returncode} and no word"
             self.text, self.error = "No job was written", last.removeprefix("drgs: ")
+            try:
+                engine_link.check_installed(self._python, last)
+            except DeviceError as error:
+                self.error = str(error)
         self.done = True
 
     @staticmethod

@@ -12,12 +12,19 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 from mathutils import Matrix
 
-from ..addon import engine_link
-from ..drgs_blender.core.errors import AssetError, first_of
+from ..addon import engine_link, messages
+from ..drgs_blender.core.errors import AssetError, UsageError, first_of
 from ..drgs_blender.core.file_integrity import crashes_blender
+from ..drgs_blender.core.file_types import READ
 from .base import DrgsOperator
 from .reconstruct import CAMERA_ITEMS
 
+#: Endings of files in captures: cameras of the layouts that are read, and photographs.
+_IN_CAPTURES = (".json", ".npy", ".bin", ".txt", ".pkl", ".exr", *READ["picture"].extensions)
+#: How many folders above a chosen file a capture is looked for: cameras may be in sparse/0, photographs in images.
+_ABOVE = 3
+#: Custom properties: of a collection the capture whose cameras it holds, of a camera its photograph.
+_CAPTURE, _PHOTOGRAPH = "drgs_capture", "drgs_photograph"
 #: Width of the sensor that the cameras get, mm: that of full frame.
 _SENSOR = 36.0
 #: Size of the cameras in the viewport, in parts of their median distance from the world's origin.
@@ -37,7 +44,7 @@ class DRGS_OT_import_cameras(DrgsOperator, bpy.types.Operator):
         description="Folder of the capture, or a file in it", subtype="FILE_PATH", options={"SKIP_SAVE"}
     )
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-    filter_glob: StringProperty(default="*.json", options={"HIDDEN"})
+    filter_glob: StringProperty(default=";".join(f"*{e}" for e in _IN_CAPTURES), options={"HIDDEN"})
     use_pictures: BoolProperty(
         name="Photographs", description="Show each photograph behind the scene in its camera's view", default=True
     )
@@ -62,20 +69,9 @@ class DRGS_OT_import_cameras(DrgsOperator, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context) -> set[str]:
         path = Path(bpy.path.abspath(self.chosen("Import Cameras"))).absolute()
-        if path.is_file() and path.suffix.lower() != ".json":  # a photograph, poses_bounds.npy, cameras.bin
-            path = path.parent
-        found = json.loads(engine_link.output_of(["inspect", str(path), "--json", "--axes", self.axes]))
-        if found.get("kind") != "capture":
-            raise AssetError(
-                str(path), f"is no capture, but {found.get('kind')}", "Choose the folder of the photographs"
-            )
+        path, found = _inspect(path, self.axes)
         cameras = found["cameras"]
-        into = bpy.data.collections.new(f"Cameras of {path.parent.name if path.is_file() else path.name}")
-        context.scene.collection.children.link(into)
-        distances = [float(np.linalg.norm(np.array(one["matrix_world"])[:3, 3])) for one in cameras]
-        made = [_camera(one, _DISPLAY * float(np.median(distances))) for one in cameras]
-        for obj in made:
-            into.objects.link(obj)
+        made = self._place(context, path, cameras)
         missing = [name for one, obj in zip(cameras, made) if (name := self._show(one, obj.data))]
         if self.use_camera:
             context.scene.camera = made[0]
@@ -87,8 +83,28 @@ class DRGS_OT_import_cameras(DrgsOperator, bpy.types.Operator):
         self._tell(path, found, missing)
         return {"FINISHED"}
 
+    def _place(self, context: bpy.types.Context, path: Path, cameras: list[dict[str, Any]]) -> list[bpy.types.Object]:
+        """The objects of `cameras` in the scene; those of an earlier import are renewed."""
+        distances = [float(np.linalg.norm(np.array(one["matrix_world"])[:3, 3])) for one in cameras]
+        size = _DISPLAY * float(np.median(distances))
+        known = {obj[_PHOTOGRAPH]: obj for obj in context.scene.objects if _PHOTOGRAPH in obj and obj.type == "CAMERA"}
+        made = [_camera(one, size, known.get(one["image"])) for one in cameras]
+        new = [obj for one, obj in zip(cameras, made) if one["image"] not in known]
+        if new:
+            into = _collection(context, path.parent if path.is_file() else path)
+            for obj in new:
+                into.objects.link(obj)
+        if len(new) < len(made):
+            text = (
+                f"{path}: {len(made) - len(new)} of its cameras were there already and are renewed, {len(new)} are new"
+            )
+            messages.note("INFO", text)
+            self.report({"INFO"}, text)
+        return made
+
     def _show(self, camera: dict[str, Any], data: bpy.types.Camera) -> str:
         """Put the photograph behind the camera's view; the name of one that cannot be loaded, else ""."""
+        data.background_images.clear()
         if not self.use_pictures:
             return ""
         path = Path(camera["image"])
@@ -122,15 +138,49 @@ class DRGS_OT_import_cameras(DrgsOperator, bpy.types.Operator):
             self.warn(f"{path}: photographs have {len(sizes)} sizes: set the resolution to look through the others")
 
 
-def _camera(camera: dict[str, Any], size: float) -> bpy.types.Object:
-    """A camera object, in no collection yet."""
-    data = bpy.data.cameras.new(camera["name"])
+def _inspect(path: Path, axes: str) -> tuple[Path, dict[str, Any]]:
+    """The capture that `path` is, or in whose folder it lies, and its description."""
+    places = [path]
+    if path.is_file() and path.suffix.lower() != ".json":
+        if path.suffix.lower() not in _IN_CAPTURES:
+            remedy = "Choose the folder of the photographs, its transforms.json, poses_bounds.npy or a photograph"
+            raise AssetError(str(path), "is neither a capture nor a photograph", remedy)
+        places = list(path.parents)[:_ABOVE]
+    failures: list[UsageError] = []
+    for place in places:
+        try:
+            found = json.loads(engine_link.output_of(["inspect", str(place), "--json", "--axes", axes]))
+        except UsageError as error:
+            failures.append(error)
+            continue
+        if found.get("kind") == "capture":
+            return place, found
+        problem = f"is no capture, but {found.get('format', found.get('kind'))}"
+        failures.append(UsageError(str(place), problem, "Choose the folder of the photographs"))
+    raise failures[0]
+
+
+def _collection(context: bpy.types.Context, folder: Path) -> bpy.types.Collection:
+    """The collection for the cameras of the capture in `folder`, in the scene."""
+    for known in context.scene.collection.children_recursive:
+        if known.get(_CAPTURE) == str(folder):
+            return known
+    made = bpy.data.collections.new(f"Cameras of {folder.name}")
+    made[_CAPTURE] = str(folder)
+    context.scene.collection.children.link(made)
+    return made
+
+
+def _camera(camera: dict[str, Any], size: float, known: bpy.types.Object | None) -> bpy.types.Object:
+    """The object of a camera: `known`, renewed, or a new one, in no collection yet."""
+    obj = known or bpy.data.objects.new(camera["name"], bpy.data.cameras.new(camera["name"]))
+    obj[_PHOTOGRAPH] = camera["image"]
+    data = obj.data
     width, height = camera["width"], camera["height"]
     data.sensor_fit, data.sensor_width = "HORIZONTAL", _SENSOR
     data.lens = camera["fx"] / width * _SENSOR
     data.shift_x, data.shift_y = (width / 2 - camera["cx"]) / width, (camera["cy"] - height / 2) / width
     data.display_size = max(size, 1e-3)
-    obj = bpy.data.objects.new(camera["name"], data)
     obj.matrix_world = Matrix(camera["matrix_world"])
     return obj
 

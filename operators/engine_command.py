@@ -29,7 +29,7 @@ class CommandOperator(DrgsOperator):
     _process: subprocess.Popen[bytes] | None = None
     _log: Path | None = None
     _timer: bpy.types.Timer | None = None
-    _subject, _failure, _program = "", "", ""
+    _subject, _failure, _program, _python = "", "", "", ""
     _expected = output_check.ExpectedFiles()
     _folder: Path | None = None
 
@@ -137,6 +137,7 @@ class CommandOperator(DrgsOperator):
 
     def _spawn(self, arguments: list[str]) -> None:
         command = engine_link.drgs_command()
+        self._python = command[0]
         self._program = f"drgs {arguments[0]} of {command[0]}"
         handle, name = tempfile.mkstemp(prefix="drgs-", suffix=".log")
         self._log = Path(name)
@@ -183,6 +184,7 @@ class CommandOperator(DrgsOperator):
         lines = [line for line in self._read_output(last=True).strip().splitlines() if not line.startswith("DRGS_")]
         try:
             if self.process.returncode:
+                engine_link.check_installed(self._python, lines[-1] if lines else "")
                 errors = [line for line in lines if line.startswith("drgs: ")] or lines
                 reason = errors[-1].removeprefix("drgs: ") if errors else f"exit code {self.process.returncode}"
                 raise AssetError(self._subject, f"{self._failure}: {reason.rstrip('.')}", "")

@@ -8,7 +8,7 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..drgs_blender.core.errors import UsageError
-from ..drgs_blender.core.file_types import WRITTEN
+from ..drgs_blender.core.file_types import READ, WRITTEN
 from ..drgs_blender.core.frame_sequences import frame_path
 from .import_parts import UP_ITEMS
 from .scene_frames import NUMBER, SceneFrames, draw_colour
@@ -17,8 +17,9 @@ _HELD = {"splats": "Splats", "mesh": "Mesh with materials", "environment": "The 
 # Blender evaluates annotations apart from this module: no loops in them.
 _FORMATS = tuple((name, f"{name} ({t.extensions[0]})", _HELD[t.kind]) for name, t in WRITTEN.items())
 _ENDINGS = tuple(dict.fromkeys(e for t in WRITTEN.values() for e in t.extensions))
-#: Endings of what other programs export. Others may be parts of a name.
-_FOREIGN = (".abc", ".blend", ".dae", ".drgs", ".fbx", ".stl", ".vdb", ".x3d")
+#: Endings of what other programs export, or of what is only read. Others may be parts of a name.
+_FOREIGN = {".abc", ".blend", ".bvh", ".drgs", ".fbx", ".mdd", ".pc2", ".svg", ".vdb", ".wrl", ".x3d"}
+_FOREIGN |= {e for t in READ.values() for e in t.extensions if e not in _ENDINGS}
 _GLOB = ";".join(f"*{e}" for e in _ENDINGS)
 
 
@@ -65,10 +66,10 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def check(self, context: bpy.types.Context) -> bool:
-        """Give the file the ending of the format; whether that changed anything."""
+        """Give the file the ending of the format; whether that changed anything. Foreign ones stay, to be refused."""
         path = Path(self.filepath)
         own = WRITTEN[self.format].extensions
-        if path.suffix.lower() in own or not path.name:
+        if path.suffix.lower() in (*own, *_FOREIGN) or not path.name:
             return False
         self.filepath = str(path.with_suffix(own[0]) if path.suffix.lower() in _ENDINGS else f"{path}{own[0]}")
         return True

@@ -78,6 +78,7 @@ class SimulateProcess:
         self._inputs, self._folder = inputs, folder
         self._stdout, self._log = inputs / scene_export.STDOUT, inputs / scene_export.LOG
         command = engine_link.drgs_command()
+        self._python = command[0]
         self.name = f"drgs simulate of {command[0]}"
         arguments = [inputs / scene_export.BODY, "--settings", inputs / scene_export.SETTINGS, "--out", folder]
         arguments += ["--overwrite", "--threads", str(threads), "--device", device]
@@ -141,7 +142,7 @@ class SimulateProcess:
 
         Raises
         ------
-        AssetError, WriteError, EngineError
+        AssetError, WriteError, EngineError, DeviceError
             It could not do its work.
         """
         lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
@@ -156,6 +157,7 @@ class SimulateProcess:
             remedy = "Free some space or choose another folder, and bake again"
             raise WriteError(f"{subject}, {self._folder}", "cannot be written", f"{remedy}. {held}".rstrip(". "))
         last = lines[-1][:300] if lines else "it printed nothing"
+        engine_link.check_installed(self._python, last)
         remedy = "Bake again: it goes on" + (f". {held}" if held else "")
         raise EngineError(subject, f"the engine's program ended ({code}): {last.rstrip('.')}", remedy)
 

@@ -134,6 +134,7 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
             passes = engine_link.render(frame, self._progress, self._stopped)
         for text in passes.warnings:
             warn(text)
+        messages.end_picture()
         if report is None:
             for text in warn.texts:
                 self._warn(text)

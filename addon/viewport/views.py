@@ -152,6 +152,10 @@ def _upload(viewport: ViewportState, picture: Picture) -> None:
         if text not in viewport.warned:
             viewport.warned.add(text)
             messages.note("WARNING", text)
+    if picture.fraction > 0.0:  # a coarse one shows less, and has less to say
+        for text in viewport.warned.difference(picture.passes.warnings):
+            viewport.warned.discard(text)
+            messages.withdraw("WARNING", text)
 
 
 def rows_of_strip(height: int, width: int) -> int:

@@ -80,8 +80,24 @@ def make_asset(
     surfels, binding, report["surfels"] = attach(
         mesh, pretrained, density=density, detail=detail if detail.any else None, most=max_surfels
     )
+    left = report["surfels"].get("hidden_pieces", 0)
+    if left and len(surfels) >= max_surfels:
+        report["surfels"]["notes"] = [_surfel_note(len(surfels), left, max_surfels, density)]
     provenance = {"mesh": plain_name(name), "made": "surfels attached to the mesh", "report": report}
     return Asset(surfels, mesh, binding, read_environment_of(environment), provenance)
+
+
+def _surfel_note(count: int, left: int, most: int, density: float) -> str:
+    """Why `left` surfels of `count` show less than is known of the surface; -1: none was made smaller for it."""
+    if left < 0:
+        return (
+            f"no surfels are made smaller for textures and normal maps: --density {density:g} alone makes {count} of "
+            f"them, --max-surfels is {most}. For more detail give more than {count}, or a smaller --density"
+        )
+    return (
+        f"{left} of {count} surfels are coarser than the textures and normal maps: --max-surfels {most} is reached. "
+        "For more detail give more"
+    )
 
 
 def scale_mesh(mesh: Mesh, scale: float, name: str) -> None:
@@ -162,6 +178,11 @@ def detailed_mesh(
     count = file.file_count or len(file.vertices)
     origin = _source(net, file.vertex_numbers[source], file.vertex_numbers[corners], count)
     divided = len(net.faces) > faces
+    if divided:
+        report["notes"].append(
+            f"the mesh is divided where its textures need more vertices: {faces} triangles became {len(net.faces)}, of "
+            f"at most {max_triangles} (--max-triangles of drgs make and drgs import; {faces} keeps the file's)"
+        )
     if alpha is not None:
         kept = max_texture > 0 and file.corner_uvs is not None
         pictured = np.array([kept and has_opacity_image(m) for m in file.materials] + [False])

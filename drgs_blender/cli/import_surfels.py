@@ -60,7 +60,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--resolution", type=int_range(8, 1024), metavar="N", help="voxels along the longest side of a built mesh"
     )
     parser.add_argument(
-        "--max-triangles", type=int_range(1, 10**8), metavar="N", help="budget for the texture detail of a mesh"
+        "--max-triangles",
+        type=int_range(1, 10**8),
+        metavar="N",
+        help="most triangles when a mesh is divided where its textures need more vertices; default 300000",
     )
 
 

@@ -9,6 +9,8 @@ import argparse
 import dataclasses
 import json
 import math
+import re
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -30,6 +32,8 @@ _ZIP = b"PK\x03\x04"
 _EXR = b"\x76\x2f\x31\x01"
 #: Items of a list that a person is shown, and values within values, without --all.
 _FEW, _FEW_WITHIN = 16, 2
+#: Lines that a person is shown without --all, lines of a part that is put into running text, and its letters in a line.
+_MOST_LINES, _FEW_LINES, _WIDTH = 30, 3, 120
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,7 +48,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the description."""
     report = {"file": str(args.file), **inspect_file(args.file, args.axes, args.up)}
-    print(json.dumps(report, indent=2, allow_nan=False) if args.json else "\n".join(as_lines(report, whole=args.whole)))
+    if args.json:
+        print(json.dumps(report, indent=2, allow_nan=False))
+    else:
+        print("\n".join(as_lines(report) if args.whole else short_lines(report)))
     return 0
 
 
@@ -198,6 +205,28 @@ def as_lines(value: Any, depth: int = 0, whole: bool = True) -> Iterator[str]:
             yield f"{pad}{key}: {', '.join(format_value(part) for part in item[:_FEW]) or 'none'}{more}"
         else:
             yield f"{pad}{key}: {format_value(item)}" if named else f"{pad}- {format_value(item)}"
+
+
+def short_lines(report: dict[str, Any]) -> list[str]:
+    """At most `_MOST_LINES` lines of a description: where it has more, the longest parts are told in a few."""
+    blocks = {key: list(as_lines({key: item}, whole=False)) for key, item in report.items()}
+    for key in sorted(blocks, key=lambda name: -len(blocks[name])):
+        if sum(map(len, blocks.values())) > _MOST_LINES and len(blocks[key]) > 1:
+            blocks[key] = _condensed(key, report[key], blocks[key])
+    lines = [line for block in blocks.values() for line in block]
+    if len(lines) <= _MOST_LINES:
+        return lines
+    return [*lines[: _MOST_LINES - 1], f"... {len(lines) - _MOST_LINES + 1} more lines, see --all"]
+
+
+def _condensed(key: str, item: Any, block: list[str]) -> list[str]:
+    """The lines of one part as running text; one line that counts it where that is long, too."""
+    running = "; ".join(re.sub(r"^\s*(- |\d+: )?", "", line) for line in block[1:]).replace(":; ", ": ")
+    lines = textwrap.wrap(f"{key}: {running}", _WIDTH, subsequent_indent="  ", break_on_hyphens=False)
+    if len(lines) <= _FEW_LINES and len(lines) < len(block):
+        return lines
+    names = f" ({', '.join(map(str, item))})" if isinstance(item, dict) else ""
+    return [textwrap.shorten(f"{key}: {len(item)}{names}", _WIDTH, placeholder=" ...)") + ", see --all"]
 
 
 def count_values(value: Any) -> int:

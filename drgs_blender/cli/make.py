@@ -44,13 +44,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-triangles",
         type=int_range(1, 10**8),
         metavar="N",
-        help="budget when the mesh is divided for texture detail",
+        help="most triangles when the mesh is divided where its textures need more vertices; default 150000. As many "
+        "as the file has keep its mesh",
     )
     parser.add_argument(
         "--max-surfels",
         type=int_range(1, 10**7),
         metavar="N",
-        help="budget when faces get smaller surfels for textures and normal maps; default 400000",
+        help="most surfels when faces get smaller ones for textures and normal maps; default 400000. As many as "
+        "--density needs are made in any case",
     )
     parser.add_argument(
         "--textures",
@@ -65,7 +67,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="largest side in pixels of the images kept, larger ones are reduced; default 4096",
     )
     parser.add_argument(
-        "--density", type=int_range(1, 100_000), metavar="D", help="surfels along the mesh's diagonal, at least"
+        "--density",
+        type=int_range(1, 100_000),
+        metavar="D",
+        help="surfels along the mesh's diagonal, at least; default 140",
     )
 
 

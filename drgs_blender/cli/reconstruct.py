@@ -189,6 +189,8 @@ def run(args: argparse.Namespace) -> int:
     write_and_report(args.out, asset)
     clear(work)
     report = asset.provenance["report"]
+    steps = ", ".join(f"{phase} {done} of {of}" for phase, (done, of) in report["steps"].items())
+    print(f"  steps: {steps}")
     if "psnr" in report:
         # Not what `drgs evaluate` says, which renders the asset under the light that was found.
         print(f"  colours as photographed, views left out: PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.4f}")

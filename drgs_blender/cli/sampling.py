@@ -68,7 +68,8 @@ def add_arguments(
     add(
         "--subpixel-samples",
         "subpixel_samples",
-        "anti-aliasing positions per pixel, which share its samples; 0: chosen by the number of samples",
+        "anti-aliasing positions per pixel, which share its samples; 0: chosen by the number of samples, "
+        "more where the camera sees meshes alone",
         type=int_range(0, 1024),
     )
     add(

@@ -381,7 +381,7 @@ class RenderSettings:
         Indirect bounces.
     subpixel_samples : int
         Sub-pixel samples: anti-aliasing positions per pixel, which share its samples; 0 chooses by their number
-        (`subpixel_count`).
+        (`subpixel_count`), in a session as of "mesh" where the camera sees no surfels anyway.
     camera_sees, rays_see : {"surfels", "mesh"}
         Representation of DR-GS objects for camera rays, and for shadow and indirect rays: their meshes, or the
         surfels, blended along each ray (slower; for thin things without a good mesh).

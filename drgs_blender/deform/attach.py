@@ -105,8 +105,8 @@ def attach(
     binding : Binding
     report : dict
         "surfels", "faces", "cut_faces", "degenerate_faces" (they get no surfel); with `detail` "hidden_pieces" (which
-        show less than it knows, for want of surfels; -1: `density` alone asks for more than `most`) and "notes" where
-        `most` is the reason; with `pretrained` also "pretrained",
+        show less than it knows, for want of surfels; -1: `density` alone asks for more than `most`); with `pretrained`
+        also "pretrained",
         "interior", "on_edges" (projected to an edge or vertex and not used), "faces_with_pretrained",
         "faces_from_neighbours", "faces_unseen".
     """
@@ -125,11 +125,6 @@ def attach(
         if detail is not None:
             patches, left = cut_for_detail(patches, faces, detail, most, FINEST * diagonal)
             report["hidden_pieces"] = left
-            if left and len(patches.face) >= most:
-                coarse = f"{left} surfels are coarser than the textures"
-                if left < 0:
-                    coarse = f"{len(patches.face)} surfels, which the density asks for, are not cut for textures"
-                report["notes"] = [f"{coarse}: the budget is {most} surfels"]
     n = len(patches.face)
     report["surfels"] = n
     report["cut_faces"] = int((np.bincount(patches.face) > 1).sum())

@@ -97,14 +97,14 @@ class View:
         self.pixel = self._pace.size((x1 - x0) * (y1 - y0))
         return self._coarse(prepared, draw, self.pixel)
 
-    def advance(self, prepared: PreparedScene, draw: Draw, cancelled: IsCancelled | None) -> Passes:
-        """The next picture: finer pixels, then more samples."""
+    def advance(self, seen: Frame, prepared: PreparedScene, draw: Draw, cancelled: IsCancelled | None) -> Passes:
+        """The next picture: finer pixels, then more samples of the frame as it is `seen`."""
         if self._picture is None and self.pixel > 4:
             passes = self._coarse(prepared, draw, self.pixel // 4)
             self.pixel //= 4
             return passes
         if self._picture is None:
-            picture, seconds = Progressive(self.frame, self.backend), 0.0
+            picture, seconds = Progressive(seen, self.backend), 0.0
         else:
             picture, seconds = self._picture, STEP_SECONDS
         pictures = picture.advance(prepared, seconds, cancelled)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +17,7 @@ from ..core.errors import AssetError, UsageError
 from ..core.frame import Frame, MeshState, MotionStep, ObjectState, RenderSettings, World
 from ..core.materials import Image
 from ..core.memory import give_back
+from ..core.passes import COLOURS
 from ..deform.gpu.mesh_driven import Deformer
 from ..deform.mesh_driven import MeshDriven
 from ..ipc.change_detection import reuse_equal
@@ -42,6 +43,8 @@ Array = np.ndarray
 
 #: Surfels a vertex up to which a mesh is taken for as detailed as a coarse picture.
 _SURFELS_A_VERTEX = 16
+#: Passes that are black without light.
+_LIT = frozenset({"Combined", *COLOURS})
 
 
 class SceneCache:
@@ -142,7 +145,7 @@ class SceneCache:
         """Jobs of `compute.manifest` that a frame needs for what its assets are."""
         known = [self._assets.get(state.asset) for state in frame.objects]
         given = [loaded.asset for loaded in known if loaded is not None]
-        return ("lights",) if len(given) == len(known) and may_need(frame, given) else ()
+        return ("lights", "mesh") if len(given) == len(known) and may_need(frame, given) else ()
 
     def snapshot(self, frame: Frame) -> Frame:
         """Copy of a frame that is safe from later changes of its arrays; those of the scene are copies already."""
@@ -219,6 +222,12 @@ class SceneCache:
         lit = [item.posed for item in visible if item.posed is not None]
         return self._joined(lit, backend)
 
+    def as_seen(self, frame: Frame) -> Frame:
+        """The frame that was posed last, as it is drawn: as of meshes where the camera sees nothing else."""
+        if any(item.state.visibility.camera and not item.seen_by_mesh for item in self.objects):
+            return frame
+        return replace(frame, settings=replace(frame.settings, camera_sees="mesh"))
+
     def _poser(self, backend: RenderBackend) -> Callable[..., PosedSurfels]:
         """Who poses surfels: `MeshDriven.pose`, or a device as long as it can."""
         launcher = backend.launcher
@@ -278,8 +287,8 @@ class SceneCache:
         vertices, instances = self.scene.at(moved, [*step.meshes, *[None] * others])
         return SceneState(vertices, instances, camera_parameters(step.camera, frame.settings, frame.noise_index))
 
-    def warnings(self) -> list[str]:
-        """Warnings about the meshes of the last frame."""
+    def warnings(self, passes: Collection[str] = ()) -> list[str]:
+        """Warnings about meshes and light of the last frame, of which `passes` were made."""
         found = []
         if not self.objects and not self.meshes:
             found.append("the frame has no DR-GS object; the picture shows the world alone")
@@ -307,6 +316,11 @@ class SceneCache:
         found += self._captured_faults
         found += self.scene.mesh_materials.warnings
         found += self.lights.warnings
+        if not _LIT.isdisjoint(passes) and self._is_unlit():
+            found.append(
+                "nothing lights the scene: it has no lamp that shines, its World is black and no material emits light. "
+                "Add a lamp, or give the World a colour or an environment image that is not black"
+            )
         bad = sum(light.bad_texels for light in (self.environment, self.background) if light is not None)
         if bad:
             found.append(
@@ -315,6 +329,15 @@ class SceneCache:
                 "give no light; where that shows, repair the image"
             )
         return found
+
+    def _is_unlit(self) -> bool:
+        """Whether the camera sees something to which nothing gives light."""
+        assert self.environment is not None
+        lit = not self.environment.black or self.lights.count or self.scene.emissive_meshes
+        if lit or self.captured or self.emission is not None:
+            return False
+        seen = [*(item.state.visibility for item in self.objects), *(mesh.visibility for mesh in self.meshes)]
+        return any(own.camera and not own.holdout for own in seen)
 
     def _name(self, index: int) -> str:
         """Of an object as the trace scene numbers them."""

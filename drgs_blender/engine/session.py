@@ -155,7 +155,6 @@ class Session:
         >>> passes["Depth"][4, 4].round(3)
         array([2.], dtype=float32)
         """
-        frame = _as_drawn(frame)
         self._compile(frame, (), progress, cancelled)
         timer, backend = _StageTimer(cancelled), self._backends.select(frame.settings.device)
         prepared = self._prepare(frame, timer, progress, backend)
@@ -205,7 +204,6 @@ class Session:
         AssetError, UsageError, Cancelled
             As `render`.
         """
-        frame = _as_drawn(frame)
         self._views.pop(name, None)
         self._compile(frame, ("viewport",), progress, cancelled)
         timer, backend = _StageTimer(cancelled), self._backends.select(frame.settings.device)
@@ -239,9 +237,8 @@ class Session:
         timer = _StageTimer(cancelled)
         backend = view.backend
         prepared = self._prepare(view.frame, timer, progress, backend)  # other views may have changed the scene
-        passes = view.advance(
-            prepared, lambda frame, prepared, report: self._draw(frame, prepared, report, cancelled, backend), cancelled
-        )
+        draw = lambda frame, prepared, report: self._draw(frame, prepared, report, cancelled, backend)  # noqa: E731
+        passes = view.advance(self._scene_cache.as_seen(view.frame), prepared, draw, cancelled)
         timer("render")
         return self._with_statistics(view, passes, prepared, timer)
 
@@ -260,6 +257,7 @@ class Session:
         backend: RenderBackend,
     ) -> Passes:
         """The frame's picture as a whole, part of a sequence where it names one."""
+        frame = self._scene_cache.as_seen(frame)
         sequence, statistics = None, {}
         if frame.history and frame.settings.denoise == "svgf":
             self._lights = reuse_equal(frame.lights, self._lights)
@@ -309,20 +307,8 @@ class Session:
         lights = self._scene_cache.lights
         linked = lights.linked is not None or lights.grouped is not None
         device = self._backends.warnings(settings, linked, needs_paths(self._scene_cache.scene, settings))
-        found = self._scene_cache.warnings() + device + self._darkness(frame)
+        found = self._scene_cache.warnings(frame.passes) + device
         return found + _ignored_lobes(settings, self._scene_cache.meshes) + ([trouble] if trouble else [])
-
-    def _darkness(self, frame: Frame) -> list[str]:
-        """What to do where nothing lights what needs light."""
-        cache = self._scene_cache
-        needy = bool(frame.meshes) or any(item.captured is None for item in cache.objects)
-        shines = cache.lights.count or cache.scene.mesh_materials.table.emissive or cache.emission is not None
-        if not needy or shines or cache.environment is None or cache.environment.texels[..., :3].any():
-            return []
-        return [
-            "nothing lights the scene: its environment is black, there is no lamp that shines, and no surface emits "
-            "light. Give the world a colour or a picture, or add a light"
-        ]
 
     def _statistics(self, frame: Frame, prepared: PreparedScene, timer: _StageTimer) -> dict[str, float]:
         return timer.seconds | {
@@ -333,17 +319,10 @@ class Session:
         }
 
 
-def _as_drawn(frame: Frame) -> Frame:
-    """The frame; as one of meshes where no object has surfels to show, for as many sub-pixel samples as edges need."""
-    if frame.objects or frame.settings.camera_sees != "surfels":
-        return frame
-    return replace(frame, settings=replace(frame.settings, camera_sees="mesh"))
-
-
 def jobs_of(frame: Frame) -> list[str]:
     """Jobs of `compute.manifest` whose kernels a frame needs, in the order of the stages."""
     settings, jobs = frame.settings, ["frame"]
-    if settings.camera_sees == "mesh":
+    if settings.camera_sees == "mesh" or not any(state.visibility.camera for state in frame.objects):
         jobs.append("mesh")
     if any(state.captured_colours for state in frame.objects):
         jobs += ["captured", "lights"]

@@ -12,7 +12,7 @@ from .child_process import Child
 from .watchdog import EngineLost, Watchdog
 
 _POLL = 0.04
-_REMEDY = "Install the engine in the environment named in the preferences, or correct the path"
+_REMEDY = "Install DR-GS in that environment, or name another in the preferences or in DRGS_ENGINE"
 
 
 def greet(child: Child, program: str, watchdog: Watchdog, stopped: Callable[[], bool]) -> None:

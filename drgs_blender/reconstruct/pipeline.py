@@ -109,7 +109,8 @@ def reconstruct(
     Returns
     -------
     Asset
-        In the capture's world space. ``provenance["report"]`` holds counts, "psnr" and "ssim" of the views left out;
+        In the capture's world space. ``provenance["report"]`` holds counts, "psnr" and "ssim" of the views left out,
+        "steps" (of each phase those done, and those of its schedule, fewer where ``minutes`` end it);
         ``provenance["learned_from"]`` the names of the others, ``provenance["settings"]`` all settings.
 
     Raises
@@ -135,7 +136,7 @@ def reconstruct(
     )
     free = work.learn("surfels", training, 0.0, 0.5)
     work.on_progress(Progress("mesh", 0.5, len(free)))
-    report: dict[str, Any] = {"views": len(capture.training), "left_out": len(capture.testing)}
+    report: dict[str, Any] = {"views": len(capture.training), "left_out": len(capture.testing), "steps": work.steps}
     mesh, report["mesh"] = mesh_of(free, capture, region, settings.mesh_resolution)
     final: Gaussians = free
     binding: Binding | None = None
@@ -167,6 +168,9 @@ def reconstruct(
             binding = shaded_by(binding, mesh, found.normals)
         _copy_materials(surfels, mesh, binding)
         environment, origin = Environment(found.environment), "separated from the lighting"
+        done, of = report["steps"]["materials"]
+        if done < min(FEW_STEPS, of):
+            origin = f"hardly separated from the lighting, in {done} of {of} steps: unreliable"
     learned = [view.name for view in capture.training]
     provenance: dict[str, Any] = {"capture": capture.name, "learned_from": learned, "variant": settings.variant}
     provenance |= {"materials": origin, "settings": as_tables(settings), "report": report}
@@ -195,6 +199,8 @@ class _Work:
     ) -> None:
         self.capture, self.settings, self.folder = capture, settings, folder
         self.on_progress, self.cancelled = on_progress, cancelled
+        #: Phase -> steps done, and those of its schedule.
+        self.steps: dict[str, list[int]] = {}
         self.backend = select_backend(settings.device)
         if folder is not None:
             try:
@@ -247,6 +253,7 @@ class _Work:
                     Progress(phase, begin + (end - begin) * reached, len(training.gaussians), training.psnr, picture)
                 )
                 reported, shown = now, now if draw else shown
+        self.steps[phase] = [training.iteration, training.schedule.iterations]
         return training.attempt(lambda: training.gaussians.on(CPU))
 
 
@@ -286,15 +293,15 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: 
         shown if thin else None,
         start,
     )
-    done, of = found.report["iterations"], work.settings.decoupling.iterations
+    done, of = work.steps["materials"] = [found.report["iterations"], work.settings.decoupling.iterations]
     if done < min(FEW_STEPS, of):
         minutes = work.settings.minutes
-        limit, unit = f"{settings.seconds:g} seconds", "seconds"
+        limit, option = f"{settings.seconds:g} seconds", "a larger --set decoupling.seconds=S"
         if minutes is not None:
-            limit, unit = f"part of {minutes:g} minutes", "minutes"
+            limit, option = f"part of {minutes:g} minutes", "more minutes, --time-budget M"
         log.warning(
-            "materials got %d of %d steps in their %s, too few to separate them from the light: give more %s, or "
-            "photographs of a lower resolution", done, of, limit, unit,
+            "materials got %d of %d steps in their %s, too few to separate them from the light: they are unreliable. "
+            "Give %s, or a lower --resolution", done, of, limit, option,
         )  # fmt: skip
     # Without the clock: the same run gives the same bytes.
     report["decoupling"] = {key: value for key, value in found.report.items() if key != "seconds"}

@@ -40,23 +40,115 @@ def capture(tmp_path):
     return folder, frames
 
 
-def test_a_file_beside_the_photographs_stands_for_their_folder(scene, capture):
+def test_a_file_of_the_capture_stands_for_its_folder(scene, capture):
     folder, _ = capture
-    for name in ("transforms.json", "cover.jpg"):
+    (folder / "sparse" / "0").mkdir(parents=True)
+    for name in ("transforms.json", "cover.jpg", "images/photo_0.png", "sparse/0/cameras.bin"):
         (folder / name).touch()
-        assert bpy.ops.drgs.import_cameras(filepath=str(folder / name)) == {"FINISHED"}
-    with pytest.raises(RuntimeError, match="images: is no capture"):
-        bpy.ops.drgs.import_cameras(filepath=str(folder / "images" / "photo_0.png"))
+        bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+        assert bpy.ops.drgs.import_cameras(filepath=str(folder / name)) == {"FINISHED"}, name
+        assert len(bpy.data.collections["Cameras of statue"].objects) == 5, name
 
 
-@pytest.mark.skipif(os.name == "nt", reason="a shell script stands for a Python without DR-GS")
-def test_a_python_without_the_engine_is_named(scene, capture, tmp_path, monkeypatch):
-    bare = tmp_path / "python"
+def test_poses_of_llff_stand_for_their_folder(scene, tmp_path):
+    folder = tmp_path / "fern"
+    (folder / "images").mkdir(parents=True)
+    rows = []
+    for k in range(4):
+        image = bpy.data.images.new(f"{k}", 40, 30)
+        image.filepath_raw, image.file_format = str(folder / "images" / f"{k}.png"), "PNG"
+        image.save()
+        pose = np.column_stack([[0, -1, 0], [1, 0, 0], [0, 0, 1], [0.3 * k, 0.1 * k * k, 4], [30, 40, 50]])
+        rows.append([*pose.ravel(), 1.0, 10.0])
+    np.save(folder / "poses_bounds.npy", np.array(rows, float))
+    assert bpy.ops.drgs.import_cameras(filepath=str(folder / "poses_bounds.npy")) == {"FINISHED"}
+    assert len(bpy.data.collections["Cameras of fern"].objects) == 4
+
+
+@pytest.mark.parametrize("name", ["statue.drgs", "walk.mp4", "mesh.obj"])
+def test_files_of_other_kinds_are_refused(scene, capture, name):
+    (capture[0] / name).write_bytes(b"v 0 0 0")
+    with pytest.raises(RuntimeError, match=f"{name}: is neither a capture nor a photograph. Choose the folder"):
+        bpy.ops.drgs.import_cameras(filepath=str(capture[0] / name))
+    assert not bpy.data.collections
+
+
+def test_a_photograph_without_a_capture_is_refused(scene, tmp_path):
+    (tmp_path / "alone" / "deep" / "deeper").mkdir(parents=True)
+    photo = tmp_path / "alone" / "deep" / "deeper" / "photo.png"
+    photo.touch()
+    with pytest.raises(RuntimeError, match="deeper: is no capture"):
+        bpy.ops.drgs.import_cameras(filepath=str(photo))
+
+
+def test_cameras_that_are_imported_again_are_renewed(scene, capture):
+    """The same objects, as the capture now has them; nothing is there twice, what holds them keeps them."""
+    folder, _ = capture
+    bpy.ops.drgs.import_cameras(filepath=str(folder))
+    group = bpy.data.collections["Cameras of statue"]
+    before = {obj.name: obj for obj in group.objects}
+    text = json.loads((folder / "transforms.json").read_text())
+    text["frames"][2]["transform_matrix"][0][3] += 1.0
+    text["frames"][2]["fl_x"] *= 2
+    del text["frames"][4]
+    (folder / "transforms.json").write_text(json.dumps(text))
+    place, lens = before["photo_2"].matrix_world[0][3], before["photo_2"].data.lens
+    assert bpy.ops.drgs.import_cameras(filepath=str(folder / "transforms.json")) == {"FINISHED"}
+    assert len(bpy.data.collections) == 1 and {obj.name: obj for obj in group.objects} == before
+    assert len(bpy.data.cameras) == 6, "five and the scene's own"
+    assert before["photo_2"].matrix_world[0][3] == pytest.approx(place + 1.0)
+    assert before["photo_2"].data.lens == pytest.approx(2 * lens)
+    assert all(len(obj.data.background_images) == 1 for obj in group.objects)
+    said = [message.text for message in part("addon.messages").history]
+    assert any("4 of its cameras were there already and are renewed, 0 are new" in text for text in said)
+    bpy.data.objects.remove(before["photo_1"])
+    bpy.ops.drgs.import_cameras(filepath=str(folder))
+    assert len(group.objects) == 5 and len(bpy.data.collections) == 1
+
+
+@pytest.fixture
+def bare_python(tmp_path, monkeypatch):
+    """Path of a Python without DR-GS, which DRGS_ENGINE names."""
+    if os.name == "nt":
+        pytest.skip("a shell script stands for a Python without DR-GS")
+    bare = tmp_path / "bare" / "python"
+    bare.parent.mkdir()
     bare.write_text(f'#!/bin/sh\nexec "{sys.executable}" -I -S "$@"\n')
     bare.chmod(0o755)
     monkeypatch.setenv("DRGS_ENGINE", str(bare))
-    with pytest.raises(RuntimeError, match=r"python cannot run it \(ModuleNotFoundError.*Set Up Engine"):
+    part("addon.engine_link").stop()
+    return bare
+
+
+def test_a_python_without_the_engine_is_named(scene, capture, ball, bare_python):
+    """By every operator that needs it: which Python, who named it, what is missing, what to do."""
+    told = r"bare/python \(named in DRGS_ENGINE\): DR-GS is not installed in it \(No module named .*Set Up Engine"
+    with pytest.raises(RuntimeError, match=told):
         bpy.ops.drgs.import_cameras(filepath=str(capture[0]))
+    cube = bpy.data.meshes.new("cube")
+    cube.from_pydata([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [], [(0, 1, 2)])
+    obj = bpy.data.objects.new("cube", cube)
+    scene.collection.objects.link(obj)
+    bpy.context.view_layer.objects.active = obj
+    with pytest.raises(RuntimeError, match=told):
+        bpy.ops.drgs.convert(out=str(bare_python.parent / "cube.drgs"))
+    with pytest.raises(RuntimeError, match=r"bare/python: did not start as an engine.*No module named.*DRGS_ENGINE"):
+        bpy.ops.drgs.engine_test()
+    submit = part("addon.submit")
+    scene.drgs.submit.folder = str(bare_python.parent)
+    job = submit.start(scene)
+    assert "DR-GS is not installed in it" in job.error and "DRGS_ENGINE" in job.error
+
+
+def test_packages_that_the_engine_lacks_are_named(monkeypatch):
+    link = part("addon.engine_link")
+    monkeypatch.setenv("DRGS_ENGINE", "/x/python")
+    with pytest.raises(
+        part("drgs_blender.core.errors").DeviceError, match="numba, which DR-GS needs, is not installed"
+    ):
+        link.check_installed("/x/python", "ModuleNotFoundError: No module named 'numba'")
+    link.check_installed("/x/python", "drgs: torch: is not installed (No module named 'torch'). pip install torch")
+    link.check_installed("/x/python", "ValueError: what else goes wrong")
 
 
 def test_cameras_see_what_the_photographs_show(scene, capture):

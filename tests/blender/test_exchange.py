@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -203,6 +204,17 @@ def test_stl_that_blender_writes_becomes_an_object(scene, tmp_path, text):
     assert len(points) == len(wanted)  # the corners of triangles are joined again
     apart = np.abs(points[:, None] - wanted[None]).max(axis=2)
     assert apart.min(axis=1).max() < 1e-5 and apart.min(axis=0).max() < 1e-5
+
+
+@pytest.mark.parametrize("name", ["a.abc", "a.OBJ", "a.gltf", "a.hdr"])
+def test_the_file_browser_keeps_a_foreign_ending_to_be_refused(scene, tmp_path, name):
+    """It was made "a.abc.ply", and written without a word. Endings that are part of a name get that of the format."""
+    export, stand_in = part("operators.export").DRGS_OT_export, SimpleNamespace(filepath=name, format="3DGS PLY")
+    assert not export.check(stand_in, bpy.context) and stand_in.filepath == name
+    stand_in.filepath = "chair.v2"
+    assert export.check(stand_in, bpy.context) and stand_in.filepath == "chair.v2.ply"
+    with pytest.raises(RuntimeError, match=r"cannot be written; understood: \.ply \.spz"):
+        bpy.ops.drgs.export(filepath=str(tmp_path / name))
 
 
 def test_endings_of_other_formats_are_refused_or_told(ball, scene, tmp_path):

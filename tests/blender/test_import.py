@@ -185,6 +185,12 @@ def test_surfels_become_an_asset_and_an_object(scene, tmp_path):
     assert (tmp_path / "toy.drgs").read_bytes() == before
 
 
+def test_a_mesh_is_not_taken_for_a_damaged_asset(scene, tmp_path):
+    (tmp_path / "chair.glb").write_bytes(b"glTF" + bytes(60))
+    with pytest.raises(RuntimeError, match=r"chair\.glb: is no \.drgs file but a mesh.*drgs make.*Object > Convert"):
+        bpy.ops.import_scene.drgs(filepath=str(tmp_path / "chair.glb"))
+
+
 @pytest.mark.slow
 def test_a_file_that_is_imported_again_is_another_object(scene, tmp_path):
     """What the first is made of stays, and what another .blend may be made of."""

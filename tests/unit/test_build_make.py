@@ -66,6 +66,20 @@ def test_images_without_coordinates_are_named():
     assert not mesh_with_materials(file, "plane")[1]["notes"]
 
 
+def test_a_mesh_that_is_divided_says_so():
+    """With both numbers and the option, by which the file's own mesh can be kept."""
+    squares = np.indices((64, 64)).sum(axis=0) // 4 % 2
+    image = Image(np.repeat(squares[..., None], 3, axis=2).astype(np.float32), srgb=False)
+    file = plane(8, image)
+    faces = len(file.faces)
+    mesh, report = mesh_with_materials(file, "plane", max_triangles=500)
+    (note,) = report["notes"]
+    assert faces < len(mesh.faces) <= 500
+    assert f"{faces} triangles became {len(mesh.faces)}, of at most 500 (--max-triangles" in note
+    kept, report = mesh_with_materials(file, "plane", max_triangles=faces)
+    assert len(kept.faces) == faces and not report["notes"]
+
+
 def test_srgb_images_are_decoded_and_factors_multiply():
     image = Image(np.full((4, 4, 3), 188, np.uint8), srgb=True)
     file = plane(1, image)

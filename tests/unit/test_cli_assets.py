@@ -13,7 +13,7 @@ from PIL import Image
 
 from drgs_blender.cli import doctor
 from drgs_blender.cli.find_blender import find_blender
-from drgs_blender.cli.inspect_file import as_lines
+from drgs_blender.cli.inspect_file import as_lines, short_lines
 from drgs_blender.cli.main import main
 from drgs_blender.compute.warp import runtime
 from drgs_blender.core.asset.container import read_asset
@@ -192,6 +192,37 @@ def test_inspect_counts_what_is_long_unless_all_is_asked_for():
     short, whole = ("\n".join(as_lines(report, whole=whole)) for whole in (False, True))
     assert "a: 3 values, see --all" in short and "f: 1, 2" in short and "views: 3, see --all" in short
     assert "see --all" not in whole and "e: 3" in whole and whole.count("x: 1.5") == 3
+
+
+@pytest.mark.parametrize("length", [3, 12, 40, 400])
+def test_inspect_shows_a_person_thirty_lines_at_most(length: int) -> None:
+    """Short descriptions as they are; of others what is in them, the longest parts in a line or two; --all has all."""
+    numbers = {f"name {i}": [0.0, float(i)] for i in range(length)}
+    report = {"kind": "asset", "counts": numbers, "bounds": {"mesh": [[0, 0, 0], [1, 2, 3]]}, "digest": "abc"}
+    report |= {"ranges": dict(numbers), "notes": [f"a sentence that is long enough, number {i}" for i in range(length)]}
+    lines, whole = short_lines(report), list(as_lines(report))
+    assert len(lines) <= 30 and "digest: abc" in lines and "kind: asset" in lines
+    assert all(len(line) < 140 for line in lines)
+    if len(whole) <= 30:
+        assert lines == whole
+    else:
+        assert any("see --all" in line for line in lines) or f"name {length - 1}: 0, {length - 1}" in " ".join(lines)
+    many = {f"key {i}": i for i in range(length)}
+    assert len(short_lines(many)) == min(length, 30)
+    assert length <= 30 or short_lines(many)[-1] == f"... {length - 29} more lines, see --all"
+
+
+def test_inspect_of_an_asset_is_short_and_json_is_whole(cube, tmp_path, capsys) -> None:
+    out = tmp_path / "cube.drgs"
+    assert main(["make", str(cube), "--out", str(out)]) == 0
+    capsys.readouterr()
+    assert main(["inspect", str(out)]) == 0
+    short = capsys.readouterr().out.splitlines()
+    assert len(short) <= 30 and any(line.startswith("counts: ") and "surfels: " in line for line in short)
+    assert main(["inspect", str(out), "--all"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) > 60
+    told = described(out, capsys)
+    assert len(told["members"]["mesh.safetensors"]) > 2 and told["bounds"]["mesh"][1]
 
 
 def test_inspect_counts_what_is_not_finite(tmp_path, capsys):

@@ -460,6 +460,39 @@ def test_not_an_asset(tmp_path: Path) -> None:
         read_asset(tmp_path / "x.drgs")
 
 
+@pytest.mark.parametrize(
+    ("name", "data", "told"),
+    [
+        (
+            "a.glb",
+            b"glTF" + bytes(60),
+            r"no \.drgs file but a mesh or splats.*`drgs make a\.glb` or `drgs import a\.glb`",
+        ),
+        (
+            "a.OBJ",
+            b"v 0 0 0\n",
+            r"but a mesh\. Make one of it by `drgs make a\.OBJ`; in Blender by File > Import > DR-GS",
+        ),
+        ("a.stl", b"", "but a mesh.*Object > Convert > DR-GS"),
+        ("a.3mf", b"PK\3\4" + bytes(60), "but a mesh"),
+        ("a.spz", bytes(60), "but splats.*`drgs import a.spz`"),
+        ("a.hdr", bytes(60), "is an image, no .drgs file"),
+        ("a.fbx", bytes(60), r"is not a \.drgs file.*File > Import and choose Object > Convert > DR-GS"),
+    ],
+)
+def test_files_of_other_kinds_are_called_what_they_are(tmp_path: Path, name: str, data: bytes, told: str) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(AssetError, match=told):
+        read_asset(tmp_path / name)
+    with pytest.raises(AssetError, match="does not exist"):
+        read_asset(tmp_path / f"none{Path(name).suffix}")
+
+
+def test_an_asset_of_another_name_is_read(tmp_path: Path) -> None:
+    write_asset(tmp_path / "a.glb", make_asset(100))
+    assert len(read_asset(tmp_path / "a.glb").surfels) == 100
+
+
 def test_safetensors_agree_with_the_reference_package_both_ways() -> None:
     reference = pytest.importorskip("safetensors.numpy")
     rng = np.random.default_rng(3)

@@ -125,10 +125,11 @@ def test_surfels_show_textures_that_the_mesh_has_no_vertices_for() -> None:
     assert error_of(fine) < 0.35 * error_of(coarse)
     assert coarse.provenance["report"]["surfels"]["hidden_pieces"] > 100
     (note,) = coarse.provenance["report"]["surfels"]["notes"]
-    assert "the budget is 300 surfels" in note
+    left = coarse.provenance["report"]["surfels"]["hidden_pieces"]
+    assert note.startswith(f"{left} of 300 surfels are coarser than the textures") and "--max-surfels 300 is" in note
     dense = make_asset(file, max_triangles=8, density=10, max_surfels=1)
     (note,) = dense.provenance["report"]["surfels"]["notes"]
-    assert len(dense.surfels) == 256 and "256 surfels, which the density asks for" in note
+    assert len(dense.surfels) == 256 and "--density 10 alone makes 256 of them, --max-surfels is 1" in note
     enough = make_asset(plane(2, checker(8, 2)), max_triangles=8, density=10, max_surfels=20_000)
     assert len(enough.surfels) < 20_000 and "notes" not in enough.provenance["report"]["surfels"]
     plain = make_asset(plane(2), max_triangles=8, density=10, max_surfels=20_000)

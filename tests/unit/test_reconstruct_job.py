@@ -133,6 +133,7 @@ def test_materials_and_light_come_with_the_asset(capture, tmp_path):
     asset = reconstruct(capture, short, told.append, folder=tmp_path)
     assert asset.environment.radiance.shape == (8, 16, 3) and asset.environment.radiance.min() > 0
     assert asset.provenance["report"]["decoupling"]["iterations"] == 30
+    assert asset.provenance["materials"] == "separated from the lighting"
     assert told[-1].phase == "materials" and told[-1].part == 1.0
     # A surfel has the mean of its face's corners, which have learned something.
     corners = asset.mesh.faces[asset.binding.face]
@@ -141,6 +142,17 @@ def test_materials_and_light_come_with_the_asset(capture, tmp_path):
     assert asset.mesh.albedo.std(axis=0).max() > 0.01
     # It is shaded by what was learned on the mesh, not by its own normal, which 60 steps have hardly turned.
     assert asset.binding.normal[:, 2].min() > 0.9
+
+
+def test_materials_of_too_few_steps_are_called_unreliable(capture, caplog):
+    """In the log with what to do, and in the asset: a budget that is over after the first step separates nothing."""
+    hurried = Decoupling(iterations=400, seconds=1e-6, pixels=64, cosine=2, ggx=2, light=2, environment=8)
+    short = Settings(schedule=replace(QUICK, iterations=3, surfels=500), mesh_resolution=24, decoupling=hurried)
+    asset = reconstruct(capture, short)
+    assert asset.provenance["report"]["steps"] == {"surfels": [3, 3], "materials": [1, 400]}
+    assert asset.provenance["materials"] == "hardly separated from the lighting, in 1 of 400 steps: unreliable"
+    (told,) = [r.getMessage() for r in caplog.records if "of 400 steps" in r.getMessage()]
+    assert "unreliable" in told and "--set decoupling.seconds" in told
 
 
 def test_settings_of_later_phases_leave_surfels_as_they_are(capture, tmp_path, caplog):
@@ -264,6 +276,7 @@ def test_the_command_writes_an_asset_and_its_preview(tmp_path, capsys, monkeypat
     said, warned = capsys.readouterr()
     assert "device cuda" in warned and "Learned on the CPU" in warned
     assert code == 0 and "DRGS_PROGRESS" in said and "views left out: PSNR" in said
+    assert "  steps: surfels 30 of 30\n" in said
     assert len(read_asset(out).surfels) > 100
     assert Image.open(out.with_name("balls.preview.png")).size == (64, 32)
     assert not Path(out.with_name("balls.reconstruct")).exists()

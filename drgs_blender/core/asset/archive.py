@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import AssetError, WriteError
+from ..file_types import READ
 
 Array = np.ndarray
 
@@ -37,6 +38,7 @@ _VERSION, _FLAGS, _STORED = 20, 1 << 11, 0  # 2.0; names in UTF-8; not compresse
 _TIME, _DATE = 0, 0x21  # 1980-01-01 00:00, so that equal assets are equal files
 _PADDING_ID = 0xD935  # extra field that Android's zipalign reserves for padding
 _ATTRIBUTES = 0o100644 << 16  # a regular file, in Unix terms
+_BY_HAND = "import it by File > Import and choose Object > Convert > DR-GS"
 _SIZE_LIMIT = 0xFFFFFFFF - (1 << 20)  # what a zip without the zip64 extension can address, less headers
 
 
@@ -86,9 +88,35 @@ def read_archive(path: str | os.PathLike[str], check: Collection[str] = ()) -> d
     Raises
     ------
     AssetError
-        The file cannot be opened, is truncated, or is not laid out as `write_archive` does.
+        The file cannot be opened, is truncated, or is not laid out as `write_archive` does; one named as a mesh, splats
+        or an image is called that, with the way to an asset.
     """
-    data = _map(Path(path))
+    try:
+        return _read_archive(Path(path), check)
+    except AssetError as error:
+        other = _foreign(Path(path))
+        if other is None or not (os.path.isfile(path) and os.access(path, os.R_OK)):
+            raise
+        raise AssetError(str(path), *other) from error
+
+
+def _foreign(path: Path) -> tuple[str, str] | None:
+    """What a file is that is no `.drgs` file, by its name, and what to do; None where the name does not say it."""
+    suffix = path.suffix.lower()
+    kinds = {t.kind for t in READ.values() if suffix in t.extensions}
+    if "environment" in kinds:
+        return "is an image, no .drgs file", "Choose an asset, or use the image as the environment"
+    ways = {"mesh": ("a mesh", "make"), "surfels": ("splats", "import")}
+    known = [] if suffix == ".json" else [way for kind, way in ways.items() if kind in kinds]
+    if not known:
+        return None
+    commands = " or ".join(f"`drgs {command} {path.name}`" for _, command in known)
+    hint = f"Make one of it by {commands}; in Blender by File > Import > DR-GS asset from splats and mesh"
+    return f"is no .drgs file but {' or '.join(what for what, _ in known)}", f"{hint}, or {_BY_HAND}"
+
+
+def _read_archive(path: Path, check: Collection[str]) -> dict[str, Array]:
+    data = _map(path)
     members, tail_start = _central_directory(data, str(path))
     _check_names(members, str(path))
     heads, offsets, tail = _framing(members)
@@ -153,7 +181,7 @@ def _central_directory(data: Array, subject: str) -> tuple[list[Member], int]:
     if signature != b"PK\5\6":
         if data[:4].tobytes() == b"PK\3\4":
             raise AssetError(subject, "is truncated: the directory at its end is missing", _RESTORE)
-        hint = "`drgs make` makes one of a mesh, as Convert to DR-GS does in Blender; `drgs import` of splats"
+        hint = f"`drgs make` makes one of a mesh, `drgs import` of splats; in Blender {_BY_HAND}"
         raise AssetError(subject, "is not a .drgs file", hint)
     if disk or first_disk or here != count or comment or count > MEMBER_LIMIT:
         raise AssetError(subject, "is a zip, but not laid out as a .drgs file", _RESTORE)
