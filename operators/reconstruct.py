@@ -124,9 +124,11 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
     use_environment: BoolProperty(
         name="Set World", description="Light the scene with the light of the photographs", default=False
     )
-    surfels: IntProperty(name="Surfels, at Most", description="0 is 16,000", default=0, min=0, max=5_000_000)
+    surfels: IntProperty(
+        name="Surfels, at Most", description="0: as many as the photographs show", default=0, min=0, max=5_000_000
+    )
     voxels: IntProperty(
-        name="Voxels", description="Of the mesh's longest side, from 16 to 1024; 0 is 256", default=0, min=0, max=1024
+        name="Voxels", description="Of the mesh's longest side, from 16 to 1024; 0 is 512", default=0, min=0, max=1024
     )
     iterations: IntProperty(
         name="Surfel Steps", description="How long surfels are learned; 0 is 3,000", default=0, min=0, max=10_000_000

@@ -87,10 +87,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--surfels",
         type=int_range(10, 5_000_000),
         metavar="N",
-        help="at most, before --variant m makes its own; default 16000",
+        help="at most, before --variant m makes its own; default: as many as the photographs show, up to 64000, and "
+        "with a --time-budget as that is long",
     )
     parser.add_argument(
-        "--voxels", type=int_range(16, 1024), metavar="N", help="of the mesh's longest side; default 256"
+        "--voxels",
+        type=int_range(16, 1024),
+        metavar="N",
+        help="of the mesh's longest side, none smaller than a pixel; default 512",
     )
     parser.add_argument(
         "--time-budget",

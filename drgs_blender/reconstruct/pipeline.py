@@ -177,7 +177,7 @@ def reconstruct(
     return Asset(surfels, mesh, binding, environment, provenance)
 
 
-def mesh_of(gaussians: Gaussians, capture: Capture, region: Region, resolution: int = 256) -> tuple[Mesh, dict]:
+def mesh_of(gaussians: Gaussians, capture: Capture, region: Region, resolution: int | None = None) -> tuple[Mesh, dict]:
     """Mesh of surfels as the training views see them (`depth_fusion.fuse`), with the outlines of their masks."""
     cameras = [view.camera for view in capture.training]
     mesh, report = fuse(gaussians, cameras, region, resolution)

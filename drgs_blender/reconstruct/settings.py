@@ -48,8 +48,8 @@ class Settings:
         "p" keeps the free surfels (driven by particles or mesh), "m" makes surfels on the mesh's faces.
     schedule : Schedule
         How surfels are learned.
-    mesh_resolution : int
-        Most voxels along the mesh's longest side.
+    mesh_resolution : int, optional
+        Most voxels along the mesh's longest side, none smaller than a pixel; None: 512, or as many as memory holds.
     minutes : float, optional
         The time budget of all stages together, once kernels are compiled; None: the steps decide.
     materials : bool
@@ -64,7 +64,7 @@ class Settings:
 
     variant: Literal["p", "m"] = "p"
     schedule: Schedule = field(default_factory=Schedule)
-    mesh_resolution: Annotated[int, Range(16, 1024)] = 256
+    mesh_resolution: Annotated[int | None, Range(16, 1024)] = None
     minutes: Annotated[float | None, Range(0.001, 1e6)] = None
     materials: bool = True
     decoupling: Decoupling = field(default_factory=lambda: Decoupling(normals=True))

@@ -675,3 +675,21 @@ def test_black_and_unfinished_photographs_do_no_harm(ball, capture):
     views[1].colour[10:20] = np.nan
     found = decouple(replace(capture, views=views), ball, replace(SMALL, exposure=True))
     assert all(np.isfinite(array).all() for array in arrays(found))
+
+
+def test_smoothness_is_that_of_the_same_slope_on_finer_meshes():
+    """Of a sheet whose albedo rises evenly: shorter edges differ less, and weigh more."""
+    losses, grids = [], []
+    for cells in (100, 400, 800):  # edges of that part of the sheet: the first is coarser than 1/200
+        place = np.linspace(0, 1, cells + 1)
+        x, y = np.meshgrid(place, place, indexing="ij")
+        corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).reshape(-1)
+        faces = np.stack([corner, corner + cells + 1, corner + 1], -1)
+        sheet = plain_mesh(np.stack([x, y, 0 * x], -1).reshape(-1, 3), faces)
+        settings = Settings().for_mesh(sheet)
+        edges = np.linalg.norm(sheet.vertices[faces[:, 0]] - sheet.vertices[faces[:, 1]], axis=1)
+        losses.append(settings.smoothness * edges.mean())
+        grids.append(settings.coarse)
+        assert settings.normal_smoothness / Settings().normal_smoothness == settings.smoothness / Settings().smoothness
+    assert losses[0] == pytest.approx(2 * losses[1], rel=0.01) and losses[1] == pytest.approx(losses[2], rel=0.01)
+    assert grids == [3, 4, 5] and Settings(coarse=0).for_mesh(sheet).coarse == 0

@@ -101,7 +101,7 @@ def test_vertices_slide_along_the_surface_and_not_off_it():
     assert np.abs(np.linalg.norm(moved, axis=1) - 1).max() < 0.1 * edge
 
 
-def test_more_voxels_than_memory_are_refused_with_how_many_fit(cameras, monkeypatch):
+def test_more_voxels_than_memory_are_refused_with_how_many_fit(cameras, monkeypatch, caplog):
     def begun(*_):
         raise LookupError
 
@@ -117,6 +117,11 @@ def test_more_voxels_than_memory_are_refused_with_how_many_fit(cameras, monkeypa
         depth_fusion.fuse(None, sharp, region, fitting)  # type: ignore[arg-type]
     with pytest.raises(UsageError):
         depth_fusion.fuse(None, sharp, region, fitting + 2)  # type: ignore[arg-type]
+    # where none are asked for, as many as fit are taken, and told
+    _, voxel, _ = depth_fusion.grid(sharp, region)
+    assert f"gets {fitting} voxels" in caplog.text and voxel == pytest.approx(2 * RADIUS / fitting)
+    _, taken, _ = depth_fusion.grid(sharp, region, fitting)
+    assert taken == pytest.approx(voxel)
 
 
 @pytest.mark.parametrize("pixels", [-1.2, 0.8])

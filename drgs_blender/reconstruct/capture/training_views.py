@@ -1,9 +1,13 @@
-"""Training views: over one background, in full and half size, with what never changes computed."""
+"""Training views: over one background, cropped to the object, in full and half size, with what never changes computed.
+
+Beyond its mask a view shows the background alone. What is left of it around the object is wide enough to show surfels
+that stray.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -18,30 +22,36 @@ from .capture import Capture, View
 
 #: Pixels of all views up to which what SSIM knows of photographs beforehand is kept: 24 bytes each.
 MAX_CACHED_PIXELS = 30_000_000
+#: Margin of a crop around the mask: in parts of the mask's longer side, and at least pixels.
+MARGIN, LEAST_MARGIN = 0.1, 16
 #: Background given to photographs whose masks take their real one away, sRGB.
 GREY = (0.5, 0.5, 0.5)
 
 
 @dataclass(slots=True)
 class Target:
-    """One view at one size.
+    """One view at one size, cropped to the object.
 
     Attributes
     ----------
     camera : Camera
-        Of that size.
+        Of that size and crop.
     photograph : Photograph or tensor
         The photograph to be matched; on a device the colour alone, (h, w, 3).
     mask : (h, w) tensor or None
         Tensor in 0..1, or None where nothing is known of it.
     background : (h, w, 3) tensor or None
         What is behind the surfels, sRGB; None: the one colour of `background_of`.
+    share : float
+        Part of the view that is left of it, 0..1. Means over the crop count as much: a pixel of each view counts the
+        same.
     """
 
     camera: Camera
     photograph: Photograph | Tensor
     mask: Tensor | None
     background: Tensor | None = None
+    share: float = 1.0
 
     @property
     def colour(self) -> Tensor:
@@ -78,19 +88,39 @@ def targets(capture: Capture) -> list[list[Target]]:
         raise AssetError(str(capture.source), "has black pictures alone", "Check the exposure and the files")
     drawn = silhouettes(capture)
     masks: list[Array | None] = [None for _ in views] if drawn is None else [*drawn]
-    keep = sum(view.colour[..., 0].size for view in views) <= MAX_CACHED_PIXELS
+    windows = [_window(view.camera, mask) for view, mask in zip(views, masks, strict=True)]
+    keep = sum((x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in windows) <= MAX_CACHED_PIXELS
     full, half = [], []
-    for view, mask in zip(views, masks, strict=True):
-        colour = composed(view, capture)
-        full.append(_target(view.camera, colour, mask, keep))
+    for view, mask, (x0, y0, x1, y1) in zip(views, masks, windows, strict=True):
+        whole = view.camera
+        camera = replace(whole, width=x1 - x0, height=y1 - y0, cx=whole.cx - x0, cy=whole.cy - y0)
+        colour, share = (
+            composed(view, capture)[y0:y1, x0:x1],
+            camera.width * camera.height / (whole.width * whole.height),
+        )
+        if mask is not None:
+            mask = np.ascontiguousarray(mask[y0:y1, x0:x1], np.float32)
+        full.append(_target(camera, colour, mask, keep, share))
         smaller = None if mask is None else half_size(mask[..., None])[..., 0]
-        half.append(_target(halved(view.camera), half_size(colour), smaller, keep))
+        half.append(_target(halved(camera), half_size(colour), smaller, keep, share))
     return [full, half]
 
 
-def _target(camera: Camera, colour: Array, mask: Array | None, keep: bool) -> Target:
-    known = None if mask is None else torch.from_numpy(np.ascontiguousarray(mask, np.float32))
-    return Target(camera, Photograph.of(colour, keep), known)
+def _window(camera: Camera, mask: Array | None) -> tuple[int, int, int, int]:
+    """Pixels (x0, y0, x1, y1) around the object, all where it is not to be seen; halves of x0 and y0 are whole."""
+    whole = (0, 0, camera.width, camera.height)
+    if mask is None or not mask.any():
+        return whole
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    margin = max(LEAST_MARGIN, math.ceil(MARGIN * max(np.ptp(rows), np.ptp(columns))))
+    x0, y0 = (max(int(at[0]) - margin, 0) // 2 * 2 for at in (columns, rows))
+    x1, y1 = (min(int(at[-1]) + 1 + margin, size) for at, size in ((columns, camera.width), (rows, camera.height)))
+    return x0, y0, x1, y1
+
+
+def _target(camera: Camera, colour: Array, mask: Array | None, keep: bool, share: float) -> Target:
+    known = None if mask is None else torch.from_numpy(mask)
+    return Target(camera, Photograph.of(colour, keep), known, share=share)
 
 
 def halved(camera: Camera) -> Camera:
@@ -109,16 +139,8 @@ def half_size(picture: Array) -> Array:
 
 def pixel_rays(camera: Camera, device: torch.device | None = None) -> Tensor:
     """(h, w, 3) float32 directions of the pixels' centres, world space, of unit depth; on the CPU or a device."""
-    local = _local_rays(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, device)
-    turn = torch.tensor(np.asarray(camera.matrix_world)[:3, :3].T, dtype=torch.float32, device=device)
-    return local @ turn
-
-
-@lru_cache(maxsize=8)
-def _local_rays(
-    width: int, height: int, fx: float, fy: float, cx: float, cy: float, device: torch.device | None
-) -> Tensor:
-    """The same in the camera's own frame: views of one lens share it."""
-    x, y = (np.arange(width) + 0.5 - cx) / fx, -(np.arange(height) + 0.5 - cy) / fy
-    rays = np.stack([*np.meshgrid(x, y), np.full((height, width), -1.0)], -1)
-    return torch.tensor(rays, dtype=torch.float32, device=device)
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = -(np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    right, up, back = np.asarray(camera.matrix_world)[:3, :3].T
+    there = lambda a: torch.tensor(a, dtype=torch.float32, device=device)  # noqa: E731
+    return there(x[:, None] * right) + there(y[:, None] * up - back)[:, None]

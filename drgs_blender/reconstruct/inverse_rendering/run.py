@@ -132,7 +132,7 @@ def decouple(
         raise UsageError(str(capture.source), "has no training view", "Leave fewer views out for the test")
     if len(capture.training) < 4:
         log.warning("only %d views: light and materials can hardly be separated", len(capture.training))
-    job = Job(capture, mesh, settings, checkpoint, backend, normals, start, now)
+    job = Job(capture, mesh, settings.for_mesh(mesh), checkpoint, backend, normals, start, now)
     schedule = job.schedule
     while schedule.going():
         if cancelled is not None and cancelled():

@@ -16,7 +16,7 @@ from ...core.asset.model import Mesh
 from ...core.frame import Camera
 from ...geometry.tsdf import DepthMaps, SignedDistanceField
 from ..capture.training_views import pixel_rays
-from ..memory_budget import check_fits
+from ..memory_budget import check_fits, fitting
 from ..model.gaussians import Gaussians
 from .tangential_relaxation import relaxed
 from .visual_hull import Region, world_to_pixel
@@ -27,6 +27,8 @@ log = logging.getLogger(__name__)
 TOGETHER = 32
 #: Least side of a voxel, pixels.
 PIXELS = 1.0
+#: Voxels along the longest side where none are asked for: with less memory than these take fewer, or none.
+MOST, FEWEST = 512, 16
 #: Voxels around the region.
 _AROUND = 5
 #: Bytes per voxel of `SignedDistanceField` at the most: sum, weight and count, the field, smoothed, and widened.
@@ -36,7 +38,7 @@ SMOOTH = 0.8
 
 
 def fuse(
-    gaussians: Gaussians, cameras: list[Camera], region: Region, resolution: int = 256
+    gaussians: Gaussians, cameras: list[Camera], region: Region, resolution: int | None = None
 ) -> tuple[Mesh, dict[str, Any]]:
     """Mesh of what `cameras` see of the surfels.
 
@@ -46,8 +48,8 @@ def fuse(
     cameras : list of Camera
     region : Region
         Its box, slightly widened, is divided.
-    resolution : int
-        Most voxels along the longest side; none is smaller than `PIXELS` of the nearest quarter of views.
+    resolution : int, optional
+        Most voxels along the longest side, see `grid`.
 
     Returns
     -------
@@ -75,22 +77,39 @@ def fuse(
     return mesh, report
 
 
-def grid(cameras: list[Camera], region: Region, resolution: int = 256) -> tuple[Array, float, tuple[int, ...]]:
+def grid(cameras: list[Camera], region: Region, resolution: int | None = None) -> tuple[Array, float, tuple[int, ...]]:
     """First corner (3,) and side of the voxels of `fuse`, metres, and how many there are along each axis.
+
+    None is smaller than `PIXELS` of the nearest quarter of views.
+
+    Parameters
+    ----------
+    cameras : list of Camera
+    region : Region
+    resolution : int, optional
+        Most voxels along the longest side; None: `MOST`, or as many as the memory holds.
 
     Raises
     ------
     UsageError: more than the memory holds.
     """
-    side = float((region.high - region.low).max())
     pixel = [float(np.linalg.norm(np.asarray(c.matrix_world)[:3, 3] - region.centre)) / c.fx for c in cameras]
-    voxel = max(side / resolution, PIXELS * float(np.quantile(pixel, 0.25)))
-    low, high = region.low - _AROUND * voxel, region.high + _AROUND * voxel
-    shape = tuple(int(n) for n in np.ceil((high - low) / voxel).astype(int) + 1)
-    around = 2 * _AROUND + 2
-    needed = _BYTES_PER_VOXEL * float(np.prod(shape))
-    check_fits(needed, "the mesh", "voxels", "--voxels", max(shape) - around, 3, around)
+    smallest = PIXELS * float(np.quantile(pixel, 0.25))
+    low, voxel, shape = _voxels(region, resolution or MOST, smallest)
+    around, needed = 2 * _AROUND + 2, _BYTES_PER_VOXEL * float(np.prod(shape))
+    count = max(shape) - around
+    if resolution is None and FEWEST <= (fewer := fitting(needed, count, 3, around)) < count:
+        log.warning("the mesh gets %d voxels along its longest side: of %d there is no memory", fewer, count)
+        return _voxels(region, fewer, smallest)
+    check_fits(needed, "the mesh", "voxels", "--voxels", count, 3, around)
     return low, voxel, shape
+
+
+def _voxels(region: Region, resolution: int, smallest: float) -> tuple[Array, float, tuple[int, ...]]:
+    """`grid` of so many voxels along the longest side, of at least the `smallest` side."""
+    voxel = max(float((region.high - region.low).max()) / resolution, smallest)
+    low, high = region.low - _AROUND * voxel, region.high + _AROUND * voxel
+    return low, voxel, tuple(int(n) for n in np.ceil((high - low) / voxel).astype(int) + 1)
 
 
 def surface_maps(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:

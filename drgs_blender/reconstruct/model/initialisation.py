@@ -24,14 +24,27 @@ if TYPE_CHECKING:
 
 #: Most surfels for each pixel of a view that shows the object.
 PER_PIXEL = 1.5
+#: Most surfels where none are asked for, at least and at most; in between for each second there is to learn them.
+FEWEST, MOST, PER_SECOND = 16_000, 64_000, 100
 #: Surfels inside the hull, as a part of those on it; how opaque they begin; their deviation in distances between them.
 INSIDE, FAINTLY, WIDE = 1 / 3, 0.1, 0.6
 
 
-def surfel_limit(views: list[Target]) -> int:
-    """Number of surfels that suits pictures of this size: with more, the photographs are overfitted."""
+def surfel_limit(views: list[Target], wanted: int | None = None, seconds: float | None = None) -> int:
+    """Number of surfels that suits pictures of this size: with more, the photographs are overfitted.
+
+    Parameters
+    ----------
+    views : list of Target
+    wanted : int, optional
+        No more than these; None: `MOST`, and fewer where there is less time than these take.
+    seconds : float, optional
+        Of learning; None: all that it takes.
+    """
+    if wanted is None:
+        wanted = MOST if seconds is None else int(min(max(FEWEST, PER_SECOND * seconds), MOST))
     shown = [v.camera.width * v.camera.height if v.mask is None else float(v.mask.sum()) for v in views]
-    return max(int(PER_PIXEL * np.mean(shown)), 1)
+    return min(max(int(PER_PIXEL * np.mean(shown)), 1), wanted)
 
 
 def on_hull(capture: Capture, region: Region, surfels: int, bands: int, seed: int = 0) -> Gaussians:

@@ -13,6 +13,8 @@ class DensificationSchedule:
     schedule : Schedule
     start : int
         Surfels at the first step.
+    most : int
+        Surfels at the end, at most.
 
     Attributes
     ----------
@@ -21,8 +23,8 @@ class DensificationSchedule:
         Number of rounds that are done.
     """
 
-    def __init__(self, schedule: Schedule, start: int) -> None:
-        self._schedule, self.start, self.rounds = schedule, start, 0
+    def __init__(self, schedule: Schedule, start: int, most: int) -> None:
+        self._schedule, self.start, self.rounds, self._most = schedule, start, 0, most
 
     def due(self, part: float) -> int:
         """Rounds that are to be done by this part of the schedule."""
@@ -30,7 +32,7 @@ class DensificationSchedule:
 
     def budget(self, part: float) -> int:
         """Largest number of surfels at this part of the schedule."""
-        return int(self.start + (self._schedule.surfels - self.start) * self._grown(part))
+        return int(self.start + (self._most - self.start) * self._grown(part))
 
     def _grown(self, part: float) -> float:
         begin, end = self._schedule.densify

@@ -83,7 +83,7 @@ class Learner:
         self.optimiser.steps = self.light.steps = self.iteration
         with _one_thread():
             rendered, rays = self._render(target, part)
-            loss = self._loss(rendered, target, rays, part)
+            loss = target.share * self._loss(rendered, target, rays, part)
             if beside is not None:
                 loss = loss + self._schedule.patches * self._patch_loss(rendered, target, rays, beside)
             loss.backward()
@@ -190,8 +190,8 @@ def _grey(target: Target) -> Tensor:
 
 
 def _squared_error(rendered: RenderedView, target: Target) -> float:
-    """Mean over the picture."""
-    return float((rendered.colour.detach().clamp(0, 1) - target.colour).square().mean())
+    """Mean over the picture that the view is cut from."""
+    return target.share * float((rendered.colour.detach().clamp(0, 1) - target.colour).square().mean())
 
 
 def _importance(features: Tensor) -> Tensor:

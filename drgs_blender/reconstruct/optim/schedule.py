@@ -26,8 +26,9 @@ class Schedule:
     ----------
     iterations : int
         Steps, one view each.
-    surfels : int
-        At most so many at the end of densification; for small pictures fewer.
+    surfels : int, optional
+        At most so many at the end of densification; for small pictures fewer. None: as many as the photographs show,
+        see `initialisation.surfel_limit`.
     coarse : float
         Part of the steps that is done at half size.
     densify : tuple of float
@@ -59,7 +60,7 @@ class Schedule:
     """
 
     iterations: Annotated[int, Range(1, 10_000_000)] = 3000
-    surfels: Annotated[int, Range(10, 5_000_000)] = 16000
+    surfels: Annotated[int | None, Range(10, 5_000_000)] = None
     coarse: Part = 0.3
     densify: tuple[Part, Part] = (0.08, 0.6)
     rounds: Annotated[int, Range(0, 1000)] = 16

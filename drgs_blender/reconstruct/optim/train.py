@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -56,7 +55,8 @@ class Training:
     ----------
     region : Region
     schedule : Schedule
-        With as many surfels as the photographs show.
+    surfels : int
+        At most so many: as the schedule and the photographs have it.
     targets : list of list of Target
         Training views in full and in half size.
     time_budget : TimeBudget
@@ -81,12 +81,13 @@ class Training:
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.region, self.targets, self._background = region, targets(capture), background_of(capture)
-        self.schedule = schedule = replace(schedule, surfels=min(schedule.surfels, surfel_limit(self.targets[0])))
+        self.schedule = schedule
+        self.surfels = surfel_limit(self.targets[0], schedule.surfels, seconds)
         if schedule.patches:
             self._near = neighbours(capture.training, region.centre)
         rival = None
         if gaussians is None:
-            gaussians = on_hull(capture, region, schedule.surfels, schedule.bands, schedule.seed)
+            gaussians = on_hull(capture, region, self.surfels, schedule.bands, schedule.seed)
             if len(capture.training) >= MIN_VIEWS:
                 rival = inside_hull(gaussians, capture, region, schedule.bands, schedule.seed)
         self.time_budget, self.trial, self.fallback = TimeBudget(seconds, now), Trial(rival), Fallback(self, now)
@@ -94,7 +95,7 @@ class Training:
 
     def _begin(self, gaussians: Gaussians, backend: LearningBackend) -> None:
         """Learn these from the first step on."""
-        self._begun, self.densification = gaussians, DensificationSchedule(self.schedule, len(gaussians))
+        self._begun, self.densification = gaussians, DensificationSchedule(self.schedule, len(gaussians), self.surfels)
         self.time_budget.restart()
         self.fallback.begin(backend)
 
