@@ -29,6 +29,8 @@ _CAPTURE, _PHOTOGRAPH = "drgs_capture", "drgs_photograph"
 _SENSOR = 36.0
 #: Size of the cameras in the viewport, in parts of their median distance from the world's origin.
 _DISPLAY = 0.06
+#: What `drgs inspect` says of folders that are none.
+_NONE = "is no capture"
 #: Difference of fx and fy beyond which pixels are told not to be square.
 _SQUARE = 0.005
 
@@ -87,11 +89,16 @@ class DRGS_OT_import_cameras(DrgsOperator, bpy.types.Operator):
         """The objects of `cameras` in the scene; those of an earlier import are renewed."""
         distances = [float(np.linalg.norm(np.array(one["matrix_world"])[:3, 3])) for one in cameras]
         size = _DISPLAY * float(np.median(distances))
-        known = {obj[_PHOTOGRAPH]: obj for obj in context.scene.objects if _PHOTOGRAPH in obj and obj.type == "CAMERA"}
+        folder = path.parent if path.is_file() else path
+        earlier = _collection(context, folder)
+        known: dict[str, bpy.types.Object] = {}
+        for obj in sorted(earlier.objects if earlier else (), key=lambda one: one.name):  # copies come later
+            if obj.type == "CAMERA" and _PHOTOGRAPH in obj:
+                known.setdefault(obj[_PHOTOGRAPH], obj)
         made = [_camera(one, size, known.get(one["image"])) for one in cameras]
         new = [obj for one, obj in zip(cameras, made) if one["image"] not in known]
         if new:
-            into = _collection(context, path.parent if path.is_file() else path)
+            into = earlier or _new_collection(context, folder)
             for obj in new:
                 into.objects.link(obj)
         if len(new) < len(made):
@@ -104,10 +111,12 @@ class DRGS_OT_import_cameras(DrgsOperator, bpy.types.Operator):
 
     def _show(self, camera: dict[str, Any], data: bpy.types.Camera) -> str:
         """Put the photograph behind the camera's view; the name of one that cannot be loaded, else ""."""
-        data.background_images.clear()
+        path = Path(camera["image"])
+        for background in list(data.background_images):  # not the user's own
+            if background.image and Path(bpy.path.abspath(background.image.filepath)) == path:
+                data.background_images.remove(background)
         if not self.use_pictures:
             return ""
-        path = Path(camera["image"])
         try:
             if crashes_blender(path):
                 return f"{path.name} (cut off)"
@@ -153,18 +162,28 @@ def _inspect(path: Path, axes: str) -> tuple[Path, dict[str, Any]]:
         except UsageError as error:
             failures.append(error)
             continue
-        if found.get("kind") == "capture":
+        if found.get("kind") != "capture":
+            problem = f"{_NONE}, but {found.get('format', found.get('kind'))}"
+            failures.append(UsageError(str(place), problem, "Choose the folder of the photographs"))
+        elif path.suffix.lower() in READ["picture"].extensions and path.parent != place and not _has(found, path):
+            failures.append(UsageError(str(path), f"is no photograph of the capture {place}", "Choose one of them"))
+        else:
             return place, found
-        problem = f"is no capture, but {found.get('format', found.get('kind'))}"
-        failures.append(UsageError(str(place), problem, "Choose the folder of the photographs"))
-    raise failures[0]
+    raise next((one for one in failures if _NONE not in str(one)), failures[0])
 
 
-def _collection(context: bpy.types.Context, folder: Path) -> bpy.types.Collection:
-    """The collection for the cameras of the capture in `folder`, in the scene."""
-    for known in context.scene.collection.children_recursive:
-        if known.get(_CAPTURE) == str(folder):
-            return known
+def _has(found: dict[str, Any], photograph: Path) -> bool:
+    """Whether a capture has this photograph."""
+    return any(Path(one["image"]) == photograph for one in found["cameras"])
+
+
+def _collection(context: bpy.types.Context, folder: Path) -> bpy.types.Collection | None:
+    """The scene's collection of the cameras of the capture in `folder`, if there is one."""
+    return next((one for one in context.scene.collection.children_recursive if one.get(_CAPTURE) == str(folder)), None)
+
+
+def _new_collection(context: bpy.types.Context, folder: Path) -> bpy.types.Collection:
+    """A collection for them, in the scene."""
     made = bpy.data.collections.new(f"Cameras of {folder.name}")
     made[_CAPTURE] = str(folder)
     context.scene.collection.children.link(made)

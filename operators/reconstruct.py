@@ -128,7 +128,11 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
         name="Surfels, at Most", description="0: as many as the photographs show", default=0, min=0, max=5_000_000
     )
     voxels: IntProperty(
-        name="Voxels", description="Of the mesh's longest side, from 16 to 1024; 0 is 512", default=0, min=0, max=1024
+        name="Voxels",
+        description="Of the mesh's longest side, from 16 to 1024; 0: 512 at most",
+        default=0,
+        min=0,
+        max=1024,
     )
     iterations: IntProperty(
         name="Surfel Steps", description="How long surfels are learned; 0 is 3,000", default=0, min=0, max=10_000_000

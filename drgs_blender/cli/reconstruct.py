@@ -87,14 +87,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--surfels",
         type=int_range(10, 5_000_000),
         metavar="N",
-        help="at most, before --variant m makes its own; default: as many as the photographs show, up to 64000, and "
-        "with a --time-budget as that is long",
+        help="at most, before --variant m makes its own; default: as many as the photographs show, up to 64000, or "
+        "with a --time-budget 2700 per minute of it, from 16000 on",
     )
     parser.add_argument(
         "--voxels",
         type=int_range(16, 1024),
         metavar="N",
-        help="of the mesh's longest side, none smaller than a pixel; default 512",
+        help="of the mesh's longest side, none smaller than a pixel; default 512, or 256 with --variant m or a "
+        "--time-budget",
     )
     parser.add_argument(
         "--time-budget",

@@ -32,7 +32,7 @@ def fingerprint(capture: Capture, **settings: Any) -> str:
         digest.update(np.array([camera.fx, camera.fy, camera.cx, camera.cy]).tobytes())
         digest.update(np.ascontiguousarray(view.colour).data)
         if view.mask is not None:
-            digest.update(np.packbits(view.mask > 0.5).tobytes())
+            digest.update(np.ascontiguousarray(view.mask).data)
     return digest.hexdigest()
 
 

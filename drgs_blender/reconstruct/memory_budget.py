@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from ..core.errors import UsageError
-from ..core.memory import total_memory
+from ..core.memory import available_memory, total_memory
 
 #: Part of the memory that one thing may take.
 _SHARE = 0.5
 
 
 def fitting(needed: float, value: int, power: int, margin: int = 0) -> int:
-    """The largest value, up to the one that needs `needed` bytes, with which one thing fits; see `check_fits`."""
-    share = min(_SHARE * total_memory() / needed, 1.0)
+    """The largest value, up to the one that needs `needed` bytes, with which one thing fits in free memory, too."""
+    share = min(_SHARE * total_memory() / needed, available_memory() / needed, 1.0)
     return max(int((value + margin) * share ** (1 / power)) - margin, 1)
 
 
@@ -32,5 +32,6 @@ def check_fits(needed: float, subject: str, of: str, option: str, value: int, po
     """
     total = total_memory()
     if needed > _SHARE * total:
+        fitting = int((value + margin) * (_SHARE * total / needed) ** (1 / power)) - margin
         problem = f"is {needed / 2**30:.2g} GiB of {of}, this machine has {total / 2**30:.2g} GiB of memory"
-        raise UsageError(subject, problem, f"Give {option} {fitting(needed, value, power, margin)} or less")
+        raise UsageError(subject, problem, f"Give {option} {max(fitting, 1)} or less")

@@ -17,6 +17,7 @@ from ..compute.prepare import PHASE, prepare_kernels
 from ..core.arrays import Array
 from ..core.asset.model import BASE_CHANNELS, Asset, Binding, Environment, Mesh, Surfels
 from ..core.errors import Cancelled, WriteError, first_of
+from ..core.frame import Camera
 from ..deform.binding import bind
 from ..deform.mesh_driven import MeshDriven
 from ..geometry.normals import VertexNormals
@@ -28,7 +29,7 @@ from .gpu.select_backend import select_backend
 from .inverse_rendering.run import Decoupled, decouple
 from .jit_warmup import warm_up
 from .losses.photometric import Photograph, structural_similarity
-from .meshing.depth_fusion import fuse, grid
+from .meshing.depth_fusion import MOST, fuse, grid, voxels_that_fit
 from .meshing.normal_integration import follow_normals, shaded_by, shaded_by_own
 from .meshing.silhouette_fit import fill_silhouettes
 from .meshing.surfel_normals import with_surfel_normals
@@ -50,6 +51,8 @@ ON_MESH = 0.4
 SURFEL_TIME_FRACTION, MESH_SURFEL_TIME_FRACTION = 0.45, 0.15
 #: Part of the time budget for materials and light.
 MATERIAL_TIME_FRACTION = 0.35
+#: Voxels where none are asked for and each face gets a surfel, or time decides.
+FEW_VOXELS = 256
 #: Fewer steps of materials than this separate them poorly from the light.
 FEW_STEPS = 300
 #: Phase -> the settings that decide its result.
@@ -124,9 +127,10 @@ def reconstruct(
     settings.check()
     if idle := settings.without_effect():
         log.warning("%s: no effect with variant %s, materials %s", first_of(idle), settings.variant, settings.materials)
-    work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)
     region = find_region(capture)
-    grid([view.camera for view in capture.training], region, settings.mesh_resolution)  # before minutes of learning
+    voxels = _voxels(settings, [view.camera for view in capture.training], region)
+    settings = replace(settings, mesh_resolution=voxels)  # for the asset, and a run that goes on with other memory
+    work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)
     prepare_kernels(("reconstruct",), lambda phase, part: work.on_progress(Progress(phase, part)), work.cancelled)
     if settings.minutes is not None:
         work.on_progress(Progress(PHASE, 0.0))
@@ -135,9 +139,10 @@ def reconstruct(
         capture, region, settings.schedule, seconds=work.seconds(SURFEL_TIME_FRACTION), backend=work.backend
     )
     free = work.learn("surfels", training, 0.0, 0.5)
+    del training  # and the photographs that it keeps in memory
     work.on_progress(Progress("mesh", 0.5, len(free)))
     report: dict[str, Any] = {"views": len(capture.training), "left_out": len(capture.testing), "steps": work.steps}
-    mesh, report["mesh"] = mesh_of(free, capture, region, settings.mesh_resolution)
+    mesh, report["mesh"] = mesh_of(free, capture, region, voxels)
     final: Gaussians = free
     binding: Binding | None = None
     if settings.variant == "m":
@@ -177,13 +182,23 @@ def reconstruct(
     return Asset(surfels, mesh, binding, environment, provenance)
 
 
-def mesh_of(gaussians: Gaussians, capture: Capture, region: Region, resolution: int | None = None) -> tuple[Mesh, dict]:
+def mesh_of(gaussians: Gaussians, capture: Capture, region: Region, resolution: int = MOST) -> tuple[Mesh, dict]:
     """Mesh of surfels as the training views see them (`depth_fusion.fuse`), with the outlines of their masks."""
     cameras = [view.camera for view in capture.training]
     mesh, report = fuse(gaussians, cameras, region, resolution)
     if (masks := silhouettes(capture)) is not None:
         mesh.vertices = fill_silhouettes(mesh, cameras, masks)
     return mesh, report
+
+
+def _voxels(settings: Settings, cameras: list[Camera], region: Region) -> int:
+    """Voxels along the mesh's longest side, known before minutes of learning; errors as of `depth_fusion.grid`."""
+    resolution = settings.mesh_resolution
+    if resolution is None:
+        few = settings.variant == "m" or settings.minutes is not None
+        resolution = voxels_that_fit(cameras, region, FEW_VOXELS if few else MOST)
+    grid(cameras, region, resolution)
+    return resolution
 
 
 class _Work:

@@ -49,7 +49,8 @@ class Settings:
     schedule : Schedule
         How surfels are learned.
     mesh_resolution : int, optional
-        Most voxels along the mesh's longest side, none smaller than a pixel; None: 512, or as many as memory holds.
+        Most voxels along the mesh's longest side, none smaller than a pixel; None: 512 or as many as memory holds, and
+        256 where surfels are made on its faces or time decides.
     minutes : float, optional
         The time budget of all stages together, once kernels are compiled; None: the steps decide.
     materials : bool

@@ -106,6 +106,37 @@ def test_cameras_that_are_imported_again_are_renewed(scene, capture):
     assert len(group.objects) == 5 and len(bpy.data.collections) == 1
 
 
+def test_a_copy_and_pictures_of_the_user_stay_when_cameras_are_renewed(scene, capture):
+    folder, frames = capture
+    bpy.ops.drgs.import_cameras(filepath=str(folder))
+    group = bpy.data.collections["Cameras of statue"]
+    first = group.objects["photo_2"]
+    copy = first.copy()
+    copy.data = first.data.copy()
+    group.objects.link(copy)
+    copy.matrix_world.translation = (9, 9, 9)
+    first.matrix_world.translation = (5, 5, 5)
+    own = first.data.background_images.new()
+    own.image = bpy.data.images.new("grid", 4, 4)
+    bpy.ops.drgs.import_cameras(filepath=str(folder))
+    bpy.context.view_layer.update()
+    assert copy.matrix_world.translation[:] == (9, 9, 9)
+    assert first.matrix_world.translation[:] == pytest.approx([row[3] for row in frames[2]["transform_matrix"][:3]])
+    assert sorted(one.image.name for one in first.data.background_images) == ["grid", "photo_2.png"]
+
+
+def test_a_photograph_beside_a_capture_is_not_taken_for_it_and_damage_is_named(scene, capture):
+    folder, _ = capture
+    (folder / "other").mkdir()
+    (folder / "other" / "lens.png").touch()
+    with pytest.raises(RuntimeError, match=r"lens.png: is no photograph of the capture .*statue"):
+        bpy.ops.drgs.import_cameras(filepath=str(folder / "other" / "lens.png"))
+    (folder / "transforms.json").write_text('{"frames": [')
+    with pytest.raises(RuntimeError) as told:
+        bpy.ops.drgs.import_cameras(filepath=str(folder / "images" / "photo_0.png"))
+    assert "transforms.json" in str(told.value)
+
+
 @pytest.fixture
 def bare_python(tmp_path, monkeypatch):
     """Path of a Python without DR-GS, which DRGS_ENGINE names."""

@@ -26,8 +26,10 @@ from drgs_blender.reconstruct.inverse_rendering.losses import blotches, dullness
 from drgs_blender.reconstruct.inverse_rendering.materials import Materials, from_specular  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.pixels import foreground_pixels  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.radiance_cache import radiance_cache  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.regularisers import Regularisers, fineness  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.run import Decoupled, decouple  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.surface import SurfaceSamples  # noqa: E402
 from drgs_blender.render.integrator.integrate import integrate as kernel_integrate  # noqa: E402
 from drgs_blender.render.lights.environment import EnvironmentLight  # noqa: E402
 from drgs_blender.render.pipeline import render  # noqa: E402
@@ -677,19 +679,22 @@ def test_black_and_unfinished_photographs_do_no_harm(ball, capture):
     assert all(np.isfinite(array).all() for array in arrays(found))
 
 
-def test_smoothness_is_that_of_the_same_slope_on_finer_meshes():
-    """Of a sheet whose albedo rises evenly: shorter edges differ less, and weigh more."""
-    losses, grids = [], []
+def test_the_same_slope_is_smoothed_as_much_on_finer_meshes():
+    """Of a sheet whose materials change evenly: along shorter edges they differ less, and weigh more."""
+    smooth, pulled = [], []
     for cells in (100, 400, 800):  # edges of that part of the sheet: the first is coarser than 1/200
         place = np.linspace(0, 1, cells + 1)
         x, y = np.meshgrid(place, place, indexing="ij")
         corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).reshape(-1)
         faces = np.stack([corner, corner + cells + 1, corner + 1], -1)
         sheet = plain_mesh(np.stack([x, y, 0 * x], -1).reshape(-1, 3), faces)
-        settings = Settings().for_mesh(sheet)
-        edges = np.linalg.norm(sheet.vertices[faces[:, 0]] - sheet.vertices[faces[:, 1]], axis=1)
-        losses.append(settings.smoothness * edges.mean())
-        grids.append(settings.coarse)
-        assert settings.normal_smoothness / Settings().normal_smoothness == settings.smoothness / Settings().smoothness
-    assert losses[0] == pytest.approx(2 * losses[1], rel=0.01) and losses[1] == pytest.approx(losses[2], rel=0.01)
-    assert grids == [3, 4, 5] and Settings(coarse=0).for_mesh(sheet).coarse == 0
+        settings = Settings(metal_smoothness=0, metal_albedo_prior=0)
+        held = Regularisers(faces, np.full((len(sheet.vertices), 3), 0.5), settings, fineness(sheet))
+        edge = np.arange(0, len(held._edges), 7)
+        slope = torch.from_numpy(sheet.vertices[:, :1].astype(np.float32))
+        ends = torch.from_numpy(held.edges(edge).astype(np.int64))
+        samples = SurfaceSamples(slope.expand(-1, 5), slope, slope.expand(-1, 5), torch.ones(len(slope), 3), ends)
+        pulled.append(float(held.of_normals(samples)))
+        smooth.append(float(held.of_materials(samples, edge, True, True)))
+    assert smooth[0] == pytest.approx(2 * smooth[1], rel=0.02) and smooth[1] == pytest.approx(smooth[2], rel=0.02)
+    assert pulled[0] == pytest.approx(pulled[1]) and pulled[1] == pytest.approx(pulled[2])  # no difference along edges

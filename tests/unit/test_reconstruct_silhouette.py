@@ -118,10 +118,9 @@ def test_more_voxels_than_memory_are_refused_with_how_many_fit(cameras, monkeypa
     with pytest.raises(UsageError):
         depth_fusion.fuse(None, sharp, region, fitting + 2)  # type: ignore[arg-type]
     # where none are asked for, as many as fit are taken, and told
-    _, voxel, _ = depth_fusion.grid(sharp, region)
-    assert f"gets {fitting} voxels" in caplog.text and voxel == pytest.approx(2 * RADIUS / fitting)
-    _, taken, _ = depth_fusion.grid(sharp, region, fitting)
-    assert taken == pytest.approx(voxel)
+    assert depth_fusion.voxels_that_fit(sharp, region, 1024) == fitting
+    assert f"gets {fitting} voxels" in caplog.text
+    assert depth_fusion.voxels_that_fit(sharp, region, 20) == 20
 
 
 @pytest.mark.parametrize("pixels", [-1.2, 0.8])

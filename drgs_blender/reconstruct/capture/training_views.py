@@ -1,7 +1,7 @@
 """Training views: over one background, cropped to the object, in full and half size, with what never changes computed.
 
-Beyond its mask a view shows the background alone. What is left of it around the object is wide enough to show surfels
-that stray.
+Beyond its mask a view teaches nothing but the background. What is left of it around the object is wide enough to show
+surfels that stray.
 """
 
 from __future__ import annotations
@@ -22,8 +22,10 @@ from .capture import Capture, View
 
 #: Pixels of all views up to which what SSIM knows of photographs beforehand is kept: 24 bytes each.
 MAX_CACHED_PIXELS = 30_000_000
-#: Margin of a crop around the mask: in parts of the mask's longer side, and at least pixels.
+#: Margin of a crop around the mask: in parts of the mask's longer side, and in pixels at the least.
 MARGIN, LEAST_MARGIN = 0.1, 16
+#: Mask up to which a pixel shows no object: what compression leaves of 0.
+TRACE = 0.02
 #: Background given to photographs whose masks take their real one away, sRGB.
 GREY = (0.5, 0.5, 0.5)
 
@@ -43,8 +45,8 @@ class Target:
     background : (h, w, 3) tensor or None
         What is behind the surfels, sRGB; None: the one colour of `background_of`.
     share : float
-        Part of the view that is left of it, 0..1. Means over the crop count as much: a pixel of each view counts the
-        same.
+        Pixels of the crop in parts of the whole view's. Means over the crop count as much: a pixel of each view counts
+        the same.
     """
 
     camera: Camera
@@ -109,9 +111,9 @@ def targets(capture: Capture) -> list[list[Target]]:
 def _window(camera: Camera, mask: Array | None) -> tuple[int, int, int, int]:
     """Pixels (x0, y0, x1, y1) around the object, all where it is not to be seen; halves of x0 and y0 are whole."""
     whole = (0, 0, camera.width, camera.height)
-    if mask is None or not mask.any():
+    if mask is None or not (shown := mask > TRACE).any():
         return whole
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    rows, columns = np.flatnonzero(shown.any(1)), np.flatnonzero(shown.any(0))
     margin = max(LEAST_MARGIN, math.ceil(MARGIN * max(np.ptp(rows), np.ptp(columns))))
     x0, y0 = (max(int(at[0]) - margin, 0) // 2 * 2 for at in (columns, rows))
     x1, y1 = (min(int(at[-1]) + 1 + margin, size) for at, size in ((columns, camera.width), (rows, camera.height)))

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...core.asset.model import Mesh
 from .environment import LearnedLight, colour_cast
 from .losses import blotches, dullness
 from .radiance_cache import edges_of
@@ -18,6 +19,8 @@ Array = np.ndarray
 _SMOOTH = (1.0, 1.0, 1.0, 2.0, 10.0, 10.0, 10.0)
 #: Edges that are smoothed per step; how much photographed chroma may differ along one that is.
 _EDGES, _CHROMA = 8192, 0.08
+#: Mean edge, in parts of the extent, of the meshes that weights were chosen on; finer ones count at most so many times.
+EDGE, FINEST = 1 / 200, 8.0
 
 
 class Regularisers:
@@ -29,10 +32,12 @@ class Regularisers:
     colours : (v, 3) float32 array
         Mean colour of the photographs at the vertices.
     settings : Settings
+    finer : float
+        `fineness` of the mesh: differences along edges weigh so many times more.
     """
 
-    def __init__(self, faces: Array, colours: Array, settings: Settings) -> None:
-        self._settings = settings
+    def __init__(self, faces: Array, colours: Array, settings: Settings, finer: float = 1.0) -> None:
+        self._settings, self._finer = settings, finer
         self._edges = edges_of(faces)
         self._likeness = _likeness(self._edges, colours)
 
@@ -62,10 +67,11 @@ class Regularisers:
         differences = (pair[:, 0] - pair[:, 1]).abs()
         likeness = torch.from_numpy(self._likeness[edge])[:, None]
         weights = torch.tensor(_SMOOTH[: samples.columns.shape[1]])
-        loss = s.smoothness * ((likeness * differences).mean(0) * weights).sum()
+        smoothness = s.smoothness * self._finer
+        loss = smoothness * ((likeness * differences).mean(0) * weights).sum()
         has_metals = has_metallic and knows_metals
         if s.metal_smoothness > 0 and has_metals:
-            loss = loss + s.metal_smoothness * s.smoothness * blotches(differences[:, :3], pair[:, :, 4], likeness)
+            loss = loss + s.metal_smoothness * smoothness * blotches(differences[:, :3], pair[:, :, 4], likeness)
         if s.binary_metallic_prior > 0 and has_metallic:
             loss = loss + s.binary_metallic_prior * (samples.materials[:, 4] * (1 - samples.materials[:, 4])).mean()
         if s.metal_albedo_prior > 0 and has_metals:
@@ -86,8 +92,18 @@ class Regularisers:
         if samples.offsets is None:
             return torch.zeros(())
         turned = samples.at_ends(samples.offsets)
-        loss = self._settings.normal_smoothness * (((turned[:, 0] - turned[:, 1]) ** 2).sum(1).mean())
-        return loss + 0.02 * self._settings.normal_smoothness * (samples.offsets**2).sum(1).mean()
+        alike = ((turned[:, 0] - turned[:, 1]) ** 2).sum(1).mean()
+        return self._settings.normal_smoothness * (self._finer * alike + 0.02 * (samples.offsets**2).sum(1).mean())
+
+
+def fineness(mesh: Mesh) -> float:
+    """How many times shorter edges are than those of the meshes that weights were chosen on, from 1 to `FINEST`.
+
+    Along shorter edges the same materials differ less, and a vertex is seen by fewer pixels.
+    """
+    corners = mesh.vertices[mesh.faces[:, :2]]
+    edge = float(np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1).mean())
+    return min(max(EDGE * float(np.ptp(mesh.vertices, axis=0).max()) / max(edge, 1e-30), 1.0), FINEST)
 
 
 def _likeness(edges: Array, colours: Array) -> Array:

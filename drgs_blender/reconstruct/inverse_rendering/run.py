@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from .lighting import Lighting
 from .losses import log_loss, unbiased_loss
 from .pixels import Normals, Pixels, foreground_pixels
 from .radiance_cache import filled, radiance_cache
-from .regularisers import Regularisers
+from .regularisers import Regularisers, fineness
 from .schedule import Schedule
 from .settings import Settings
 from .surface import Surface, SurfaceSamples
@@ -132,7 +133,7 @@ def decouple(
         raise UsageError(str(capture.source), "has no training view", "Leave fewer views out for the test")
     if len(capture.training) < 4:
         log.warning("only %d views: light and materials can hardly be separated", len(capture.training))
-    job = Job(capture, mesh, settings.for_mesh(mesh), checkpoint, backend, normals, start, now)
+    job = Job(capture, mesh, settings, checkpoint, backend, normals, start, now)
     schedule = job.schedule
     while schedule.going():
         if cancelled is not None and cancelled():
@@ -208,9 +209,11 @@ class Job:
         # without any detail: light is to explain shading before albedo can.
         mean = self._pixels.colour.mean(axis=0)
         self.lighting = Lighting(gatherer, settings, 2.5 * float(mean.mean()))
-        self.surface = Surface(mesh, settings, mean, normals is not None, start)
+        finer = fineness(mesh)
+        grids = settings.coarse and settings.coarse + round(math.log2(finer))
+        self.surface = Surface(mesh, replace(settings, coarse=grids), mean, normals is not None, start)
         colours = np.maximum(cache[:, 0] * 0.28209479, 0)
-        self._regularisers = Regularisers(mesh.faces, colours, settings)
+        self._regularisers = Regularisers(mesh.faces, colours, settings, finer)
         #: Logarithm of the brightness of the photographs, one each.
         self._exposure = torch.zeros(len(capture.training)) if settings.exposure else None
         self._adam = Adam(self._learned())

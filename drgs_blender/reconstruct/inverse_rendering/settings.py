@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
-import numpy as np
-
-from ...core.asset.model import Mesh
 from ...core.errors import UsageError
 from ..ranges import Part, Range, Weight, check
-
-#: Mean edge, in parts of the extent, of the meshes that the weights were chosen on; finer ones count as so many times.
-EDGE, FINEST = 1 / 200, 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,10 +39,11 @@ class Settings:
     light_rate : float
         First step size of the light, in log radiance.
     coarse : int
-        Also learn materials on this many nested grids of cells, which carry what many pixels agree on quickly; of finer
-        meshes on more, see `for_mesh`.
+        Also learn materials on this many nested grids of cells, which carry what many pixels agree on quickly. Where
+        edges are shorter than 1/200 of the mesh, on one more for each halving.
     smoothness : float
-        Weight of the differences of materials along edges, less where the photographs differ; see `for_mesh`.
+        Weight of the differences of materials along edges, less where the photographs differ; where edges are shorter
+        than 1/200 of the mesh, as many times more, at most 8.
     light_smoothness : float
         Weight of the differences of log radiance between neighbours in the environment.
     grey_light_prior : float
@@ -76,7 +70,7 @@ class Settings:
     normals : bool
         Also learn an offset of each vertex normal, held by `normal_smoothness`.
     normal_smoothness : float
-        Weight of the differences of these offsets along edges; see `for_mesh`.
+        Weight of the squared differences of these offsets along edges, as `smoothness` more on finer meshes.
     exposure : bool
         Also learn the brightness of every photograph.
     most_pixels : int
@@ -114,20 +108,6 @@ class Settings:
     exposure: bool = False
     most_pixels: Annotated[int, Range(1, 1 << 31)] = 2_000_000
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
-
-    def for_mesh(self, mesh: Mesh) -> Settings:
-        """As for meshes whose edges are `EDGE` of their extent, also on finer ones.
-
-        Along shorter edges the same materials differ less, and a vertex is seen by fewer pixels: smoothness counts the
-        slope, not the difference, and a grid more stands for each halving of the edges.
-        """
-        corners = mesh.vertices[mesh.faces[:, :2]]
-        edge = float(np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1).mean())
-        extent = float(np.ptp(mesh.vertices, axis=0).max())
-        finer = min(max(EDGE * extent / max(edge, 1e-30), 1.0), FINEST)
-        grids = round(math.log2(finer)) if self.coarse else 0
-        smooth = {name: getattr(self, name) * finer for name in ("smoothness", "normal_smoothness")}
-        return replace(self, coarse=self.coarse + grids, **smooth)
 
     def check(self, prefix: str = "decoupling.") -> None:
         """Raise UsageError on what cannot be used; `prefix` is put before names."""

@@ -27,10 +27,11 @@ log = logging.getLogger(__name__)
 TOGETHER = 32
 #: Least side of a voxel, pixels.
 PIXELS = 1.0
-#: Voxels along the longest side where none are asked for: with less memory than these take fewer, or none.
+#: Voxels along the longest side where none are asked for, at most and at least.
 MOST, FEWEST = 512, 16
-#: Voxels around the region.
+#: Voxels around the region, on each side and along an axis in all.
 _AROUND = 5
+_BEYOND = 2 * _AROUND + 2
 #: Bytes per voxel of `SignedDistanceField` at the most: sum, weight and count, the field, smoothed, and widened.
 _BYTES_PER_VOXEL = 24
 #: Standard deviation of the smoothing of the field, voxels: below it is the noise of the depth maps.
@@ -38,7 +39,7 @@ SMOOTH = 0.8
 
 
 def fuse(
-    gaussians: Gaussians, cameras: list[Camera], region: Region, resolution: int | None = None
+    gaussians: Gaussians, cameras: list[Camera], region: Region, resolution: int = MOST
 ) -> tuple[Mesh, dict[str, Any]]:
     """Mesh of what `cameras` see of the surfels.
 
@@ -48,7 +49,7 @@ def fuse(
     cameras : list of Camera
     region : Region
         Its box, slightly widened, is divided.
-    resolution : int, optional
+    resolution : int
         Most voxels along the longest side, see `grid`.
 
     Returns
@@ -77,39 +78,55 @@ def fuse(
     return mesh, report
 
 
-def grid(cameras: list[Camera], region: Region, resolution: int | None = None) -> tuple[Array, float, tuple[int, ...]]:
+def voxels_that_fit(cameras: list[Camera], region: Region, wanted: int) -> int:
+    """How many voxels of `grid` along the longest side the memory holds, at most those `wanted`; told if fewer.
+
+    Raises
+    ------
+    UsageError: there is hardly any memory.
+    """
+    count, needed = _size(_voxels(cameras, region, wanted)[2])
+    fewer = fitting(needed, count, 3, _BEYOND)
+    if fewer >= count:
+        return wanted
+    if fewer < FEWEST:
+        _check(count, needed)
+    log.warning(
+        "the mesh gets %d voxels along its longest side, of %d: more do not fit into the memory that is free. --voxels "
+        "asks for others", fewer, count,
+    )  # fmt: skip
+    return fewer
+
+
+def grid(cameras: list[Camera], region: Region, resolution: int = MOST) -> tuple[Array, float, tuple[int, ...]]:
     """First corner (3,) and side of the voxels of `fuse`, metres, and how many there are along each axis.
 
     None is smaller than `PIXELS` of the nearest quarter of views.
-
-    Parameters
-    ----------
-    cameras : list of Camera
-    region : Region
-    resolution : int, optional
-        Most voxels along the longest side; None: `MOST`, or as many as the memory holds.
 
     Raises
     ------
     UsageError: more than the memory holds.
     """
-    pixel = [float(np.linalg.norm(np.asarray(c.matrix_world)[:3, 3] - region.centre)) / c.fx for c in cameras]
-    smallest = PIXELS * float(np.quantile(pixel, 0.25))
-    low, voxel, shape = _voxels(region, resolution or MOST, smallest)
-    around, needed = 2 * _AROUND + 2, _BYTES_PER_VOXEL * float(np.prod(shape))
-    count = max(shape) - around
-    if resolution is None and FEWEST <= (fewer := fitting(needed, count, 3, around)) < count:
-        log.warning("the mesh gets %d voxels along its longest side: of %d there is no memory", fewer, count)
-        return _voxels(region, fewer, smallest)
-    check_fits(needed, "the mesh", "voxels", "--voxels", count, 3, around)
+    low, voxel, shape = _voxels(cameras, region, resolution)
+    _check(*_size(shape))
     return low, voxel, shape
 
 
-def _voxels(region: Region, resolution: int, smallest: float) -> tuple[Array, float, tuple[int, ...]]:
-    """`grid` of so many voxels along the longest side, of at least the `smallest` side."""
-    voxel = max(float((region.high - region.low).max()) / resolution, smallest)
+def _voxels(cameras: list[Camera], region: Region, resolution: int) -> tuple[Array, float, tuple[int, ...]]:
+    pixel = [float(np.linalg.norm(np.asarray(c.matrix_world)[:3, 3] - region.centre)) / c.fx for c in cameras]
+    side = float((region.high - region.low).max())
+    voxel = max(side / resolution, PIXELS * float(np.quantile(pixel, 0.25)))
     low, high = region.low - _AROUND * voxel, region.high + _AROUND * voxel
     return low, voxel, tuple(int(n) for n in np.ceil((high - low) / voxel).astype(int) + 1)
+
+
+def _size(shape: tuple[int, ...]) -> tuple[int, float]:
+    """Voxels along the region's longest side, and bytes of all."""
+    return max(shape) - _BEYOND, _BYTES_PER_VOXEL * float(np.prod(shape))
+
+
+def _check(count: int, needed: float) -> None:
+    check_fits(needed, "the mesh", "voxels", "--voxels", count, 3, _BEYOND)
 
 
 def surface_maps(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:

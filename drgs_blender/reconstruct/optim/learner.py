@@ -83,10 +83,10 @@ class Learner:
         self.optimiser.steps = self.light.steps = self.iteration
         with _one_thread():
             rendered, rays = self._render(target, part)
-            loss = target.share * self._loss(rendered, target, rays, part)
+            loss = self._loss(rendered, target, rays, part)
             if beside is not None:
                 loss = loss + self._schedule.patches * self._patch_loss(rendered, target, rays, beside)
-            loss.backward()
+            (target.share * loss).backward()
             self._optimise(part)
             squared = _squared_error(rendered, target)
         self.error = squared if not self.iteration else 0.98 * self.error + 0.02 * squared
