@@ -13,7 +13,7 @@ def forget_everything(*_: object) -> None:
     """Drop the state of the last file, so that nothing of it is seen in the next."""
     assets.forget()
     images.forget()
-    messages.history.clear()
+    messages.clear()
 
 
 @bpy.app.handlers.persistent

@@ -10,7 +10,7 @@ import logging
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Container
+from collections.abc import Callable, Collection, Container, Hashable
 from typing import NamedTuple
 
 log = logging.getLogger("drgs")
@@ -48,6 +48,30 @@ def withdraw(level: str, text: str) -> None:
         with contextlib.suppress(ValueError):  # another thread was quicker
             history.remove(message)
     warned.discard(text)
+    _owners.pop(text, None)
+
+
+def own(owner: Hashable, texts: Collection[str], noted: bool = False) -> None:
+    """The warnings that `owner` (a viewport, an export, the render) has now: those that nobody has left are withdrawn.
+
+    Those that are `noted` are messages already.
+    """
+    for text, owners in list(_owners.items()):
+        if owner in owners and text not in texts:
+            owners.discard(owner)
+            if not owners:
+                withdraw("WARNING", text)
+    for text in texts:
+        owners = _owners.setdefault(text, set())
+        if not (noted or owners):
+            note("WARNING", text)
+        owners.add(owner)
+
+
+def clear() -> None:
+    """Forget all messages; what holds still is said again by the next picture that has it."""
+    history.clear()
+    _owners.clear()
 
 
 def named_in(text: str, known: Container[str]) -> str:
@@ -55,6 +79,9 @@ def named_in(text: str, known: Container[str]) -> str:
     return next((name for name in (*re.findall(r'"([^"]+)"', text), text.partition(": ")[0]) if name in known), "")
 
 
+#: Who has a warning now, see `own`.
+_owners: dict[str, set[Hashable]] = {}
+_RENDER = "render"
 #: What the render under way has warned of, in this frame or in those before, and what the one before it had.
 warned: set[str] = set()
 _before: set[str] = set()
@@ -69,8 +96,9 @@ def begin_render() -> None:
 def end_picture() -> None:
     """A picture is there: take back what was warned of the render before it and holds no longer."""
     for text in _before - warned:
-        withdraw("WARNING", text)
+        _owners.setdefault(text, set()).add(_RENDER)
     _before.clear()
+    own(_RENDER, warned.copy(), noted=True)
 
 
 class Warnings:

@@ -117,7 +117,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     subpixel_samples: IntProperty(
         name="Sub-Pixel Samples",
         description="Positions per pixel among which samples are divided: edges and textures get smoother. 0 chooses: "
-        "an eighth of the samples where the camera sees surfels, from 4 to 16; where it sees meshes alone half, "
+        "an eighth of the samples, from 4 to 16, where surfels are visible to the camera; of meshes alone half, "
         "up to 16, and of more than 64 a quarter, up to 64",
         min=0,
         soft_max=64,

@@ -47,7 +47,8 @@ def main() -> None:
     for folder in options.photographs:
         name, folder_of_truth = folder.name, options.truth / folder.name
         learned, truth = read_truth(folder), read_truth(folder_of_truth)
-        assert truth is not None
+        if truth is None:
+            parser.error(f"{folder_of_truth} has no truth.json: name a folder of `drgs evaluate --make-scenes`")
         if learned is not None and learned.training_light != truth.training_light:
             parser.error(f"{folder} was photographed under {learned.training_light}, the truth {truth.training_light}")
         capture = read_capture(folder)
@@ -59,7 +60,9 @@ def main() -> None:
         asset = reconstruct(capture, settings)
         spent = processor_seconds() - begun, time.perf_counter() - wall
         side = max(capture.views[0].colour.shape[:2])
-        limit = "" if options.surfels is None else f", {options.surfels} surfels and {options.voxels} voxels"
+        asked = {"surfels": options.surfels, "voxels": options.voxels, "steps": options.iterations}
+        default = {"surfels": None, "voxels": None, "steps": Schedule().iterations}
+        limit = "".join(f", {value} {what}" for what, value in asked.items() if value != default[what])
         path = ASSETS / f"{name}-{side}{limit.replace(', ', '-').replace(' ', '-')}.drgs"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_asset(path, asset)
@@ -88,8 +91,8 @@ def main() -> None:
         print(name, *row, flush=True)
     body = (
         "Foregrounds under lights that were not photographed, scaled by one factor a channel; 256 x 256 pixels of the "
-        f"same test views judge all rows. {options.iterations} and 2500 steps; surfels and voxels follow the "
-        "photographs where nothing else stands there.\n\n"
+        f"same test views judge all rows. {Schedule().iterations} and {Settings().decoupling.iterations} steps, and "
+        "surfels and voxels that follow the photographs, where nothing else stands there.\n\n"
     )
     cells = [(key.split("|")[0], *cells) for key, cells in sorted(rows.items())]
     write_section("resolution", "Larger photographs", body + table(COLUMNS, cells))

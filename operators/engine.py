@@ -50,7 +50,7 @@ class DRGS_OT_clear_messages(DrgsOperator, bpy.types.Operator):
     bl_label = "Clear"
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        messages.history.clear()
+        messages.clear()
         return {"FINISHED"}
 
 

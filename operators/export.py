@@ -60,7 +60,8 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
         self.frame_start, self.frame_end, self.frame_step = scene.frame_start, scene.frame_end, scene.frame_step
         if not self.filepath:
             blend = bpy.data.filepath
-            self.filepath = str(Path(blend).with_suffix("")) if blend else "untitled"
+            stem = Path(blend).with_suffix("") if blend else "untitled"
+            self.filepath = f"{stem}{WRITTEN[self.format].extensions[0]}"
         self.check(context)
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}

@@ -95,6 +95,7 @@ def _export(
 ) -> Exported:
     wanted = Wanted.of(depsgraph.scene)
     assets: dict[str, tuple[int, int]] = {}
+    texts: list[str] = []
 
     def key_of(path: Path) -> str:
         return os.path.realpath(path)  # as the engine makes it; it is asked later, by the worker
@@ -103,7 +104,7 @@ def _export(
         frame = export_frame(
             depsgraph,
             key_of,
-            messages.Warnings(),
+            texts.append,
             camera=NO_CAMERA,
             cache=cache,
             is_visible=is_visible,
@@ -113,6 +114,7 @@ def _export(
         bakes.manager.drop(key)
         messages.note("ERROR", str(error))
         return Exported(error=str(error))
+    messages.own(("viewport", *key), dict.fromkeys(texts))
     bakes.manager.want(key, wanted.requests)
     for state in frame.objects:
         status = os.stat(state.asset)
@@ -140,4 +142,5 @@ def forget() -> None:
     """Drop all exported scenes."""
     for key in _scenes:
         bakes.manager.drop(key)
+        messages.own(("viewport", *key), ())
     _scenes.clear()

@@ -47,7 +47,7 @@ class ViewportState:
     picture, strips : the picture on the screen
     arriving, arrived : the next picture, and its strips that are on the graphics card
     since : time at which the first picture of this request was drawn
-    warned : warnings of the engine that are messages already
+    warned : warnings of the engine, of its latest pictures
     blur : how the picture is blurred, since the scene changed or the settings of that
     """
 
@@ -57,7 +57,7 @@ class ViewportState:
     arriving: Picture | None = None
     arrived: list[draw.Strip] = field(default_factory=list)
     since: float = 0.0
-    warned: set[str] = field(default_factory=set)
+    warned: list[str] = field(default_factory=list)
     blur: blurred.Blur = field(default_factory=blurred.Blur)
 
 
@@ -148,14 +148,9 @@ def _upload(viewport: ViewportState, picture: Picture) -> None:
         viewport.since = time.perf_counter()
     viewport.picture, viewport.strips = picture, viewport.arrived
     viewport.arriving, viewport.arrived = None, []
-    for text in picture.passes.warnings:
-        if text not in viewport.warned:
-            viewport.warned.add(text)
-            messages.note("WARNING", text)
-    if picture.fraction > 0.0:  # a coarse one shows less, and has less to say
-        for text in viewport.warned.difference(picture.passes.warnings):
-            viewport.warned.discard(text)
-            messages.withdraw("WARNING", text)
+    earlier = [] if picture.fraction > 0.0 else viewport.warned  # a coarse one knows less
+    viewport.warned = list(dict.fromkeys([*earlier, *picture.passes.warnings]))
+    messages.own(id(viewport), viewport.warned)
 
 
 def rows_of_strip(height: int, width: int) -> int:
@@ -206,8 +201,9 @@ def not_blurred() -> list[str]:
 
 def forget() -> None:
     """Drop all viewport states, so that nothing of the last file is shown in the next."""
-    for name in list(_viewports):
+    for name, viewport in list(_viewports.items()):
         worker.drop(name)
+        messages.own(id(viewport), ())
     _viewports.clear()
     scenes.forget()
 
@@ -292,7 +288,9 @@ def _poll() -> float | None:
     live = dict(_live())
     for name in set(_viewports) - set(live):
         worker.drop(name)
-        _viewports.pop(name).blur.withdraw()
+        gone = _viewports.pop(name)
+        gone.blur.withdraw()
+        messages.own(id(gone), ())
     arriving = {name for name, viewport in _viewports.items() if viewport.arriving is not None}
     # Each is read once: they go on counting.
     news, baked = worker.news, (bakes.manager.news, bakes.manager.status()[0])

@@ -318,8 +318,8 @@ class SceneCache:
         found += self.lights.warnings
         if not _LIT.isdisjoint(passes) and self._is_unlit():
             found.append(
-                "nothing lights the scene: it has no lamp that shines, its World is black and no material emits light. "
-                "Add a lamp, or give the World a colour or an environment image that is not black"
+                "nothing lights the scene: it has no lamp that shines, its World gives no light and no material emits "
+                "any. Add a lamp, or give the World a colour or an environment image that is not black"
             )
         bad = sum(light.bad_texels for light in (self.environment, self.background) if light is not None)
         if bad:

@@ -47,10 +47,10 @@ def test_a_warning_of_one_frame_of_an_animation_stays(scene, ball):
 def test_a_viewport_takes_back_what_its_whole_picture_no_longer_says(monkeypatch):
     views, messages = part("addon.viewport.views"), part("addon.messages")
     monkeypatch.setattr(views.draw, "strip", lambda *_: None)
-    messages.history.clear()
-    viewport = views.ViewportState()
+    messages.clear()
+    viewport, other = views.ViewportState(), views.ViewportState()
 
-    def show(fraction: float, *texts: str) -> list[str]:
+    def show(fraction: float, *texts: str, viewport=viewport) -> list[str]:
         passes = part("drgs_blender.ipc.protocol").Passes(
             {"Combined": np.zeros((2, 3, 4), np.float32)}, list(texts), {}
         )
@@ -63,3 +63,42 @@ def test_a_viewport_takes_back_what_its_whole_picture_no_longer_says(monkeypatch
     assert show(1.0, "dark") == ["dark"]
     assert show(1.0) == []
     assert show(1.0, "dark") == ["dark"], "it may come again"
+    assert show(1.0, "dark", viewport=other) == ["dark"], "it is said once"
+    assert show(1.0) == ["dark"], "another viewport has it still"
+    assert show(1.0, viewport=other) == []
+    show(1.0, "dark")
+    monkeypatch.setitem(views._viewports, "gone", viewport)
+    views.forget()
+    assert warned() == [], "with its viewport"
+
+
+def test_a_render_takes_back_only_what_no_viewport_has():
+    messages = part("addon.messages")
+    messages.clear()
+    messages.begin_render()
+    messages.Warnings(messages.warned)("dark")
+    messages.end_picture()
+    messages.own("viewport", ["dark"])
+    messages.begin_render()
+    messages.end_picture()
+    assert warned() == ["dark"]
+    messages.own("viewport", [])
+    assert warned() == []
+
+
+def test_what_an_export_of_the_viewport_warns_of_leaves_when_it_is_mended(scene, ball):
+    scenes = part("addon.viewport.scenes")
+    light = bpy.data.lights.new("Bad", "POINT")
+    light.energy = float("nan")
+    obj = bpy.data.objects.new("Bad", light)
+    scene.collection.objects.link(obj)
+
+    def export() -> list[str]:
+        graph = bpy.context.evaluated_depsgraph_get()
+        scenes.changed(graph)
+        scenes.exported(graph)
+        return warned('Light "Bad"')
+
+    assert len(export()) == 1 and len(export()) == 1
+    bpy.data.objects.remove(obj)
+    assert export() == []
