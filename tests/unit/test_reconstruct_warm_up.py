@@ -83,5 +83,5 @@ def test_too_little_time_for_materials_is_said(minutes, seconds, monkeypatch, ca
     reconstruct(balls(8, 24), replace(settings, minutes=minutes), told.append)
     assert bool(warmed) == any(progress.phase == PREPARING for progress in told) == (minutes is not None)
     assert ("materials got" in caplog.text) == limited
-    assert minutes is None or ("in their part of 0.01 minutes" in caplog.text and "give more minutes" in caplog.text)
-    assert not seconds or ("in their 0.2 seconds" in caplog.text and "give more seconds" in caplog.text)
+    assert minutes is None or ("in their part of 0.01 minutes" in caplog.text and "Give more minutes" in caplog.text)
+    assert not seconds or ("in their 0.2 seconds" in caplog.text and "decoupling.seconds=S" in caplog.text)
