@@ -82,22 +82,19 @@ def named_in(text: str, known: Container[str]) -> str:
 #: Who has a warning now, see `own`.
 _owners: dict[str, set[Hashable]] = {}
 _RENDER = "render"
-#: What the render under way has warned of, in this frame or in those before, and what the one before it had.
+#: What the render under way has warned of, in this frame or in those before.
 warned: set[str] = set()
-_before: set[str] = set()
 
 
 def begin_render() -> None:
     """A picture or an animation begins: each warning is given once, not with every frame."""
-    _before.update(warned)
+    for text in warned:  # also of a render that has no picture
+        _owners.setdefault(text, set()).add(_RENDER)
     warned.clear()
 
 
 def end_picture() -> None:
     """A picture is there: take back what was warned of the render before it and holds no longer."""
-    for text in _before - warned:
-        _owners.setdefault(text, set()).add(_RENDER)
-    _before.clear()
     own(_RENDER, warned.copy(), noted=True)
 
 

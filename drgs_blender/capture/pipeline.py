@@ -243,7 +243,7 @@ def _by_features(ready: Prepared, photos: list[Photo], ordered: bool, subject: s
                  cancelled: Callable[[], bool]) -> Registration:  # fmt: skip
     """Cameras by features; where pictures are missing once more, by features that views farther apart share.
 
-    Of frames, and of so many pictures that not all are matched, missing ones are not worth the time.
+    Of frames, and where there are too many pictures to match all, missing ones are not worth the time.
     """
     best: Registration | None = None
     affine = (False,) if ordered or len(photos) > features.EXHAUSTIVE else (False, True)

@@ -208,7 +208,7 @@ def as_lines(value: Any, depth: int = 0, whole: bool = True) -> Iterator[str]:
 
 
 def short_lines(report: dict[str, Any]) -> list[str]:
-    """At most `_MOST_LINES` lines of a description: where it has more, the longest parts are told in a few."""
+    """At most `_MOST_LINES` lines of a description: where it has more, the longest parts are shortened."""
     blocks = {key: list(as_lines({key: item}, whole=False)) for key, item in report.items()}
     for key in sorted(blocks, key=lambda name: -len(blocks[name])):
         if sum(map(len, blocks.values())) > _MOST_LINES and len(blocks[key]) > 1:

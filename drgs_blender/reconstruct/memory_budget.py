@@ -11,7 +11,11 @@ _SHARE = 0.5
 
 def fitting(needed: float, value: int, power: int, margin: int = 0) -> int:
     """The largest value, up to the one that needs `needed` bytes, with which one thing fits in free memory, too."""
-    share = min(_SHARE * total_memory() / needed, available_memory() / needed, 1.0)
+    return _reduced(min(_SHARE * total_memory() / needed, available_memory() / needed, 1.0), value, power, margin)
+
+
+def _reduced(share: float, value: int, power: int, margin: int) -> int:
+    """The value whose bytes are this share of those of `value`; at least 1."""
     return max(int((value + margin) * share ** (1 / power)) - margin, 1)
 
 
@@ -32,6 +36,6 @@ def check_fits(needed: float, subject: str, of: str, option: str, value: int, po
     """
     total = total_memory()
     if needed > _SHARE * total:
-        fitting = int((value + margin) * (_SHARE * total / needed) ** (1 / power)) - margin
+        reduced = _reduced(_SHARE * total / needed, value, power, margin)
         problem = f"is {needed / 2**30:.2g} GiB of {of}, this machine has {total / 2**30:.2g} GiB of memory"
-        raise UsageError(subject, problem, f"Give {option} {max(fitting, 1)} or less")
+        raise UsageError(subject, problem, f"Give {option} {reduced} or less")

@@ -174,7 +174,7 @@ def reconstruct(
         _copy_materials(surfels, mesh, binding)
         environment, origin = Environment(found.environment), "separated from the lighting"
         done, of = report["steps"]["materials"]
-        if done < min(FEW_STEPS, of):
+        if _are_few(done, of):
             origin = f"hardly separated from the lighting, in {done} of {of} steps: unreliable"
     learned = [view.name for view in capture.training]
     provenance: dict[str, Any] = {"capture": capture.name, "learned_from": learned, "variant": settings.variant}
@@ -309,7 +309,7 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: 
         start,
     )
     done, of = work.steps["materials"] = [found.report["iterations"], work.settings.decoupling.iterations]
-    if done < min(FEW_STEPS, of):
+    if _are_few(done, of):
         minutes = work.settings.minutes
         limit, option = f"{settings.seconds:g} seconds", "a larger --set decoupling.seconds=S"
         if minutes is not None:
@@ -321,6 +321,11 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: 
     # Without the clock: the same run gives the same bytes.
     report["decoupling"] = {key: value for key, value in found.report.items() if key != "seconds"}
     return found
+
+
+def _are_few(done: int, of: int) -> bool:
+    """Whether so few steps of materials, of those of the schedule, separate them poorly from the light."""
+    return done < min(FEW_STEPS, of)
 
 
 def _copy_materials(surfels: Surfels, mesh: Mesh, binding: Binding) -> None:

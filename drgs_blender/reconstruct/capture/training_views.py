@@ -96,10 +96,8 @@ def targets(capture: Capture) -> list[list[Target]]:
     for view, mask, (x0, y0, x1, y1) in zip(views, masks, windows, strict=True):
         whole = view.camera
         camera = replace(whole, width=x1 - x0, height=y1 - y0, cx=whole.cx - x0, cy=whole.cy - y0)
-        colour, share = (
-            composed(view, capture)[y0:y1, x0:x1],
-            camera.width * camera.height / (whole.width * whole.height),
-        )
+        colour = composed(view, capture)[y0:y1, x0:x1]
+        share = camera.width * camera.height / (whole.width * whole.height)
         if mask is not None:
             mask = np.ascontiguousarray(mask[y0:y1, x0:x1], np.float32)
         full.append(_target(camera, colour, mask, keep, share))
@@ -144,5 +142,6 @@ def pixel_rays(camera: Camera, device: torch.device | None = None) -> Tensor:
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = -(np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
     right, up, back = np.asarray(camera.matrix_world)[:3, :3].T
-    there = lambda a: torch.tensor(a, dtype=torch.float32, device=device)  # noqa: E731
-    return there(x[:, None] * right) + there(y[:, None] * up - back)[:, None]
+    across = torch.tensor(x[:, None] * right, dtype=torch.float32, device=device)
+    down = torch.tensor(y[:, None] * up - back, dtype=torch.float32, device=device)
+    return across + down[:, None]

@@ -19,7 +19,7 @@ Array = np.ndarray
 _SMOOTH = (1.0, 1.0, 1.0, 2.0, 10.0, 10.0, 10.0)
 #: Edges that are smoothed per step; how much photographed chroma may differ along one that is.
 _EDGES, _CHROMA = 8192, 0.08
-#: Mean edge, in parts of the extent, of the meshes that weights were chosen on; finer ones count at most so many times.
+#: Mean edge, in parts of the extent, of the meshes that weights were chosen on; and the most that finer ones count.
 EDGE, FINEST = 1 / 200, 8.0
 
 
@@ -33,7 +33,7 @@ class Regularisers:
         Mean colour of the photographs at the vertices.
     settings : Settings
     finer : float
-        `fineness` of the mesh: differences along edges weigh so many times more.
+        `fineness` of the mesh: the factor of differences along edges.
     """
 
     def __init__(self, faces: Array, colours: Array, settings: Settings, finer: float = 1.0) -> None:

@@ -56,7 +56,7 @@ class Training:
     region : Region
     schedule : Schedule
     surfels : int
-        At most so many: as the schedule and the photographs have it.
+        Their largest number, of the schedule and the photographs.
     targets : list of list of Target
         Training views in full and in half size.
     time_budget : TimeBudget
