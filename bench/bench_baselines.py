@@ -15,12 +15,14 @@ from typing import Any
 
 import numpy as np
 from bench_evaluate import mean, similarity, under_other_lights
+from other_methods import Baked, Prefiltered, split_sum
 from report import OUT, store_row, table, write_section
 
 from drgs_blender.cli.evaluate import session_renderer
 from drgs_blender.core.asset import Environment
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.frame import Camera, RenderSettings, Visibility
+from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.compare import Renderer, compare
 from drgs_blender.evaluate.truth import read_truth
@@ -47,35 +49,55 @@ class Method:
     learning : what of the decoupling differs; None: materials and light are not pulled apart
     rendering : what of the render settings differs
     visibility : which rays meet the object
+    picture : "lit"; "albedo", what is learned as such; or one of `other_methods`: "baked", "split sum"
     """
 
     learning: dict[str, Any] | None = field(default_factory=dict)
     rendering: dict[str, Any] = field(default_factory=lambda: {"bounces": 3})
     visibility: Visibility = field(default_factory=Visibility)
+    picture: str = "lit"
 
 
+#: By no ray but the camera's.
+UNSEEN = Visibility(diffuse=False, glossy=False, shadow=False)
 METHODS = {
     "DR-GS": Method(),
     "no metallic, the paper's lobe (as IRGS)": Method(
         {"parametrisation": "dielectric", "shading_model": "paper"}, {"bounces": 3, "shading_model": "paper"}
     ),
     "no shadows, no inter-reflection (as split-sum shading: Ref-Gaussian)": Method(
-        {"shadows": False, "indirect": False}, {"bounces": 0}, Visibility(diffuse=False, glossy=False, shadow=False)
+        {"shadows": False, "indirect": False}, {"bounces": 0}, UNSEEN
     ),
-    "colours of the day, carried along (as PhysGaussian, GaussianMesh, SuGaR, Mani-GS)": Method(None),
+    "split sum of each surfel, then blended (forward, as GS-ROR2)": Method(
+        {"shadows": False, "indirect": False}, {"bounces": 0}, UNSEEN, "split sum"
+    ),
+    "mean colours of the day, carried by faces (as GaussianMesh, SuGaR, Mani-GS)": Method(None, picture="albedo"),
+    "colours of the day with harmonics, carried by particles (as GSP, PhysGaussian)": Method(None, picture="baked"),
 }
 
 
 def renderer(session: Session, key: str, method: Method, samples: int) -> Renderer:
     """Renders as `method` does."""
     lit = session_renderer(session, key, RenderSettings(samples, **method.rendering), method.visibility)
+    asset = session.asset(key)
+    baked = Baked(asset) if method.picture == "baked" else None
+    lights: dict[int, Prefiltered] = {}
 
-    def photographed(camera: Camera, radiance: Array, vertices: Array | None) -> dict[str, Array]:
+    def draw(camera: Camera, radiance: Array, vertices: Array | None) -> dict[str, Array]:
         passes = lit(camera, radiance, vertices)
-        passes["Combined"] = np.concatenate([passes["Albedo"] * passes["Coverage"], passes["Coverage"]], axis=2)
+        if method.picture == "albedo":
+            passes["Combined"] = np.concatenate([passes["Albedo"] * passes["Coverage"], passes["Coverage"]], axis=2)
+        elif baked is not None:
+            passes["Combined"] = baked(camera, vertices)
+        elif method.picture == "split sum":
+            light = lights.get(id(radiance)) or lights.setdefault(id(radiance), Prefiltered(radiance))
+            assert asset.binding is not None
+            rest = asset.mesh.vertices if vertices is None else vertices
+            posed = MeshDriven(asset.mesh, asset.surfels, asset.binding).pose(rest)
+            passes["Combined"] = split_sum(posed, light, camera)
         return passes
 
-    return photographed if method.learning is None else lit
+    return draw
 
 
 def row(folder: Path, name: str, options: argparse.Namespace) -> list[str]:
@@ -120,8 +142,8 @@ def main() -> None:
         "of learning and of rendering; the integrals are ours, so the rows show what the idea costs and not what the "
         "original programs reach. PSNR of the foreground in dB; all but the views left out scaled by one factor a "
         "channel; SSIM and FLIP of scaled frames on white; relit: means over the lights that were not photographed. "
-        "Colours of the day are their mean over all "
-        "views: harmonics, which these methods have, would help them in the two columns of the day's light.\n\n"
+        "GSP simulates by XPBD; here its particles follow the true motion, so that the row is about driving and light "
+        "alone (`other_methods.py`).\n\n"
     )
     cells = [(*key.split("|"), *cells) for key, cells in rows.items()]
     write_section("baselines", "What other methods leave out", body + table(COLUMNS, cells))

@@ -2,6 +2,7 @@
 
 python bench/bench_normals.py --part chain --capture scenes/cat [--size 256]
 python bench/bench_normals.py --part relit --capture scenes/cat [--steps 1000]
+python bench/bench_normals.py --part prior --capture scenes/cat --size 128 [--steps 800]
 
 Scenes are those of `drgs evaluate --make-scenes scenes`. Surfels are learned once and kept, and so are rows, so that
 captures may be measured one by one.
@@ -21,6 +22,7 @@ from bench_evaluate import mean, score, under_other_lights
 from bench_reconstruct import first_hits, trained
 from bench_shape import VOXELS, Truth, true_depth
 from report import OUT, processor_seconds, store_row, table, write_section
+from scipy.ndimage import gaussian_filter
 
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.asset.model import Mesh
@@ -61,6 +63,17 @@ def learned(capture: Capture, name: str) -> Gaussians:
         tensors = {key: torch.from_numpy(kept[key]) for key in kept.files}
     light = tensors.pop("light")
     return Gaussians(tensors, light)
+
+
+#: Name -> degrees that a model's normals are off, and the weight and part of the steps that they have.
+PRIORS = {
+    "without normals of a model": (0.0, 0.0, 0.0),
+    "of a model 15 degrees off, as it is by default": (15.0, Schedule().normal_prior, Schedule().normal_prior_until),
+    "of the same, until .4": (15.0, Schedule().normal_prior, 0.4),
+    "true ones, weight 1, all the time": (0.0, 1.0, 1.0),
+}
+#: Deviations of what makes normals of a model of true ones: of the blur, and of the errors' width, pixels.
+BLUR, WIDE = 1.5, 6.0
 
 
 class Chain:
@@ -161,6 +174,40 @@ def relit(capture: Capture, folder: Path, name: str, steps: int) -> dict[str, li
     return found
 
 
+def as_a_model_sees(normals: np.ndarray, degrees: float, random: np.random.Generator) -> np.ndarray:
+    """Normals (h, w, 3), 0 where there are none, blurred, and turned anyhow by about as many degrees, alike nearby."""
+    if not degrees:
+        return normals
+    noise = gaussian_filter(random.normal(size=normals.shape), (WIDE, WIDE, 0))
+    noise *= np.tan(np.radians(degrees)) / np.sqrt((noise**2).sum(-1).mean())
+    return unit(gaussian_filter(normals, (BLUR, BLUR, 0)) + noise, (0, 0, 0)).astype(np.float32)
+
+
+def write_prior(capture: Capture, folder: Path, name: str, steps: int) -> None:
+    """Measure and write what normals of a model bring stage (i)."""
+    truth, rows = Truth(folder), {}
+    judge, maps = Chain(capture, truth), [truth.maps(view.camera) for view in capture.training]
+    for label, (degrees, weight, until) in PRIORS.items():
+        random = np.random.default_rng(0)
+        for view, (depth, normal) in zip(capture.training, maps, strict=True):
+            shown = as_a_model_sees(np.where((depth > 0)[..., None], normal, 0), degrees, random)
+            view.normals = np.where((depth > 0)[..., None], shown, 0).astype(np.float32)
+        schedule = Schedule(iterations=steps, normal_prior=weight, normal_prior_until=until)
+        training, figures = trained(capture, schedule, None)
+        mesh, _ = pipeline.mesh_of(training.gaussians, capture, training.region)
+        degrees_off = judge.surfels(training.gaussians), judge.mesh(mesh)
+        cells = [*(f"{value:.2f}" for value in (*degrees_off, figures["psnr"]))]
+        print(name, label, *cells, flush=True)
+        rows = store_row(FOLDER / "prior.json", f"{name}|{label}", cells)
+    body = (
+        f"{steps} steps. Normals as a model would give them are true ones of the training views, blurred, with smooth "
+        "errors. Normals in mean degrees and PSNR in dB in the views left out.\n\n"
+    )
+    head = ("Object-pixels", "Normals", "Surfels' own, deg", "Mesh, deg", "PSNR dB")
+    cells = [(*key.split("|"), *values) for key, values in rows.items()]
+    write_section("reconstruct-prior", "What normals of a model bring stage (i)", body + table(head, cells))
+
+
 def write_chain(capture: Capture, folder: Path, name: str, _: int) -> None:
     """Measure and write the chain."""
     rows = store_row(FOLDER / "chain.json", name, chain(capture, Truth(folder), name))
@@ -192,7 +239,11 @@ def write_relit(capture: Capture, folder: Path, name: str, steps: int) -> None:
     )
 
 
-PARTS: dict[str, Callable[[Capture, Path, str, int], None]] = {"chain": write_chain, "relit": write_relit}
+PARTS: dict[str, Callable[[Capture, Path, str, int], None]] = {
+    "chain": write_chain,
+    "relit": write_relit,
+    "prior": write_prior,
+}
 
 
 def main() -> None:

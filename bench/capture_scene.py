@@ -5,7 +5,9 @@
 Cycles renders an object, the cat of the examples unless another is named, from two rings of hand-held cameras.
 `FOLDER/images` has the pictures without cameras or masks; `FOLDER/truth.json` the true cameras: camera to world,
 Blender's axes, metres; `FOLDER/truth` the true masks, the object's coverage. With `--sheet`, the picture of a marker
-sheet on A4 lies under the object; with `--camouflage` the object has the table's picture.
+sheet on A4 lies under the object; with `--camouflage` the object has the table's picture; with `--clutter` other
+things stand around it. With `--relit` the object alone is rendered under another sky, from cameras of its own, into
+`FOLDER/relit`: a capture with masks, whose `transforms.json` has true cameras.
 """
 
 from __future__ import annotations
@@ -28,6 +30,9 @@ from cycles_job import add_world, reset  # noqa: E402
 HEIGHT, TABLE, DISTANCE = 0.16, 1.2, 0.55
 A4 = (0.210, 0.297)
 GROUND = ("table", "sheet")
+#: Things around the object: distance and side, metres, and colour.
+CLUTTER = ((0.24, 0.07, (0.6, 0.1, 0.08)), (0.27, 0.1, (0.1, 0.3, 0.6)), (0.22, 0.05, (0.7, 0.6, 0.2)),
+           (0.29, 0.08, (0.2, 0.5, 0.2)), (0.25, 0.06, (0.8, 0.8, 0.8)))  # fmt: skip
 
 
 def picture_material(name: str, image: bpy.types.Image) -> bpy.types.Material:
@@ -66,6 +71,25 @@ def plane(name: str, width: float, height: float, z: float, image: bpy.types.Ima
     bpy.context.collection.objects.link(bpy.data.objects.new(name, mesh))
 
 
+def clutter() -> None:
+    """Boxes around the object, turned anyhow."""
+    for k, (distance, side, colour) in enumerate(CLUTTER):
+        angle = 2 * math.pi * (k + 0.3) / len(CLUTTER)
+        place = (distance * math.cos(angle), distance * math.sin(angle), side / 2)
+        bpy.ops.mesh.primitive_cube_add(size=side, location=place, rotation=(0, 0, 2.1 * k))
+        box = bpy.context.object
+        box.name = f"clutter {k}"
+        material = bpy.data.materials.new(box.name)
+        material.use_nodes = True
+        material.node_tree.nodes["Principled BSDF"].inputs["Base Color"].default_value = (*colour, 1.0)
+        box.data.materials.append(material)
+
+
+def is_subject(obj: bpy.types.Object) -> bool:
+    """Whether an object belongs to what is photographed, not to what it stands on or among."""
+    return obj.name not in GROUND and not obj.name.startswith("clutter")
+
+
 def stand(path: Path) -> list[bpy.types.Object]:
     """Import the object, `HEIGHT` high, its feet at the origin; its meshes."""
     if path.suffix.lower() == ".obj":
@@ -74,7 +98,7 @@ def stand(path: Path) -> list[bpy.types.Object]:
         bpy.ops.import_scene.gltf(filepath=str(path))
     bpy.context.view_layer.update()
     graph = bpy.context.evaluated_depsgraph_get()
-    meshes = [obj for obj in bpy.data.objects if obj.type == "MESH" and obj.name not in GROUND and not obj.hide_render]
+    meshes = [obj for obj in bpy.data.objects if obj.type == "MESH" and is_subject(obj) and not obj.hide_render]
     parts = []
     for obj in meshes:
         posed = obj.evaluated_get(graph)
@@ -83,7 +107,7 @@ def stand(path: Path) -> list[bpy.types.Object]:
     low, high = vertices.min(0), vertices.max(0)
     scale = HEIGHT / (high[2] - low[2])
     foot = Vector((*((low + high) / 2)[:2], low[2]))
-    for obj in (obj for obj in bpy.data.objects if obj.parent is None and obj.name not in GROUND):
+    for obj in (obj for obj in bpy.data.objects if obj.parent is None and is_subject(obj)):
         obj.matrix_world = Matrix.Scale(scale, 4) @ Matrix.Translation(-foot) @ obj.matrix_world
     return meshes
 
@@ -121,19 +145,38 @@ def cameras(count: int, seed: int, elevations: tuple[float, float]) -> list[Matr
     return found
 
 
-def render_masks(scene: bpy.types.Scene, camera: bpy.types.Object, places: dict[str, Matrix], folder: Path) -> None:
-    """Coverage by the object alone, which nothing stands before."""
-    for name in GROUND:
-        if name in bpy.data.objects:
-            bpy.data.objects[name].hide_render = True
-    scene.render.film_transparent, scene.cycles.max_bounces, scene.cycles.use_denoising = True, 0, False
+def show_alone(scene: bpy.types.Scene) -> None:
+    """Of all, leave the object, which nothing stands before, on a transparent film."""
+    for obj in bpy.data.objects:
+        if obj.type == "MESH" and not is_subject(obj):
+            obj.hide_render = True
+    scene.render.film_transparent = True
     scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
+
+
+def render_all(scene: bpy.types.Scene, places: dict[str, Matrix], folder: Path) -> None:
+    """A picture from each camera: what is not there yet."""
+    folder.mkdir(parents=True, exist_ok=True)
     for name, matrix in places.items():
-        target = folder / f"{Path(name).stem}.png"
-        if not target.exists():
-            camera.matrix_world = matrix
-            scene.render.filepath = str(target)
+        if not (folder / name).exists():
+            scene.camera.matrix_world = matrix
+            scene.render.filepath = str(folder / name)
             bpy.ops.render.render(write_still=True)
+
+
+def render_relit(scene: bpy.types.Scene, args: argparse.Namespace, focal: float) -> None:
+    """The object under the other sky, from a third of as many cameras as photographs are of."""
+    add_world(scene, str(args.relit.resolve()), 0.0, 1.0)
+    scene.cycles.max_bounces, scene.cycles.use_denoising = 4, True
+    scene.cycles.samples = 4 * args.samples
+    views = cameras(max(args.pictures // 3, 2), 9, args.elevations)
+    places = {f"view_{k:03d}.png": matrix for k, matrix in enumerate(views)}
+    render_all(scene, places, args.folder / "relit")
+    width, height = scene.render.resolution_x, scene.render.resolution_y
+    lens = {"fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2, "w": width, "h": height}
+    frames = [{"file_path": name, "transform_matrix": [list(row) for row in matrix]} for name, matrix in places.items()]
+    data = lens | {"camera_model": "PINHOLE", "applied_transform": np.eye(4)[:3].tolist(), "frames": frames}
+    (args.folder / "relit" / "transforms.json").write_text(json.dumps(data))
 
 
 def main() -> None:
@@ -149,13 +192,17 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--denoise", action="store_true")
     parser.add_argument("--sheet", type=Path)
+    parser.add_argument("--clutter", action="store_true", help="other things stand around the object")
     parser.add_argument("--world", type=Path, required=True)
+    parser.add_argument("--relit", type=Path, help="another sky, under which the object alone is rendered")
     args = parser.parse_args()
     scene = reset()
     table = table_picture(args.seed)
     plane("table", TABLE, TABLE, -0.0005, table)
     if args.sheet:
         plane("sheet", *A4, 0.0, bpy.data.images.load(str(args.sheet.resolve())))
+    if args.clutter:
+        clutter()
     meshes = stand(args.object.resolve())
     if args.camouflage:
         cover(meshes, table, whole=True)
@@ -166,26 +213,25 @@ def main() -> None:
     scene.cycles.samples, scene.cycles.use_denoising = args.samples, args.denoise
     scene.cycles.max_bounces, scene.render.use_persistent_data = 2, True
     scene.render.resolution_x, scene.render.resolution_y = args.size, args.size * 3 // 4
+    if args.relit:  # what is judged in linear light must not have passed through a film's curve
+        scene.view_settings.view_transform = "Standard"
     scene.render.image_settings.file_format = "JPEG"
     scene.render.image_settings.quality = 95
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     camera.data.lens, camera.data.sensor_width, camera.data.clip_start = 40.0, 36.0, 0.01
     scene.collection.objects.link(camera)
     scene.camera = camera
-    images = args.folder / "images"
-    images.mkdir(parents=True, exist_ok=True)
     places = {f"photo_{k:03d}.jpg": matrix for k, matrix in enumerate(cameras(args.pictures, 5, args.elevations))}
-    truth = {
-        "focal": args.size * camera.data.lens / camera.data.sensor_width,
-        "frames": {name: [list(row) for row in matrix] for name, matrix in places.items()},
-    }
+    focal = args.size * camera.data.lens / camera.data.sensor_width
+    args.folder.mkdir(parents=True, exist_ok=True)
+    truth = {"focal": focal, "frames": {name: [list(row) for row in matrix] for name, matrix in places.items()}}
     (args.folder / "truth.json").write_text(json.dumps(truth))
-    for name, matrix in places.items():
-        if not (images / name).exists():
-            camera.matrix_world = matrix
-            scene.render.filepath = str(images / name)
-            bpy.ops.render.render(write_still=True)
-    render_masks(scene, camera, places, args.folder / "truth")
+    render_all(scene, places, args.folder / "images")
+    show_alone(scene)
+    scene.cycles.max_bounces, scene.cycles.use_denoising = 0, False
+    render_all(scene, {f"{Path(name).stem}.png": matrix for name, matrix in places.items()}, args.folder / "truth")
+    if args.relit:
+        render_relit(scene, args, focal)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ LIBRARIES = {
     "opencv": Library("cv2", "opencv-python-headless>=4.10", "marker sheets and masks"),
     "av": Library("av", "av>=14", "video"),
     "torch": Library("torch", "torch>=2.5", "masks"),
-    "onnxruntime": Library("onnxruntime", "onnxruntime>=1.20", "masks by a segmentation model"),
+    "onnxruntime": Library("onnxruntime", "onnxruntime>=1.20", "masks and normals by a model"),
     "rawpy": Library("rawpy", "rawpy>=0.24", "camera raw files"),
 }
 

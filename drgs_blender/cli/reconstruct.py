@@ -60,6 +60,7 @@ OPTIONS = {
     "axes": "capture.axes",
     "up": "capture.up",
     "masks": "capture.masks",
+    "normals": "capture.normals",
 }
 
 #: Seconds between two lines of progress on stdout.
@@ -122,6 +123,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "surroundings are learned, too",
     )
     parser.add_argument(
+        "--normals",
+        metavar="FILE",
+        help="FILE.onnx: a model of normals that you have, which the first part of learning follows; default none",
+    )
+    parser.add_argument(
         "--device",
         choices=("cpu", "cuda"),
         help="device of the optimisation: cpu or cuda; falls back to cpu. Default cpu",
@@ -162,14 +168,19 @@ def run(args: argparse.Namespace) -> int:
 
     reconstruct = reconstruction()
     from ..capture.masks.stage import check_mode
+    from ..capture.normal_model import load_model
     from ..reconstruct.readers import read_capture
-    from ..reconstruct.settings_table import as_tables
+    from ..reconstruct.settings_table import NONE, as_tables
 
     check_mode(reading.masks)
+    if reading.normals != NONE:
+        load_model(reading.normals)
     source = _with_cameras(args, reading.masks)
     capture = read_capture(source, reading.resolution, reading.test_every, reading.axes, reading.up)
     if source == args.capture or reading.masks == "none":  # else `drgs capture` has made them
         _mask(args, capture, reading.masks)
+    if reading.normals != NONE:
+        _give_normals(args, capture, reading.normals)
     logger.info("%d views to learn from, %d left out", len(capture.training), len(capture.testing))
     work = args.out.with_name(f"{args.out.stem}.reconstruct")
 
@@ -294,6 +305,14 @@ def _mask(args: argparse.Namespace, capture: Capture, masks: str) -> None:
     with interruptible() as cancelled, FractionBar(args, "finding the object", every=WORK_SECONDS) as bar:
         sheet = args.out.with_name(f"{args.out.stem}.masks.png")
         mask_capture(capture, masks, sheet, _telling(args, bar), cancelled)
+
+
+def _give_normals(args: argparse.Namespace, capture: Capture, model: str) -> None:
+    """Ask a model for the normals of the photographs."""
+    from ..capture.normal_model import give_normals
+
+    with interruptible() as cancelled, FractionBar(args, "normals", every=WORK_SECONDS) as bar:
+        give_normals(capture, model, _telling(args, bar), cancelled)
 
 
 def clear(folder: Path) -> None:

@@ -23,7 +23,10 @@ log = logging.getLogger(__name__)
 
 
 def fingerprint(capture: Capture, **settings: Any) -> str:
-    """Digest of what a state depends on: photographs, masks, cameras, settings that JSON can hold, and this version."""
+    """Digest of what a state depends on.
+
+    Photographs, masks, normals, cameras, settings that JSON can hold, and this version.
+    """
     digest = hashlib.sha256(__version__.encode() + json.dumps(settings, sort_keys=True, default=str).encode())
     for view in capture.views:
         camera = view.camera
@@ -31,8 +34,9 @@ def fingerprint(capture: Capture, **settings: Any) -> str:
         digest.update(np.asarray(camera.matrix_world, np.float64).tobytes())
         digest.update(np.array([camera.fx, camera.fy, camera.cx, camera.cy]).tobytes())
         digest.update(np.ascontiguousarray(view.colour).data)
-        if view.mask is not None:
-            digest.update(np.ascontiguousarray(view.mask).data)
+        for layer in (view.mask, view.normals):
+            if layer is not None:
+                digest.update(np.ascontiguousarray(layer).data)
     return digest.hexdigest()
 
 

@@ -13,7 +13,7 @@ from .ranges import Range, check
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """How photographs are read, see `readers.read_capture` and `masks.of_capture.mask_capture`.
+    """How photographs are read, see `readers.read_capture`, `masks.of_capture` and `normal_model`.
 
     Attributes
     ----------
@@ -29,6 +29,9 @@ class Reading:
         "given" uses masks that are there; "auto" makes them where there are none, of an object on a ground that shows
         texture; an ONNX file, or its name, makes them by this segmentation model; "none" uses none, and the
         surroundings are learned, too.
+    normals : str
+        "none", or an ONNX file, a model of normals that the first part of learning follows
+        (`schedule.normal_prior`). Nothing is downloaded.
     """
 
     resolution: Annotated[int | None, Range(8, 1 << 16)] = None
@@ -36,6 +39,7 @@ class Reading:
     axes: Literal["opengl", "opencv", "opengl-inverse", "opencv-inverse"] = "opengl"
     up: Literal["z", "y", "-z", "-y"] | None = None
     masks: str = "given"
+    normals: str = "none"
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,10 +36,11 @@ def varint(value: int) -> bytes:
 
 
 def write_model(path: Path, side: int | str = 96, channels: int = 3, gain: float = -40.0, shift: float = -41.0,
-                sigmoid: bool = False) -> Path:  # fmt: skip
+                sigmoid: bool = False, outputs: int = 1) -> Path:  # fmt: skip
     """A model whose logit is ``gain * mean + shift`` of the prepared picture: 0 where its colours' mean is -1.03.
 
-    Written field by field as onnx.proto has them (ONNX 1.16): a convolution of 1 x 1, and a sigmoid.
+    With as many `outputs` as channels it gives the picture as it is prepared instead. Written field by field as
+    onnx.proto has them (ONNX 1.16): a convolution of 1 x 1, and a sigmoid.
     """
 
     def tensor(name: str, shape: tuple[int, ...], values: list[float]) -> bytes:
@@ -57,9 +58,10 @@ def write_model(path: Path, side: int | str = 96, channels: int = 3, gain: float
     nodes = [node("Conv", ("picture", "w", "b"), "logit" if sigmoid else "mask")]
     nodes += [node("Sigmoid", ("logit",), "mask")] if sigmoid else []
     graph = b"".join(field(1, one) for one in nodes) + field(2, "dark")
-    graph += field(5, tensor("w", (1, channels, 1, 1), [gain / channels] * channels))
-    graph += field(5, tensor("b", (1,), [shift]))
-    graph += field(11, picture("picture", channels)) + field(12, picture("mask", 1))
+    weights = [gain / channels] * channels if outputs == 1 else list(np.eye(outputs, channels).ravel())
+    graph += field(5, tensor("w", (outputs, channels, 1, 1), weights))
+    graph += field(5, tensor("b", (outputs,), [shift] if outputs == 1 else [0.0] * outputs))
+    graph += field(11, picture("picture", channels)) + field(12, picture("mask", outputs))
     path.write_bytes(field(1, 8) + field(7, graph) + field(8, field(1, "") + field(2, 13)))
     return path
 
@@ -106,7 +108,7 @@ def test_models_are_prepared_as_their_names_say(tmp_path: Path, caplog: pytest.L
     found = {}
     for name in ("u2net", "isnet-general-use", "rmbg-1.4", "mine"):
         model = SegmentationModel(str(write_model(tmp_path / f"{name}.onnx", side="side", gain=-1.0, shift=0.0)))
-        found[name] = model._size, model._preparation.deviation[0], model._preparation.mean[0]
+        found[name] = model.size, model._preparation.deviation[0], model._preparation.mean[0]
     assert found == {
         "u2net": ((320, 320), 0.229, 0.485), "isnet-general-use": ((1024, 1024), 1.0, 0.485),
         "rmbg-1.4": ((1024, 1024), 1.0, 0.5), "mine": ((1024, 1024), 0.229, 0.485),

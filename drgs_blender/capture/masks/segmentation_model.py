@@ -10,42 +10,31 @@ import logging
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from PIL import Image as Pillow
 
 from ...core.arrays import Array
 from ...core.errors import AssetError, Cancelled, UsageError, first_of
-from .. import libraries
 from ..features import Tell
+from ..picture_model import IMAGENET, PictureModel, Preparation
 from .hull_check import Fit
 from .mask_view import MaskView
 from .settling import REMEDY, hull_of_masks, resized, settle, whole
 
 logger = logging.getLogger(__name__)
 
-_IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-
-
-class Preparation(NamedTuple):
-    """How a model wants its pictures: side, pixels, where its input leaves it open; mean and deviation of channels."""
-
-    side: int
-    mean: tuple[float, float, float]
-    deviation: tuple[float, float, float]
-
-
 #: Beginning of a file's name -> how pictures are prepared (of rembg 2.0.76, MIT, and of the models' own programs); the
 #: longest that fits counts, the last is for all others.
 KNOWN = {
-    "u2net": Preparation(320, *_IMAGENET),
-    "silueta": Preparation(320, *_IMAGENET),
-    "isnet": Preparation(1024, _IMAGENET[0], (1.0, 1.0, 1.0)),
-    "birefnet": Preparation(1024, *_IMAGENET),
-    "bria-rmbg": Preparation(1024, *_IMAGENET),
+    "u2net": Preparation(320, *IMAGENET),
+    "silueta": Preparation(320, *IMAGENET),
+    "isnet": Preparation(1024, IMAGENET[0], (1.0, 1.0, 1.0)),
+    "birefnet": Preparation(1024, *IMAGENET),
+    "bria-rmbg": Preparation(1024, *IMAGENET),
     "rmbg-1.4": Preparation(1024, (0.5, 0.5, 0.5), (1.0, 1.0, 1.0)),
-    "": Preparation(1024, *_IMAGENET),
+    "": Preparation(1024, *IMAGENET),
 }
 #: A model whose largest value is below it sees nothing; one whose least value is as near to 1, an object all over.
 _NOTHING = 0.1
@@ -86,7 +75,7 @@ def load_model(given: str) -> SegmentationModel:
     return SegmentationModel(given)
 
 
-class SegmentationModel:
+class SegmentationModel(PictureModel):
     """A model that tells the object of a picture from all else.
 
     Parameters
@@ -105,32 +94,7 @@ class SegmentationModel:
     """
 
     def __init__(self, given: str) -> None:
-        self.path = path = model_file(given)
-        runtime: Any = libraries.load("onnxruntime")
-        options = runtime.SessionOptions()
-        options.log_severity_level = 4  # its errors arrive as exceptions
-        try:
-            self._session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # of ONNX Runtime's own kinds
-            raise AssetError(str(path), f"is no model that ONNX Runtime reads ({_first_line(error)})",
-                             "Export it again as ONNX") from error  # fmt: skip
-        inputs = self._session.get_inputs()
-        shape = inputs[0].shape if inputs else []
-        if len(inputs) != 1 or len(shape) != 4 or shape[1] != 3 or inputs[0].type != "tensor(float)":
-            raise AssetError(
-                str(path), f"takes {', '.join(f'{one.name} {one.type} {one.shape}' for one in inputs)}",
-                "A segmentation model takes one picture: floats of the shape (1, 3, height, width)",
-            )  # fmt: skip
-        name = path.stem.lower()
-        known = max((start for start in KNOWN if name.startswith(start)), key=len)
-        self._input, self._preparation = inputs[0].name, KNOWN[known]
-        sides = [side if isinstance(side, int) and side > 0 else self._preparation.side for side in shape[2:]]
-        self._size = sides[1], sides[0]
-        if not known:
-            logger.warning(
-                "%s: is none of the models known by name (%s): pictures are prepared by ImageNet's mean and deviation, "
-                "%d x %d", path, ", ".join(filter(None, KNOWN)), *self._size,
-            )  # fmt: skip
+        super().__init__(model_file(given), KNOWN, "segmentation")
 
     def __call__(self, pixels: Array, subject: str) -> Array:
         """How sure the model is of the object, in [0, 1].
@@ -152,21 +116,11 @@ class SegmentationModel:
             What the model gives is no mask.
         """
         height, width = pixels.shape[:2]
-        small = Pillow.fromarray(pixels).resize(self._size, Pillow.Resampling.LANCZOS)
-        values = np.asarray(small, np.float32) / max(int(pixels.max()), 1)
-        _, mean, deviation = self._preparation
-        given = ((values - np.asarray(mean, np.float32)) / np.asarray(deviation, np.float32)).transpose(2, 0, 1)[None]
-        try:
-            found = np.asarray(self._session.run(None, {self._input: given})[0], np.float32)
-        except Exception as error:
-            raise AssetError(str(self.path), f"fails on {subject} ({_first_line(error)})",
-                             "Check that it is a segmentation model") from error  # fmt: skip
+        found = self.run(pixels, subject, max(int(pixels.max()), 1))  # as rembg does
         if found.ndim not in (3, 4) or found.shape[0] != 1 or found.size != found.shape[-1] * found.shape[-2]:
             raise AssetError(str(self.path), f"gives values of the shape {found.shape}",
                              "A segmentation model gives one mask: (1, 1, height, width)")  # fmt: skip
         found = found.reshape(found.shape[-2:])
-        if not np.isfinite(found).all():
-            raise AssetError(str(self.path), f"gives NaN or infinity for {subject}", "Use another model")
         low, high = float(found.min()), float(found.max())
         if low < 0 or high > 1:  # logits
             found = (1 / (1 + np.exp(-np.clip(found, -40, 40)))).astype(np.float32)
@@ -231,7 +185,3 @@ def masks_by_model(model: SegmentationModel, cv2: Any, views: Sequence[MaskView]
             outline = Pillow.fromarray(new.astype(np.uint8) * 255)
             drawn[k] = np.asarray(outline.resize((width, height), Pillow.Resampling.BILINEAR))
     return drawn if fit else None, fits
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -25,6 +25,8 @@ class View:
         In 0..1, the object's coverage of the pixel; None without a mask.
     test : bool
         Left out of training.
+    normals : (height, width, 3) float32 array, optional
+        Unit, world space, 0 where not known: what a model says of the pixels (`capture.normals`).
     """
 
     name: str
@@ -32,6 +34,7 @@ class View:
     colour: Array
     mask: Array | None = None
     test: bool = False
+    normals: Array | None = None
 
 
 @dataclass(slots=True)

@@ -16,6 +16,7 @@ from torch import Tensor
 from ...core.arrays import Array
 from ...core.errors import AssetError
 from ...core.frame import Camera
+from ...geometry.normals import unit
 from ..losses.photometric import Photograph
 from ..meshing.visual_hull import silhouettes
 from .capture import Capture, View
@@ -44,6 +45,8 @@ class Target:
         Tensor in 0..1, or None where nothing is known of it.
     background : (h, w, 3) tensor or None
         What is behind the surfels, sRGB; None: the one colour of `background_of`.
+    normals : (h, w, 3) tensor or None
+        See `View.normals`.
     share : float
         Pixels of the crop in parts of the whole view's. Means over the crop count as much: a pixel of each view counts
         the same.
@@ -53,6 +56,7 @@ class Target:
     photograph: Photograph | Tensor
     mask: Tensor | None
     background: Tensor | None = None
+    normals: Tensor | None = None
     share: float = 1.0
 
     @property
@@ -100,9 +104,11 @@ def targets(capture: Capture) -> list[list[Target]]:
         share = camera.width * camera.height / (whole.width * whole.height)
         if mask is not None:
             mask = np.ascontiguousarray(mask[y0:y1, x0:x1], np.float32)
-        full.append(_target(camera, colour, mask, keep, share))
+        normals = None if view.normals is None else view.normals[y0:y1, x0:x1]
+        full.append(_target(camera, colour, mask, normals, keep, share))
         smaller = None if mask is None else half_size(mask[..., None])[..., 0]
-        half.append(_target(halved(camera), half_size(colour), smaller, keep, share))
+        coarser = None if normals is None else unit(half_size(normals), (0, 0, 0))
+        half.append(_target(halved(camera), half_size(colour), smaller, coarser, keep, share))
     return [full, half]
 
 
@@ -118,9 +124,12 @@ def _window(camera: Camera, mask: Array | None) -> tuple[int, int, int, int]:
     return x0, y0, x1, y1
 
 
-def _target(camera: Camera, colour: Array, mask: Array | None, keep: bool, share: float) -> Target:
+def _target(
+    camera: Camera, colour: Array, mask: Array | None, normals: Array | None, keep: bool, share: float
+) -> Target:
     known = None if mask is None else torch.from_numpy(mask)
-    return Target(camera, Photograph.of(colour, keep), known, share=share)
+    turned = None if normals is None else torch.from_numpy(np.ascontiguousarray(normals, np.float32))
+    return Target(camera, Photograph.of(colour, keep), known, normals=turned, share=share)
 
 
 def halved(camera: Camera) -> Camera:

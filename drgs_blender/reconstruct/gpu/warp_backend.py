@@ -59,8 +59,9 @@ class WarpLearningBackend(LearningBackend):
         self.device = self.launcher.place
 
     def bring(self, target: Target) -> Target:
-        mask, behind = (None if one is None else one.to(self.device) for one in (target.mask, target.background))
-        return replace(target, photograph=target.colour.to(self.device), mask=mask, background=behind)
+        known = target.mask, target.background, target.normals
+        mask, behind, normals = (None if one is None else one.to(self.device) for one in known)
+        return replace(target, photograph=target.colour.to(self.device), mask=mask, background=behind, normals=normals)
 
     def attributes(
         self, parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, reflections: bool

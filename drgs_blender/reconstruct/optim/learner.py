@@ -126,6 +126,9 @@ class Learner:
         shape = self._backend.shape_loss(
             maps.alpha, depth, maps.distortion, rendered.normal, target.mask, rays, counts, weights
         )
+        if target.normals is not None and part < schedule.normal_prior_until:
+            weight = schedule.normal_prior * (1 - part / schedule.normal_prior_until)
+            shape = shape + weight * _disagreement(rendered, target.normals)
         return self._backend.difference(rendered.colour, target.photograph) + shape
 
     def _patch_loss(self, rendered: RenderedView, target: Target, rays: Tensor, beside: Target) -> Tensor:
@@ -182,6 +185,12 @@ class Learner:
 def _weighted_median(maps: Maps) -> Tensor:
     """(h, w): median depth times alpha, by which `shape_loss` divides; where less than half is covered, the mean's."""
     return torch.where(maps.median > 0, maps.median * maps.alpha, maps.depth)
+
+
+def _disagreement(rendered: RenderedView, normals: Tensor) -> Tensor:
+    """Mean of 1 - cosine between the surfels' normals and those given (h, w, 3), as far as pixels are covered."""
+    known = (normals != 0).any(-1)
+    return torch.where(known, rendered.maps.alpha - (rendered.normal * normals).sum(-1), 0.0).mean()
 
 
 def _grey(target: Target) -> Tensor:

@@ -51,6 +51,10 @@ class Schedule:
         Part of the steps after which it counts.
     patches_spread : float
         Difference of a patch's grey between both views at which it counts 1 / e: what mirrors counts less; 0: no less.
+    normal_prior : float
+        Weight of normals that a model gives (`capture.normals`) at the start, from where it falls to 0.
+    normal_prior_until : float
+        Part of the steps after which they count no more: what the photographs show of shape is finer.
     reflections : float
         Part of the steps after which reflections are learned; 1 never.
     bands : int
@@ -72,6 +76,8 @@ class Schedule:
     patches: Weight = 0.0
     patches_from: Part = 0.3
     patches_spread: Weight = 0.1
+    normal_prior: Weight = 0.3
+    normal_prior_until: Part = 0.7
     reflections: Part = 0.1
     bands: Annotated[int, Range(0, 3)] = 2
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
