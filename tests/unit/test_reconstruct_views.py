@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,9 @@ from drgs_blender.reconstruct.backend import CPU  # noqa: E402
 from drgs_blender.reconstruct.capture import training_views  # noqa: E402
 from drgs_blender.reconstruct.capture.capture import Capture, View  # noqa: E402
 from drgs_blender.reconstruct.capture.training_views import composed, half_size, pixel_rays, targets  # noqa: E402
-from drgs_blender.reconstruct.meshing.visual_hull import find_region  # noqa: E402
+from drgs_blender.reconstruct.meshing import depth_fusion  # noqa: E402
+from drgs_blender.reconstruct.meshing.crops import cropped, cropped_views  # noqa: E402
+from drgs_blender.reconstruct.meshing.visual_hull import find_region, world_to_pixel  # noqa: E402
 from drgs_blender.reconstruct.model.initialisation import FEWEST, MOST, PER_PIXEL, on_hull, surfel_limit  # noqa: E402
 from drgs_blender.reconstruct.optim.learner import Learner  # noqa: E402
 from drgs_blender.reconstruct.optim.schedule import Schedule  # noqa: E402
@@ -100,3 +103,38 @@ def test_larger_pictures_get_more_surfels_and_short_runs_fewer(capture):
     assert surfel_limit(large) == MOST and surfel_limit(large, 100_000) == 100_000
     few, some, many = (surfel_limit(large, seconds=seconds) for seconds in (1.0, 300.0, 1e5))
     assert FEWEST == few < some < many == MOST
+
+
+def test_fusion_draws_what_pictures_show_of_the_region_and_finds_the_same_mesh(capture: Capture, monkeypatch) -> None:
+    region, cameras = find_region(capture), [view.camera for view in capture.training]
+    surfels = on_hull(capture, region, 3000, 0)
+    drawn = cropped(cameras, region.low, region.high)
+    (size,) = {(camera.width, camera.height) for camera in drawn}
+    assert size[0] * size[1] < 0.5 * cameras[0].width * cameras[0].height
+    corner = np.array([*itertools.product(*zip(region.low, region.high, strict=True))])
+    for whole, cut in zip(cameras, drawn, strict=True):
+        seen = np.c_[corner, np.ones(8)] @ world_to_pixel(cut).T
+        assert (seen[:, :2] / seen[:, 2:] >= 0).all() and (seen[:, :2] / seen[:, 2:] <= size).all()
+        assert (whole.cx - cut.cx) % 1 == 0 and whole.fx == cut.fx
+    with_crops, _ = depth_fusion.fuse(surfels, cameras, region, 64)
+    monkeypatch.setattr(depth_fusion, "cropped", lambda whole, *_: whole)
+    without, _ = depth_fusion.fuse(surfels, cameras, region, 64)
+    assert np.array_equal(with_crops.faces, without.faces)
+    np.testing.assert_allclose(with_crops.vertices, without.vertices, atol=1e-4)
+
+
+def test_a_camera_inside_the_region_draws_all_that_it_sees(capture: Capture) -> None:
+    outside = capture.training[0].camera
+    inside = replace(outside, matrix_world=np.eye(4))
+    found = cropped([inside, outside], np.full(3, -1.0), np.full(3, 1.0))
+    assert (found[0].width, found[0].height) == (found[1].width, found[1].height) == (outside.width, outside.height)
+
+
+def test_cropped_views_show_the_same_pixels(capture: Capture) -> None:
+    points = np.array([[-0.9, -0.5, -0.5], [0.9, 0.6, 0.7]])
+    for whole, cut in zip(capture.views, cropped_views(capture.views, points), strict=True):
+        assert cut.colour.size < whole.colour.size and cut.colour.shape[:2] == cut.mask.shape
+        near = pixel_rays(cut.camera)[5, 7], cut.colour[5, 7], cut.mask[5, 7]
+        y, x = 5 + round(whole.camera.cy - cut.camera.cy), 7 + round(whole.camera.cx - cut.camera.cx)
+        torch.testing.assert_close(near[0], pixel_rays(whole.camera)[y, x])
+        assert np.array_equal(near[1], whole.colour[y, x]) and near[2] == whole.mask[y, x]

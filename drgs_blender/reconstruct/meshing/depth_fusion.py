@@ -18,6 +18,7 @@ from ...geometry.tsdf import DepthMaps, SignedDistanceField
 from ..capture.training_views import pixel_rays
 from ..memory_budget import check_fits, fitting
 from ..model.gaussians import Gaussians
+from .crops import cropped
 from .tangential_relaxation import relaxed
 from .visual_hull import Region, world_to_pixel
 
@@ -66,6 +67,7 @@ def fuse(
     """
     low, voxel, shape = grid(cameras, region, resolution)
     field = SignedDistanceField(low, voxel, shape)
+    cameras = cropped(cameras, low, low + voxel * np.array(shape))
     for begin in range(0, len(cameras), TOGETHER):
         batch = cameras[begin : begin + TOGETHER]
         same_size = {(c.height, c.width) for c in batch}

@@ -14,6 +14,7 @@ from ...geometry.normals import VertexNormals, unit
 from ...render.scene.triangle_bvh import TriangleBVH
 from ..capture.capture import View
 from ..inverse_rendering.pixels import Normals, pixels_of
+from .crops import cropped_views
 
 #: Least cosine between both; a surfel's normal that is farther off is of something else.
 ALIKE = 0.5
@@ -38,7 +39,7 @@ def with_surfel_normals(mesh: Mesh, views: list[View], normals: Normals) -> Arra
     tree.build(mesh.vertices, mesh.faces)
     own = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
     total = np.zeros((len(own), 3))
-    for index, view in enumerate(views):
+    for index, view in enumerate(cropped_views(views, mesh.vertices)):
         pixels = pixels_of(index, view, mesh, tree, normals)
         weight = pixels.corners * (pixels.flat * pixels.towards).sum(axis=1, keepdims=True)
         corner = mesh.faces[pixels.face].ravel()

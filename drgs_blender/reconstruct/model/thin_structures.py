@@ -17,6 +17,7 @@ from ...geometry.normals import VertexNormals, unit
 from ...render.scene.triangle_bvh import TriangleBVH
 from ..capture.capture import View
 from ..inverse_rendering.pixels import Normals, pixels_of
+from ..meshing.crops import cropped_views
 from .gaussians import Gaussians
 
 log = logging.getLogger(__name__)
@@ -46,7 +47,8 @@ def is_thin(gaussians: Gaussians, mesh: Mesh, views: list[View]) -> bool:
     tree.build(mesh.vertices, mesh.faces)
     smooth = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
     cosines = []
-    for index, view in enumerate(views[:: math.ceil(len(views) / SAMPLED_VIEWS)]):
+    sampled = cropped_views(views[:: math.ceil(len(views) / SAMPLED_VIEWS)], mesh.vertices)
+    for index, view in enumerate(sampled):
         pixels = pixels_of(index, view, mesh, tree, normals_of(gaussians))
         by_mesh = unit(np.einsum("nk,nkc->nc", pixels.corners, smooth[mesh.faces[pixels.face]]))
         known = (pixels.detail_normal != 0).any(axis=1)
