@@ -56,7 +56,8 @@ class Settings:
         How much more than other albedo that of metals is smoothed, in parts of `smoothness`: there, errors of normals
         leave blotches.
     same_material : float
-        Weight of the differences of materials between vertices that photographs show alike, wherever they lie.
+        Weight of the differences of materials between vertices that photographs show alike, up to about a quarter of
+        the object apart.
     palette : int
         Also learn this many materials that all vertices share which photographs show alike; 0: none.
     unbiased : bool
@@ -103,7 +104,7 @@ class Settings:
     binary_metallic_prior: Weight = 0.0
     metal_albedo_prior: Weight = 0.05
     metal_smoothness: Weight = 5.0
-    same_material: Weight = 0.0
+    same_material: Weight = 0.003
     palette: Annotated[int, Range(0, 64)] = 0
     unbiased: bool = True
     weight_by_prediction: bool = True
