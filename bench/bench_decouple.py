@@ -31,7 +31,7 @@ SIZE, TRAIN, TEST, SAMPLES = 128, 40, 8, 32
 #: The paper's BRDF and losses: L1 of noisy estimates, white light, neither grids nor smoothness of materials.
 PAPER: dict[str, Any] = {
     "shading_model": "paper", "unbiased": False, "grey_light_prior": 0.003, "coarse": 0, "smoothness": 0.0,
-    "coarse_to_fine": False, "metal_albedo_prior": 0.0, "metal_smoothness": 0.0,
+    "coarse_to_fine": False, "metal_albedo_prior": 0.0, "metal_smoothness": 0.0, "same_material": 0.0,
 }  # fmt: skip
 
 #: Part -> row -> what differs from the settings that the rows share.

@@ -11,12 +11,14 @@ from .environment import LearnedLight, colour_cast
 from .losses import blotches, dullness
 from .radiance_cache import edges_of
 from .settings import Settings
-from .surface import SurfaceSamples
+from .surface import SurfaceSamples, at_both
 
 Array = np.ndarray
 
 #: How much smoother than albedo roughness and metallic are (of diffuse and specular colour: diffuse, roughness, rest).
 _SMOOTH = (1.0, 1.0, 1.0, 2.0, 10.0, 10.0, 10.0)
+#: The same between vertices that photographs show alike.
+_ALIKE = (1.0, 1.0, 1.0, 1.0, 2.0, 2.0, 2.0)
 #: Edges that are smoothed per step; how much photographed chroma may differ along one that is.
 _EDGES, _CHROMA = 8192, 0.08
 #: Mean edge, in parts of the extent, of the meshes that weights were chosen on; and the most that finer ones count.
@@ -77,6 +79,14 @@ class Regularisers:
         if s.metal_albedo_prior > 0 and has_metals:
             loss = loss + s.metal_albedo_prior * dullness(samples.materials[:, :3], samples.materials[:, 4])
         return loss
+
+    def of_likeness(self, samples: SurfaceSamples, weight: Array) -> Tensor:
+        """Alike where photographs are, by weights (p,) of the pairs of `samples`."""
+        assert samples.pairs is not None
+        pair = at_both(samples.columns, samples.pairs)
+        differences = torch.from_numpy(weight)[:, None] * (pair[:, 0] - pair[:, 1]).abs()
+        weights = torch.tensor(_ALIKE[: samples.columns.shape[1]])
+        return self._settings.same_material * (differences.mean(0) * weights).sum()
 
     def of_light(self, light: LearnedLight, radiance: Tensor) -> Tensor:
         """Grey and smooth."""

@@ -25,6 +25,7 @@ from ..backend import CPU, LearningBackend
 from ..capture.capture import Capture
 from ..optim.adam import Adam
 from .lighting import Lighting
+from .likeness import LikeVertices, features, palette
 from .losses import log_loss, unbiased_loss
 from .pixels import Normals, Pixels, foreground_pixels
 from .radiance_cache import filled, radiance_cache
@@ -211,7 +212,11 @@ class Job:
         self.lighting = Lighting(gatherer, settings, 2.5 * float(mean.mean()))
         finer = fineness(mesh)
         grids = settings.coarse and settings.coarse + round(math.log2(finer))
-        self.surface = Surface(mesh, replace(settings, coarse=grids), mean, normals is not None, start)
+        wanted = settings.palette > 0 or settings.same_material > 0
+        shown = features(self._pixels, mesh) if wanted else np.empty((0, 4), np.float32)
+        shared = palette(shown, settings.palette, settings.seed) if settings.palette else None
+        self.surface = Surface(mesh, replace(settings, coarse=grids), mean, normals is not None, start, shared)
+        self._like = LikeVertices(shown, mesh, settings.seed) if settings.same_material > 0 else None
         colours = np.maximum(cache[:, 0] * 0.28209479, 0)
         self._regularisers = Regularisers(mesh.faces, colours, settings, finer)
         #: Logarithm of the brightness of the photographs, one each.
@@ -231,11 +236,12 @@ class Job:
         row = generator.integers(0, len(self._pixels), s.pixels)
         edge = self._regularisers.draw(generator)
         key = generator.integers(0, 2**32, s.pixels, dtype=np.uint32)
+        pairs = self._like.draw(generator) if self._like is not None and self.schedule.knows_metals() else None
 
         learned = self._learned()
         for tensor in learned.values():
             tensor.requires_grad_(True)
-        self._loss(self._pixels.select(row), key, edge).backward()
+        self._loss(self._pixels.select(row), key, edge, pairs).backward()
         for tensor in learned.values():
             tensor.requires_grad_(False)
             if tensor.grad is not None:
@@ -255,12 +261,14 @@ class Job:
         if stale:
             self.lighting.aim(self.lighting.learned.radiance().numpy())
 
-    def _loss(self, pixels: Pixels, key: Array, edge: Array) -> Tensor:
-        samples = self.surface.at(pixels, self._regularisers.edges(edge))
+    def _loss(self, pixels: Pixels, key: Array, edge: Array, pairs: tuple[Array, Array] | None) -> Tensor:
+        samples = self.surface.at(pixels, self._regularisers.edges(edge), None if pairs is None else pairs[0])
         radiance = self.lighting.learned.radiance()
         loss = self._difference(pixels, key, samples, radiance)
         has_metallic, knows_metals = self.surface.materials.metallic, self.schedule.knows_metals()
         loss = loss + self._regularisers.of_materials(samples, edge, has_metallic, knows_metals)
+        if pairs is not None:
+            loss = loss + self._regularisers.of_likeness(samples, pairs[1])
         loss = loss + self._regularisers.of_light(self.lighting.learned, radiance)
         return loss + self._regularisers.of_normals(samples)
 

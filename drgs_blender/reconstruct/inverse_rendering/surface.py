@@ -13,7 +13,7 @@ from ...geometry.normals import VertexNormals
 from ...render.gbuffer.surfels import ALIKE
 from ...render.reference.brdf import dot, normalise
 from .blend import blend
-from .materials import Materials
+from .materials import Materials, Palette
 from .pixels import Pixels
 from .settings import Settings
 
@@ -36,6 +36,8 @@ class SurfaceSamples:
         Learned offsets of their normals.
     ends : (e, 2) int64 tensor
         The ends of the edges among those vertices.
+    pairs : (p, 2) int64 tensor, optional
+        Pairs of like vertices among them.
     """
 
     materials: Tensor
@@ -43,10 +45,16 @@ class SurfaceSamples:
     columns: Tensor
     offsets: Tensor | None
     ends: Tensor
+    pairs: Tensor | None = None
 
     def at_ends(self, values: Tensor) -> Tensor:
         """Values (u, k) of the vertices at the ends of the edges, (e, 2, k)."""
-        return values.index_select(0, self.ends.flatten()).view(len(self.ends), 2, -1)
+        return at_both(values, self.ends)
+
+
+def at_both(values: Tensor, pairs: Tensor) -> Tensor:
+    """Rows of values (u, k) at pairs (p, 2) of their numbers, (p, 2, k)."""
+    return values.index_select(0, pairs.flatten()).view(len(pairs), 2, -1)
 
 
 class Surface:
@@ -62,6 +70,8 @@ class Surface:
         Whether pixels have normals from elsewhere than the mesh.
     start : (v, 3) float32 array, optional
         Unit normals of the vertices to begin with, in place of the mesh's smooth ones.
+    palette : Palette, optional
+        Materials that vertices share.
 
     Attributes
     ----------
@@ -71,22 +81,23 @@ class Surface:
     """
 
     def __init__(
-        self, mesh: Mesh, settings: Settings, mean: Array, given_normals: bool, start: Array | None = None
-    ) -> None:
+        self, mesh: Mesh, settings: Settings, mean: Array, given_normals: bool, start: Array | None = None,
+        palette: Palette | None = None,
+    ) -> None:  # fmt: skip
         if start is None:
             start = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
         self._normals = torch.from_numpy(start)
         self._faces = torch.from_numpy(mesh.faces.astype(np.int64))
         self._given_normals = given_normals
-        self.materials = Materials(mesh, settings.parametrisation, settings.coarse, mean)
+        self.materials = Materials(mesh, settings.parametrisation, settings.coarse, mean, palette)
         self.parameters = dict(self.materials.parameters)
         if settings.normals:
             self.parameters["normals"] = torch.zeros(len(mesh.vertices), 3)
 
-    def at(self, pixels: Pixels, edges: Array) -> SurfaceSamples:
-        """The surface at pixels and at edges (e, 2) of vertices."""
+    def at(self, pixels: Pixels, edges: Array, pairs: Array | None = None) -> SurfaceSamples:
+        """The surface at pixels, at edges (e, 2) of vertices, and at pairs (p, 2) of like ones."""
         corner = self._faces[torch.from_numpy(pixels.face)]
-        ends = torch.from_numpy(edges)
+        ends = torch.from_numpy(edges if pairs is None else np.concatenate([edges, pairs]))
         used, index = torch.unique(torch.cat([corner.flatten(), ends.flatten()]), return_inverse=True)
         corner_index, end_index = index[: corner.numel()].view(-1, 3), index[corner.numel() :].view(-1, 2)
         shares = torch.from_numpy(pixels.corners)
@@ -100,7 +111,8 @@ class Surface:
         normal = normalise(blend(smooth, corner_index, shares))
         if self._given_normals:
             normal = _with_detail(pixels, normal, None if offsets is None else blend(offsets, corner_index, shares))
-        return SurfaceSamples(materials, normal, columns, offsets, end_index)
+        like = None if pairs is None else end_index[len(edges) :]
+        return SurfaceSamples(materials, normal, columns, offsets, end_index[: len(edges)], like)
 
     def normals(self) -> Array:
         """(v, 3) float32 unit: those that learning began with, and what was learned on top."""

@@ -1,0 +1,99 @@
+"""Which vertices are of one material, as far as photographs show it without knowing the light.
+
+Features of a vertex, from its pixels in all views: chromaticity and brightness of its darkest quarter, where highlights
+are not, and by how much its brightness changes from view to view, a score of how much it reflects.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
+
+from ...core.arrays import Array
+from ...core.asset.model import Mesh
+from .materials import Palette
+from .pixels import Pixels
+from .radiance_cache import filled
+
+#: Quantiles of brightness: the one taken for a vertex's own, those whose ratio is its score, and how wide each is.
+_DARK, _LOW, _HIGH, _WIDE = 0.25, 0.2, 0.8, 0.1
+#: Differences that count as much: of chromaticity, log brightness and score, and of place in parts of the extent.
+_CHROMA, _BRIGHTNESS, _SCORE, _PLACE = 0.03, 0.5, 0.4, 0.25
+#: Brightness below which its logarithm flattens out.
+_KNEE = 0.02
+#: Vertices among which others look for their like, how many each finds, and pairs of a step.
+_ANCHORS, _NEAREST, _PAIRS = 4096, 12, 4096
+#: Vertices that a palette is chosen from, and the most of its materials that a vertex has part in.
+_SAMPLE, _PARTS = 4096, 4
+
+
+def features(pixels: Pixels, mesh: Mesh) -> Array:
+    """Features of the vertices in units of differences that count.
+
+    Returns
+    -------
+    (v, 4) float32 array
+        Chromaticity (two), log brightness, score; vertices that no photograph shows take the mean of their
+        neighbours', in turn.
+    """
+    count = len(mesh.vertices)
+    corner, share = mesh.faces[pixels.face].reshape(-1), pixels.corners.reshape(-1)
+    log = np.repeat(np.log(pixels.colour.mean(axis=1) + _KNEE), 3)
+    order = np.lexsort((log, corner))
+    corner, share, log = corner[order], share[order].clip(1e-6), log[order, None]
+    colour = np.repeat(pixels.colour, 3, axis=0)[order]
+    total = np.bincount(corner, share, count)
+    before = np.cumsum(share, dtype=np.float64) - 0.5 * share - (np.cumsum(total) - total)[corner]
+    place = before / total[corner]
+
+    def at(part: float, values: Array) -> Array:
+        """Mean of `values` near a quantile of each vertex."""
+        near = share * np.exp(-(((place - part) / _WIDE) ** 2)) + 1e-9
+        whole = np.maximum(np.bincount(corner, near, count), 1e-12)
+        return np.stack([np.bincount(corner, near * column, count) for column in values.T], 1) / whole[:, None]
+
+    dark = at(_DARK, colour)
+    chroma = dark / np.maximum(dark.sum(axis=1, keepdims=True), 1e-4)
+    score = at(_HIGH, log) - at(_LOW, log)
+    found = np.column_stack([chroma[:, :2] / _CHROMA, at(_DARK, log) / _BRIGHTNESS, score / _SCORE])
+    return filled(found, total > 1e-3, mesh)
+
+
+class LikeVertices:
+    """Pairs of near vertices that photographs show alike, as a joint bilateral filter weighs them.
+
+    Parameters
+    ----------
+    features : (v, 4) float32 array
+    mesh : Mesh
+    seed : int
+    """
+
+    def __init__(self, features: Array, mesh: Mesh, seed: int) -> None:
+        extent = max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-12)
+        points = np.column_stack([features, mesh.vertices / (_PLACE * extent)])
+        most = min(_ANCHORS, len(points))
+        anchors = np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))
+        far, near = (x.reshape(len(points), -1) for x in cKDTree(points[anchors]).query(points, min(_NEAREST, most)))
+        self._like, self._weight = anchors[near], np.exp(-0.5 * far**2).astype(np.float32)
+
+    def draw(self, generator: np.random.Generator) -> tuple[Array, Array]:
+        """The pairs of a step, (p, 2) int64 vertices, and their weights (p,) float32 in [0, 1]."""
+        one = generator.integers(0, len(self._like), _PAIRS)
+        each = generator.integers(0, self._like.shape[1], _PAIRS)
+        return np.stack([one, self._like[one, each]], -1), self._weight[one, each]
+
+
+def palette(features: Array, most: int, seed: int) -> Palette:
+    """Soft assignment of vertices to at most `most` groups of alike ones."""
+    generator = np.random.default_rng(seed)
+    chosen = generator.choice(len(features), min(len(features), _SAMPLE), replace=False)
+    sample = np.unique(features[chosen].astype(np.float64), axis=0)
+    centres, _ = kmeans2(sample, min(most, len(sample)), iter=20, minit="++", missing="warn", seed=seed)
+    parts = min(_PARTS, len(centres))
+    far, near = (x.reshape(len(features), -1) for x in cKDTree(centres).query(features, parts))
+    weight = np.exp(-0.5 * (far**2 - far[:, :1] ** 2))
+    share = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+    return Palette(torch.from_numpy(near.astype(np.int64)), torch.from_numpy(share), len(centres))
