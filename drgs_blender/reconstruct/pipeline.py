@@ -26,7 +26,9 @@ from .backend import CPU
 from .capture.capture import Capture, View
 from .capture.training_views import background_of, composed
 from .gpu.select_backend import select_backend
+from .inverse_rendering.joint import LearnedSurfels, decouple_jointly
 from .inverse_rendering.run import Decoupled, decouple
+from .inverse_rendering.run import Progress as Steps
 from .jit_warmup import warm_up
 from .losses.photometric import Photograph, structural_similarity
 from .meshing.depth_fusion import MOST, fuse, grid, voxels_that_fit
@@ -147,14 +149,21 @@ def reconstruct(
     binding: Binding | None = None
     if settings.variant == "m":
         final, binding = _on_mesh(work, mesh, free, region, report)
-    report |= held_out_metrics(final, capture)
-    visible = final.opacities().detach().numpy() >= UNSEEN
-    surfels = _visible_surfels(final, visible)
-    found, thin, smooth = None, False, VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
+    found, shape, thin = None, None, False
     if settings.materials:
         # Surfels on the mesh have its normals.
         thin = report["thin"] = settings.variant == "p" and is_thin(final, mesh, capture.training)
-        found = _decoupled(work, mesh, final, thin, report)
+        surfels_now = LearnedSurfels(
+            final, settings.schedule, region.radius, lambda of: mesh_of(of, capture, region, voxels)[0]
+        )
+        found = _decoupled(work, mesh, surfels_now, thin, report)
+        if (shape := found.shape) is not None:
+            mesh, final = shape.mesh, shape.gaussians
+    smooth = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
+    report |= held_out_metrics(final, capture)
+    visible = final.opacities().detach().numpy() >= UNSEEN
+    surfels = _visible_surfels(final, visible)
+    if found is not None:
         mesh = replace(mesh, albedo=found.albedo, roughness=found.roughness, metallic=found.metallic)
         if settings.decoupling.normals:
             mesh.vertices = follow_normals(mesh, found.normals)
@@ -167,11 +176,17 @@ def reconstruct(
     if found is None:
         report["vertices_without_surfels"] = surfels_to_vertices(mesh, surfels, binding)
     else:
-        if thin:
+        if shape is not None:
+            binding = shaded_by_own(binding, mesh, surfels, np.zeros_like(smooth))
+        elif thin:
             binding = shaded_by_own(binding, mesh, surfels, found.normals - smooth)
         elif settings.decoupling.normals:
             binding = shaded_by(binding, mesh, found.normals)
-        _copy_materials(surfels, mesh, binding)
+        if shape is None:
+            _copy_materials(surfels, mesh, binding)
+        else:
+            for name in BASE_CHANNELS:
+                setattr(surfels, name, getattr(shape, name)[visible])
         environment, origin = Environment(found.environment), "separated from the lighting"
         done, of = report["steps"]["materials"]
         if _are_few(done, of):
@@ -290,24 +305,25 @@ def _on_mesh(
     return final, bound(binding, final)  # type: ignore[arg-type]
 
 
-def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: dict[str, Any]) -> Decoupled:
-    """Materials, normals and light."""
-    settings, shown, start = work.settings.decoupling, normals_of(surfels), None
+def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, thin: bool, report: dict[str, Any]) -> Decoupled:
+    """Materials, normals and light; the shape, too, where it is learned with them."""
+    settings, shown, start = work.settings.decoupling, normals_of(surfels.gaussians), None
     if settings.normals and work.settings.variant == "p" and not thin:
         start = with_surfel_normals(mesh, work.capture.training, shown)
     if (seconds := work.seconds(MATERIAL_TIME_FRACTION)) is not None:
         settings = replace(settings, seconds=seconds)
-    found = decouple(
-        work.capture,
-        mesh,
-        settings,
-        lambda at: work.on_progress(Progress("materials", 0.7 + 0.3 * at.part, len(surfels), at.psnr)),
-        work.cancelled,
-        work.file("materials"),
-        work.backend,
-        shown if thin else None,
-        start,
-    )
+    count, own = len(surfels.gaussians), shown if thin else None
+
+    def progress(at: Steps) -> None:
+        work.on_progress(Progress("materials", 0.7 + 0.3 * at.part, count, at.psnr))
+
+    rest = progress, work.cancelled, work.file("materials")
+    if settings.joint and work.settings.variant == "p":
+        if work.backend is not CPU:
+            log.warning("decoupling.joint: surfels, materials and light are learned on the CPU, not on the card")
+        found = decouple_jointly(work.capture, mesh, surfels, settings, *rest, own, start)
+    else:
+        found = decouple(work.capture, mesh, settings, *rest, work.backend, own, start)
     done, of = work.steps["materials"] = [found.report["iterations"], work.settings.decoupling.iterations]
     if _are_few(done, of):
         minutes = work.settings.minutes

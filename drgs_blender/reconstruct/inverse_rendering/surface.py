@@ -78,7 +78,7 @@ class Surface:
         self._normals = torch.from_numpy(start)
         self._faces = torch.from_numpy(mesh.faces.astype(np.int64))
         self._given_normals = given_normals
-        self.materials = Materials(mesh, settings.parametrisation, settings.coarse, mean)
+        self.materials = Materials(mesh.vertices, settings.parametrisation, settings.coarse, mean)
         self.parameters = dict(self.materials.parameters)
         if settings.normals:
             self.parameters["normals"] = torch.zeros(len(mesh.vertices), 3)
