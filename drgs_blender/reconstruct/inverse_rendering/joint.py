@@ -1,4 +1,4 @@
-"""The paper's inverse rendering: surfels, materials of their own and light are learned together.
+"""Joint learning, the paper's inverse rendering: surfels, materials of their own and light are learned together.
 
 After a first part on the mesh (`run.Job`), each step renders one photograph's view. The surfels' radiance is held to
 the photograph as in stage (i), with its losses of shape; of some pixels the blended normals and materials of the
