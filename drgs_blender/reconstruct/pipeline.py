@@ -55,6 +55,8 @@ SURFEL_TIME_FRACTION, MESH_SURFEL_TIME_FRACTION = 0.45, 0.15
 MATERIAL_TIME_FRACTION = 0.35
 #: Voxels where none are asked for and each face gets a surfel, or time decides.
 FEW_VOXELS = 256
+#: Last part of the steps of materials in which the surfels of thin objects are learned, too.
+JOINT_OF_THIN = 0.5
 #: Fewer steps of materials than this separate them poorly from the light.
 FEW_STEPS = 300
 #: Phase -> the settings that decide its result.
@@ -153,10 +155,13 @@ def reconstruct(
     if settings.materials:
         # Surfels on the mesh have its normals.
         thin = report["thin"] = settings.variant == "p" and is_thin(final, mesh, capture.training)
-        surfels_now = LearnedSurfels(
-            final, settings.schedule, region.radius, lambda of: mesh_of(of, capture, region, voxels)[0]
-        )
-        found = _decoupled(work, mesh, surfels_now, thin, report)
+
+        def fused(of: Gaussians) -> Mesh:
+            made, report["mesh"] = mesh_of(of, capture, region, voxels)
+            return made
+
+        known = LearnedSurfels(final, settings.schedule, region.radius, fused)
+        found = _decoupled(work, mesh, known, thin, report)
         if (shape := found.shape) is not None:
             mesh, final = shape.mesh, shape.gaussians
     smooth = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
@@ -312,6 +317,8 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, thin: bool, rep
         start = with_surfel_normals(mesh, work.capture.training, shown)
     if (seconds := work.seconds(MATERIAL_TIME_FRACTION)) is not None:
         settings = replace(settings, seconds=seconds)
+    if settings.joint is None:
+        settings = replace(settings, joint=JOINT_OF_THIN if thin and work.backend is CPU else 0.0)
     count, own = len(surfels.gaussians), shown if thin else None
 
     def progress(at: Steps) -> None:
