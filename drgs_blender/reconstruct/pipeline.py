@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import time
 from collections.abc import Callable
@@ -28,7 +29,6 @@ from .capture.training_views import background_of, composed
 from .gpu.select_backend import select_backend
 from .inverse_rendering.joint import LearnedSurfels, decouple_jointly
 from .inverse_rendering.run import Decoupled, decouple
-from .inverse_rendering.run import Progress as Steps
 from .jit_warmup import warm_up
 from .losses.photometric import Photograph, structural_similarity
 from .meshing.depth_fusion import MOST, fuse, grid, voxels_that_fit
@@ -155,15 +155,10 @@ def reconstruct(
     if settings.materials:
         # Surfels on the mesh have its normals.
         thin = report["thin"] = settings.variant == "p" and is_thin(final, mesh, capture.training)
-
-        def fused(of: Gaussians) -> Mesh:
-            made, report["mesh"] = mesh_of(of, capture, region, voxels)
-            return made
-
-        known = LearnedSurfels(final, settings.schedule, region.radius, fused)
-        found = _decoupled(work, mesh, known, thin, report)
+        fused = functools.partial(mesh_of, capture=capture, region=region, resolution=voxels)
+        found = _decoupled(work, mesh, LearnedSurfels(final, settings.schedule, region.radius, fused), thin, report)
         if (shape := found.shape) is not None:
-            mesh, final = shape.mesh, shape.gaussians
+            mesh, final, report["mesh"] = shape.mesh, shape.gaussians, shape.fusion
     smooth = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
     report |= held_out_metrics(final, capture)
     visible = final.opacities().detach().numpy() >= UNSEEN
@@ -181,17 +176,15 @@ def reconstruct(
     if found is None:
         report["vertices_without_surfels"] = surfels_to_vertices(mesh, surfels, binding)
     else:
-        if shape is not None:
-            binding = shaded_by_own(binding, mesh, surfels, np.zeros_like(smooth))
-        elif thin:
-            binding = shaded_by_own(binding, mesh, surfels, found.normals - smooth)
+        if thin or shape is not None:
+            turns = found.normals - smooth if shape is None else np.zeros_like(smooth)
+            binding = shaded_by_own(binding, mesh, surfels, turns)
         elif settings.decoupling.normals:
             binding = shaded_by(binding, mesh, found.normals)
         if shape is None:
             _copy_materials(surfels, mesh, binding)
         else:
-            for name in BASE_CHANNELS:
-                setattr(surfels, name, getattr(shape, name)[visible])
+            surfels = replace(surfels, **{name: getattr(shape, name)[visible] for name in BASE_CHANNELS})
         environment, origin = Environment(found.environment), "separated from the lighting"
         done, of = report["steps"]["materials"]
         if _are_few(done, of):
@@ -319,12 +312,9 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, thin: bool, rep
         settings = replace(settings, seconds=seconds)
     if settings.joint is None:
         settings = replace(settings, joint=JOINT_OF_THIN if thin and work.backend is CPU else 0.0)
-    count, own = len(surfels.gaussians), shown if thin else None
-
-    def progress(at: Steps) -> None:
-        work.on_progress(Progress("materials", 0.7 + 0.3 * at.part, count, at.psnr))
-
-    rest = progress, work.cancelled, work.file("materials")
+    own, count = shown if thin else None, len(surfels.gaussians)
+    told = lambda at: work.on_progress(Progress("materials", 0.7 + 0.3 * at.part, count, at.psnr))  # noqa: E731
+    rest = told, work.cancelled, work.file("materials")
     if settings.joint and work.settings.variant == "p":
         if work.backend is not CPU:
             log.warning("decoupling.joint: surfels, materials and light are learned on the CPU, not on the card")

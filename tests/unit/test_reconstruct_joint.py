@@ -40,7 +40,7 @@ def mesh():
 def surfels(mesh) -> LearnedSurfels:
     points = mesh.vertices.astype(np.float64)
     gaussians = Gaussians.on_surface(points, unit(points), np.full(points.shape, 0.5), 0.04)
-    return LearnedSurfels(gaussians, Schedule(), 1.0, lambda _: mesh)
+    return LearnedSurfels(gaussians, Schedule(), 1.0, lambda _: (mesh, {}))
 
 
 def arrays(found: Decoupled) -> list[np.ndarray]:

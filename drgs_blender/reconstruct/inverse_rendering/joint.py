@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -67,13 +68,13 @@ class LearnedSurfels:
     radius : float
         Of the object, metres.
     fused : callable
-        Makes a mesh from the surfels.
+        Makes a mesh from the surfels, and a report of it.
     """
 
     gaussians: Gaussians
     schedule: SurfelSchedule
     radius: float
-    fused: Callable[[Gaussians], Mesh]
+    fused: Callable[[Gaussians], tuple[Mesh, dict[str, Any]]]
 
 
 def decouple_jointly(
@@ -215,14 +216,14 @@ class JointJob(Job):
         if self._own is None:
             return super().result()
         gaussians, views = self.learner.gaussians, self._capture.training
-        mesh = self._fused(gaussians)
+        mesh, fusion = self._fused(gaussians)
         with torch.no_grad():
             columns, weight = self._carried(mesh, gaussians)
             known = weight > 1e-3
             own = np.column_stack(self._own.described(torch.from_numpy(columns)))
             values = np.clip(filled(own, known, mesh), 0, 1)
         found = self._found(values, with_surfel_normals(mesh, views, normals_of(gaussians)), known)
-        found.shape = Shape(mesh, gaussians, *self._own.values())
+        found.shape = Shape(mesh, fusion, gaussians, *self._own.values())
         return found
 
     def _carried(self, mesh: Mesh, gaussians: Gaussians) -> tuple[Array, Array]:

@@ -81,6 +81,8 @@ class Shape:
     ----------
     mesh : Mesh
         Fused from them; its materials mean nothing.
+    fusion : dict
+        Report of that, see `depth_fusion.fuse`.
     gaussians : Gaussians
     albedo : (n, 3) float32 array
     roughness, metallic : (n,) float32 array
@@ -88,6 +90,7 @@ class Shape:
     """
 
     mesh: Mesh
+    fusion: dict[str, Any]
     gaussians: Gaussians
     albedo: Array
     roughness: Array
