@@ -27,7 +27,7 @@ class CachedObject:
 
     One that is shown in captured colours is `captured` for the camera, and for rays `glowing`. One with materials of
     its own, or with `channels` that rays meet, has a `mesh` with `images` and the optional channels `shown`; `met` is
-    what stands for the object in the scene. Its surfels may have `emission` (n, 3).
+    what stands for the object in the scene. Of a thin one light meets `sheet`. Its surfels may have `emission` (n, 3).
     """
 
     state: ObjectState
@@ -37,14 +37,20 @@ class CachedObject:
     posed: PosedSurfels | None = None
     hidden_count: int = 0
     faults: list[str] = field(default_factory=list)
-    mode: tuple[bool, bool, bool] = (False, False, False)
+    mode: tuple[bool, bool, bool, bool] = (False, False, False, False)
     captured: CapturedObject | None = None
     glowing: MeshState | None = None
+    sheet: MeshState | None = None
     mesh: ObjectMesh | None = None
     images: list[Image] = field(default_factory=list)
     emission: Array | None = None
     channels: dict[str, Array] = field(default_factory=dict)
     shown: frozenset[str] = frozenset()
+
+    @property
+    def sheeted(self) -> bool:
+        """Whether light meets sheets of its surfels, which have no channels."""
+        return self.mode[3] and not self.channels
 
     @property
     def seen_by_mesh(self) -> bool:
@@ -69,7 +75,7 @@ def emission_of(objects: Sequence[CachedObject]) -> Array | None:
     return np.concatenate(rows)
 
 
-def begun(state: ObjectState, loaded: LoadedAsset, mode: tuple[bool, bool, bool], index: int) -> CachedObject:
+def begun(state: ObjectState, loaded: LoadedAsset, mode: tuple[bool, bool, bool, bool], index: int) -> CachedObject:
     """An object that is new or has changed, without its surfels.
 
     Parameters
@@ -77,20 +83,22 @@ def begun(state: ObjectState, loaded: LoadedAsset, mode: tuple[bool, bool, bool]
     state : ObjectState
     loaded : LoadedAsset
     mode : tuple of bool
-        Whether rays meet surfels, whether it is shown in captured colours, and whether its textures are met.
+        Whether rays meet surfels, whether it is shown in captured colours, whether its textures are met, and whether
+        light meets sheets.
     index : int
         Of the object in the frame.
     """
-    met, shown, textured = mode
+    met, shown, textured, sheeted = mode
     asset = loaded.asset
-    traced = traced_object(state, asset, met or shown)
+    channels = {} if shown else optional_channels(state, asset)
+    traced = traced_object(state, asset, met or shown or (sheeted and not channels))
     item = CachedObject(state, loaded, traced, traced, mode=mode)
     item.faults = [*(f"{state.name}: {fault}" for fault in loaded.faults), *material_faults(state)]
     if shown:
         if len(asset.mesh.faces):
             item.glowing = glowing_mesh(state, traced, loaded.glow_of(state.asset))
         return item
-    item.channels = optional_channels(state, asset)
+    item.channels = channels
     textures = asset.mesh.textures
     needed = textures is not None and bool(textured or item.channels or textures.optional)
     images = loaded.textured_of(state.asset) if needed else None

@@ -16,6 +16,7 @@ from ..core.frame import Frame, ObjectState, RenderSettings
 from ..core.material_adjustments import scaled
 from ..deform.mesh_driven import MeshDriven
 from .scene_objects import material
+from .surfel_sheets import meets_sheets
 
 Array = np.ndarray
 
@@ -105,5 +106,6 @@ def channel_faults(state: ObjectState, asset: Asset, shown: Collection[str], set
 
 
 def may_need(frame: Frame, assets: list[Asset]) -> bool:
-    """Whether a frame with these assets of its objects may have meshes that emit, whose kernels are others."""
-    return any(has_channels(state, asset) for state, asset in zip(frame.objects, assets))
+    """Whether a frame with these assets of its objects may have meshes that emit, or sheets; both need more kernels."""
+    both = zip(frame.objects, assets)
+    return any(has_channels(state, asset) or meets_sheets(state, asset, frame) for state, asset in both)

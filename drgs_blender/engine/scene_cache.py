@@ -38,6 +38,7 @@ from .captured_objects import captured_faults, captured_object, shows_captured
 from .loaded_assets import LoadedAsset
 from .optional_channels import channel_faults, may_need, surfel_emission
 from .scene_objects import in_asset_order, join, moved_vertices, posed_surfels
+from .surfel_sheets import meets_sheets, sheet_mesh
 
 Array = np.ndarray
 
@@ -173,7 +174,8 @@ class SceneCache:
             state = in_asset_order(state, loaded.asset)
             known = self.objects[index] if index < len(self.objects) else None
             kept = reuse_equal(state, None if known is None else known.state)
-            mode = met, shown, loaded.asset.mesh.textures is not None and not shown and not (seen and met)
+            textured = loaded.asset.mesh.textures is not None and not shown and not (seen and met)
+            mode = met, shown, textured, not shown and meets_sheets(state, loaded.asset, frame)
             if known is not None and known.loaded is loaded and known.state is kept and known.mode == mode:
                 item = known
             else:
@@ -184,6 +186,8 @@ class SceneCache:
             if (seen or met) and item.posed is None:
                 given = item.state, index, loaded.surfels_of(item.state), item.traced
                 item.posed, item.hidden_count = posed_surfels(*given, self._poser(backend))
+            if item.sheeted and item.sheet is None and item.posed is not None:
+                item.sheet = sheet_mesh(item.state, item.posed)
             if shown and item.captured is None and item.posed is not None:
                 item.captured = captured_object(item.state, loaded.asset, item.posed)
             if seen and item.posed is not None and item.emission is None and not (shown or item.seen_by_mesh):
@@ -200,6 +204,7 @@ class SceneCache:
             glowing = [item for item in objects if item.glowing is not None]
             glows = {item.state.asset: item.loaded.glow_of(item.state.asset).image for item in glowing}
             others = [*meshes, *(item.glowing for item in glowing if item.glowing is not None)]
+            others += [item.sheet for item in objects if item.sheet is not None]
             others += [item.mesh for item in objects if item.mesh is not None]
             textures = {image.name: image for item in objects for image in item.images}
             layout = self.scene.layout
@@ -283,8 +288,8 @@ class SceneCache:
             None if pose is None else moved_vertices(item.state, item.loaded.asset, pose)
             for pose, item in zip(step.objects, self.objects)
         ]
-        others = sum((item.glowing is not None) + (item.mesh is not None) for item in self.objects)
-        vertices, instances = self.scene.at(moved, [*step.meshes, *[None] * others])
+        others = [part for item in self.objects for part in (item.glowing, item.sheet, item.mesh) if part is not None]
+        vertices, instances = self.scene.at(moved, [*step.meshes, *[None] * len(others)])
         return SceneState(vertices, instances, camera_parameters(step.camera, frame.settings, frame.noise_index))
 
     def warnings(self, passes: Collection[str] = ()) -> list[str]:
@@ -368,6 +373,7 @@ class SceneCache:
         self.lights = Lights(lights, *sphere, self._emitters)
         shapes: list[ObjectState | MeshState] = [*(item.state for item in self.objects), *self.meshes]
         shapes += [item.glowing for item in self.objects if item.glowing is not None]
+        shapes += [item.sheet for item in self.objects if item.sheet is not None]
         link(self.lights, lights, shapes, self.scene, sphere)
         group(self.lights, lights, shapes, frame.world.light_group, groups_of(frame.passes))
         return self.lights

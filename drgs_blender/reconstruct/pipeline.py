@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import time
 from collections.abc import Callable
@@ -26,6 +27,7 @@ from .backend import CPU
 from .capture.capture import Capture, View
 from .capture.training_views import background_of, composed
 from .gpu.select_backend import select_backend
+from .inverse_rendering.joint import LearnedSurfels, decouple_jointly
 from .inverse_rendering.run import Decoupled, decouple
 from .jit_warmup import warm_up
 from .losses.photometric import Photograph, structural_similarity
@@ -53,6 +55,8 @@ SURFEL_TIME_FRACTION, MESH_SURFEL_TIME_FRACTION = 0.45, 0.15
 MATERIAL_TIME_FRACTION = 0.35
 #: Voxels where none are asked for and each face gets a surfel, or time decides.
 FEW_VOXELS = 256
+#: Last part of the steps of materials in which the surfels of thin objects are learned, too.
+JOINT_OF_THIN = 0.5
 #: Fewer steps of materials than this separate them poorly from the light.
 FEW_STEPS = 300
 #: Phase -> the settings that decide its result.
@@ -147,14 +151,19 @@ def reconstruct(
     binding: Binding | None = None
     if settings.variant == "m":
         final, binding = _on_mesh(work, mesh, free, region, report)
-    report |= held_out_metrics(final, capture)
-    visible = final.opacities().detach().numpy() >= UNSEEN
-    surfels = _visible_surfels(final, visible)
-    found, thin, smooth = None, False, VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
+    found, shape, thin = None, None, False
     if settings.materials:
         # Surfels on the mesh have its normals.
         thin = report["thin"] = settings.variant == "p" and is_thin(final, mesh, capture.training)
-        found = _decoupled(work, mesh, final, thin, report)
+        fused = functools.partial(mesh_of, capture=capture, region=region, resolution=voxels)
+        found = _decoupled(work, mesh, LearnedSurfels(final, settings.schedule, region.radius, fused), thin, report)
+        if (shape := found.shape) is not None:
+            mesh, final, report["mesh"] = shape.mesh, shape.gaussians, shape.fusion
+    smooth = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
+    report |= held_out_metrics(final, capture)
+    visible = final.opacities().detach().numpy() >= UNSEEN
+    surfels = _visible_surfels(final, visible)
+    if found is not None:
         mesh = replace(mesh, albedo=found.albedo, roughness=found.roughness, metallic=found.metallic)
         if settings.decoupling.normals:
             mesh.vertices = follow_normals(mesh, found.normals)
@@ -167,11 +176,15 @@ def reconstruct(
     if found is None:
         report["vertices_without_surfels"] = surfels_to_vertices(mesh, surfels, binding)
     else:
-        if thin:
-            binding = shaded_by_own(binding, mesh, surfels, found.normals - smooth)
+        if thin or shape is not None:
+            turns = found.normals - smooth if shape is None else np.zeros_like(smooth)
+            binding = shaded_by_own(binding, mesh, surfels, turns)
         elif settings.decoupling.normals:
             binding = shaded_by(binding, mesh, found.normals)
-        _copy_materials(surfels, mesh, binding)
+        if shape is None:
+            _copy_materials(surfels, mesh, binding)
+        else:
+            surfels = replace(surfels, **{name: getattr(shape, name)[visible] for name in BASE_CHANNELS})
         environment, origin = Environment(found.environment), "separated from the lighting"
         done, of = report["steps"]["materials"]
         if _are_few(done, of):
@@ -290,24 +303,24 @@ def _on_mesh(
     return final, bound(binding, final)  # type: ignore[arg-type]
 
 
-def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: dict[str, Any]) -> Decoupled:
-    """Materials, normals and light."""
-    settings, shown, start = work.settings.decoupling, normals_of(surfels), None
+def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, thin: bool, report: dict[str, Any]) -> Decoupled:
+    """Materials, normals and light; the shape, too, where it is learned with them."""
+    settings, shown, start = work.settings.decoupling, normals_of(surfels.gaussians), None
     if settings.normals and work.settings.variant == "p" and not thin:
         start = with_surfel_normals(mesh, work.capture.training, shown)
     if (seconds := work.seconds(MATERIAL_TIME_FRACTION)) is not None:
         settings = replace(settings, seconds=seconds)
-    found = decouple(
-        work.capture,
-        mesh,
-        settings,
-        lambda at: work.on_progress(Progress("materials", 0.7 + 0.3 * at.part, len(surfels), at.psnr)),
-        work.cancelled,
-        work.file("materials"),
-        work.backend,
-        shown if thin else None,
-        start,
-    )
+    if settings.joint is None:
+        settings = replace(settings, joint=JOINT_OF_THIN if thin and work.backend is CPU else 0.0)
+    own, count = shown if thin else None, len(surfels.gaussians)
+    told = lambda at: work.on_progress(Progress("materials", 0.7 + 0.3 * at.part, count, at.psnr))  # noqa: E731
+    rest = told, work.cancelled, work.file("materials")
+    if settings.joint and work.settings.variant == "p":
+        if work.backend is not CPU:
+            log.warning("decoupling.joint: surfels, materials and light are learned on the CPU, not on the card")
+        found = decouple_jointly(work.capture, mesh, surfels, settings, *rest, own, start)
+    else:
+        found = decouple(work.capture, mesh, settings, *rest, work.backend, own, start)
     done, of = work.steps["materials"] = [found.report["iterations"], work.settings.decoupling.iterations]
     if _are_few(done, of):
         minutes = work.settings.minutes

@@ -91,6 +91,8 @@ class Settings:
         names = (
             [] if self.materials else [f"decoupling.{name}" for name in _changed(self.decoupling, default.decoupling)]
         )
+        if self.materials and self.decoupling.joint and self.variant == "m":
+            names += ["decoupling.joint"]
         return names + (["fixed"] if self.fixed and self.variant == "p" else [])
 
 

@@ -25,7 +25,7 @@ from drgs_blender.reconstruct.inverse_rendering.gatherer import Gatherer  # noqa
 from drgs_blender.reconstruct.inverse_rendering.losses import blotches, dullness, log_loss, unbiased_loss  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.materials import Materials, from_specular  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.pixels import foreground_pixels  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.radiance_cache import radiance_cache  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.radiance_cache import edges_of, radiance_cache  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.regularisers import Regularisers, fineness  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.run import Decoupled, decouple  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
@@ -88,7 +88,7 @@ def test_radiance_and_its_derivatives_match_the_reference(shading_model):
     mesh, points, up = floor_points()
     image = sky()
     columns = torch.tensor([[0.6, 0.4, 0.2, 0.0, 0.3]]).repeat(len(up), 1)
-    materials = Materials(mesh, "metallic", 0)
+    materials = Materials(mesh.vertices, "metallic", 0)
     columns[:, 3] = (torch.from_numpy(ROUGHNESS) - 0.03) / 0.97
     columns.requires_grad_(True)
     normal = torch.from_numpy(up).clone().requires_grad_(True)
@@ -168,7 +168,7 @@ def test_shading_matches_the_renderer_where_the_mesh_shadows_itself():
     columns = torch.from_numpy(np.column_stack([albedo, (roughness - 0.03) / 0.97, metallic]).astype(np.float32))
     draw = gatherer(mesh, 4096)
     sums = draw.run(Points(origin, up, view, np.arange(24, dtype=np.uint32)), up, (roughness**4).astype("f4"), image)[0]
-    materials = Materials(mesh, "metallic", 0)
+    materials = Materials(mesh.vertices, "metallic", 0)
     ours = materials.reflect(columns, torch.from_numpy(sums), torch.from_numpy(view[:, 2]), "principled").mean(1)
 
     scene = TraceScene()
@@ -334,7 +334,7 @@ def test_dielectrics_are_surfaces_without_metal(shading_model):
     mesh, points, up = floor_points()
     sums = torch.rand(len(up), 2, 4, 3, generator=torch.Generator().manual_seed(2))
     columns, nv = torch.tensor([[0.6, 0.4, 0.2, 0.3, 0.0]]).repeat(len(up), 1), torch.from_numpy(points.towards[:, 2])
-    metallic, plain = (Materials(mesh, kind, 0) for kind in ("metallic", "dielectric"))
+    metallic, plain = (Materials(mesh.vertices, kind, 0) for kind in ("metallic", "dielectric"))
     assert torch.equal(
         plain.reflect(columns[:, :4], sums, nv, shading_model), metallic.reflect(columns, sums, nv, shading_model)
     )
@@ -689,7 +689,8 @@ def test_the_same_slope_is_smoothed_as_much_on_finer_meshes():
         faces = np.stack([corner, corner + cells + 1, corner + 1], -1)
         sheet = plain_mesh(np.stack([x, y, 0 * x], -1).reshape(-1, 3), faces)
         settings = Settings(metal_smoothness=0, metal_albedo_prior=0)
-        held = Regularisers(faces, np.full((len(sheet.vertices), 3), 0.5), settings, fineness(sheet))
+        finer = fineness(sheet.vertices, faces[:, :2])
+        held = Regularisers(edges_of(faces), np.full((len(sheet.vertices), 3), 0.5), settings, finer)
         edge = np.arange(0, len(held._edges), 7)
         slope = torch.from_numpy(sheet.vertices[:, :1].astype(np.float32))
         ends = torch.from_numpy(held.edges(edge).astype(np.int64))

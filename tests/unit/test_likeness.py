@@ -10,12 +10,12 @@ from shapes import plain_mesh
 torch = pytest.importorskip("torch")
 
 from drgs_blender.core.asset import Mesh  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.likeness import LikeVertices, features, palette  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.likeness import LikePoints, features, palette  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.materials import Materials  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.pixels import Pixels  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.regularisers import Regularisers  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.surface import SurfaceSamples  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.surface import Pairs  # noqa: E402
 
 torch.set_num_threads(1)
 RED, BLUE = np.float32([0.4, 0.1, 0.1]), np.float32([0.1, 0.1, 0.4])
@@ -76,8 +76,8 @@ def test_pairs_of_other_looks_or_from_afar_do_not_count(ball):
     colour[:, spot] = RED[[1, 0, 1]]
     inside = np.setdiff1d(ball.faces[spot], ball.faces[~spot])
     assert len(inside) and len(np.unique(ball.faces[spot])) < 12
-    like = LikeVertices(features(pixels(ball, colour), ball), ball, 0)
-    pairs, weight = like.draw(np.random.default_rng(1))
+    like = LikePoints(features(pixels(ball, colour), ball), ball.vertices, 0)
+    pairs, weight = (x.numpy() for x in like.draw(np.random.default_rng(1)))
     assert pairs.shape == (len(weight), 2) and weight.min() >= 0 and weight.max() <= 1
     left, right = sides(ball)
     out = np.isin(pairs[:, 0], inside) & ~np.isin(pairs[:, 1], ball.faces[spot])
@@ -88,12 +88,9 @@ def test_pairs_of_other_looks_or_from_afar_do_not_count(ball):
 
 
 def test_likeness_makes_materials_of_pairs_alike_by_their_weight():
-    faces = np.array([[0, 1, 2]])
-    held = Regularisers(faces, np.full((3, 3), 0.5), Settings(same_material=0.5))
+    held = Regularisers(np.array([[0, 1], [1, 2]]), np.full((3, 3), 0.5), Settings(same_material=0.5))
     columns = torch.tensor([[0.2] * 5, [0.3] * 5, [0.9] * 5], requires_grad=True)
-    ends = torch.zeros(0, 2, dtype=torch.int64)
-    samples = SurfaceSamples(columns, columns, columns, None, ends, torch.tensor([[0, 1], [1, 2]]))
-    loss = held.of_likeness(samples, np.float32([1, 0]))
+    loss = held.of_likeness(columns, Pairs(torch.tensor([[0, 1], [1, 2]]), torch.tensor([1.0, 0.0])))
     assert float(loss.detach()) == pytest.approx(0.5 * 0.1 * 6 / 2, rel=1e-5)
     loss.backward()
     assert (columns.grad[0] < 0).all() and (columns.grad[1] > 0).all() and not columns.grad[2].any()
@@ -103,7 +100,7 @@ def test_a_palette_teaches_a_vertex_what_another_of_the_same_look_has_learned(ba
     left, right = sides(ball)
     shared = palette(features(pixels(ball, painted(ball)), ball), 2, 0)
     assert shared.size == 2 and shared.share.sum(1).numpy() == pytest.approx(1, abs=1e-5)
-    materials = Materials(ball, "metallic", 0, palette=shared)
+    materials = Materials(ball.vertices, "metallic", 0, palette=shared)
     palette_of = materials.parameters["palette"].requires_grad_(True)
     materials.at(torch.from_numpy(np.flatnonzero(left)[:1]))[:, 3].sum().backward()
     with torch.no_grad():

@@ -16,6 +16,7 @@ from capture_cases import balls  # noqa: E402
 from drgs_blender.core.asset.model import Mesh  # noqa: E402
 from drgs_blender.geometry.normals import rotation_matrices, unit  # noqa: E402
 from drgs_blender.reconstruct import pipeline  # noqa: E402
+from drgs_blender.reconstruct.backend import LearningBackend  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling  # noqa: E402
 from drgs_blender.reconstruct.model.gaussians import Gaussians  # noqa: E402
 from drgs_blender.reconstruct.model.thin_structures import is_thin, normals_of  # noqa: E402
@@ -23,6 +24,11 @@ from drgs_blender.reconstruct.optim.schedule import Schedule  # noqa: E402
 from drgs_blender.reconstruct.pipeline import Settings, reconstruct  # noqa: E402
 
 RIBS = 12
+QUICK = Settings(
+    schedule=Schedule(iterations=60, surfels=1500),
+    mesh_resolution=32,
+    decoupling=Decoupling(iterations=5, pixels=64, cosine=2, ggx=2, light=2, environment=8, normals=True),
+)
 
 
 def surfels_on(points: np.ndarray, normals: np.ndarray) -> Gaussians:
@@ -70,9 +76,7 @@ def test_surfels_of_thin_things_are_shaded_by_their_own_normals(thin, monkeypatc
     learn = pipeline.decouple
     monkeypatch.setattr(pipeline, "is_thin", lambda *_: thin)
     monkeypatch.setattr(pipeline, "decouple", lambda *given: told.append(given[-2:]) or learn(*given))
-    quick = Decoupling(iterations=5, pixels=64, cosine=2, ggx=2, light=2, environment=8, normals=True)
-    settings = Settings(schedule=Schedule(iterations=60, surfels=1500), mesh_resolution=32, decoupling=quick)
-    asset = reconstruct(balls(), settings)
+    asset = reconstruct(balls(), replace(QUICK, decoupling=replace(QUICK.decoupling, joint=0.0)))
     assert asset.provenance["report"]["thin"] is thin
     [(normals, start)] = told
     assert (normals is not None) is thin  # learned with them, too
@@ -81,3 +85,39 @@ def test_surfels_of_thin_things_are_shaded_by_their_own_normals(thin, monkeypatc
     driven = pipeline.MeshDriven(asset.mesh, asset.surfels, asset.binding).pose(asset.mesh.vertices)
     cosine = np.abs((own * driven.normal).sum(axis=1))
     assert (np.quantile(cosine, 0.02) > 0.999) == thin
+
+
+@pytest.mark.parametrize("thin", [True, False])
+def test_surfels_of_thin_things_are_learned_with_materials_of_their_own(thin, monkeypatch):
+    together, shapes = pipeline.decouple_jointly, []
+
+    def learn(*given):
+        found = together(*given)
+        shapes.append(found.shape)
+        return found
+
+    monkeypatch.setattr(pipeline, "is_thin", lambda *_: thin)
+    monkeypatch.setattr(pipeline, "decouple_jointly", learn)
+    asset = reconstruct(balls(), QUICK)
+    assert len(shapes) == thin
+    if thin:
+        [shape] = shapes
+        visible = shape.gaussians.opacities().detach().numpy() >= pipeline.UNSEEN
+        assert np.array_equal(asset.surfels.roughness, shape.roughness[visible])
+        assert np.array_equal(asset.surfels.centre, shape.gaussians.arrays()["centre"][visible])
+        assert len(asset.mesh.vertices) == len(shape.mesh.vertices) == asset.provenance["report"]["mesh"]["vertices"]
+
+
+@pytest.mark.slow
+def test_a_card_does_not_learn_surfels_with_materials_and_says_so(monkeypatch, caplog):
+    """Asked for, they are learned on the CPU; else they are not."""
+    used = []
+    monkeypatch.setattr(pipeline, "is_thin", lambda *_: True)
+    for name in ("decouple", "decouple_jointly"):
+        learn = getattr(pipeline, name)
+        monkeypatch.setattr(pipeline, name, lambda *given, name=name, learn=learn: used.append(name) or learn(*given))
+    monkeypatch.setattr(pipeline, "select_backend", lambda _: LearningBackend())
+    for joint in (None, 0.5):
+        reconstruct(balls(), replace(QUICK, decoupling=replace(QUICK.decoupling, joint=joint)))
+    assert used == ["decouple", "decouple_jointly"]
+    assert "decoupling.joint: surfels, materials and light are learned on the CPU" in caplog.text

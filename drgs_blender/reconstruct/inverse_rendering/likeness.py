@@ -16,6 +16,7 @@ from ...core.asset.model import Mesh
 from .materials import Palette
 from .pixels import Pixels
 from .radiance_cache import filled
+from .surface import Pairs
 
 #: Quantiles of brightness: the one taken for a vertex's own, those whose ratio is its score, and how wide each is.
 _DARK, _LOW, _HIGH, _WIDE = 0.25, 0.2, 0.8, 0.1
@@ -61,29 +62,30 @@ def features(pixels: Pixels, mesh: Mesh) -> Array:
     return filled(found, total > 1e-3, mesh)
 
 
-class LikeVertices:
-    """Pairs of near vertices that photographs show alike, as a joint bilateral filter weighs them.
+class LikePoints:
+    """Pairs of near vertices, or surfels, that photographs show alike, as a joint bilateral filter weighs them.
 
     Parameters
     ----------
     features : (v, 4) float32 array
-    mesh : Mesh
+    places : (v, 3) float32 array
     seed : int
     """
 
-    def __init__(self, features: Array, mesh: Mesh, seed: int) -> None:
-        extent = max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-12)
-        points = np.column_stack([features, mesh.vertices / (_PLACE * extent)])
+    def __init__(self, features: Array, places: Array, seed: int) -> None:
+        extent = max(float(np.ptp(places, axis=0).max()), 1e-12)
+        points = np.column_stack([features, places / (_PLACE * extent)])
         most = min(_ANCHORS, len(points))
         anchors = np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))
         far, near = (x.reshape(len(points), -1) for x in cKDTree(points[anchors]).query(points, min(_NEAREST, most)))
         self._like, self._weight = anchors[near], np.exp(-0.5 * far**2).astype(np.float32)
 
-    def draw(self, generator: np.random.Generator) -> tuple[Array, Array]:
-        """The pairs of a step, (p, 2) int64 vertices, and their weights (p,) float32 in [0, 1]."""
+    def draw(self, generator: np.random.Generator) -> Pairs:
+        """The pairs of a step."""
         one = generator.integers(0, len(self._like), _PAIRS)
         each = generator.integers(0, self._like.shape[1], _PAIRS)
-        return np.stack([one, self._like[one, each]], -1), self._weight[one, each]
+        both = np.stack([one, self._like[one, each]], -1)
+        return Pairs(torch.from_numpy(both), torch.from_numpy(self._weight[one, each]))
 
 
 def palette(features: Array, most: int, seed: int) -> Palette:

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...core.asset.model import Mesh
 from ...render.reference.brdf import layer_albedo
 from .blend import blend
 
@@ -26,6 +25,8 @@ _SMOOTHEST = 0.03
 _ALBEDO, _ROUGHNESS, _METALLIC, _SPECULAR = 0.4, 0.5, 0.2, 0.1
 _GREY, _WITHIN = np.ones(3), (0.05, 0.9)
 _DIELECTRIC = 0.04
+#: Given values are kept this far from 0 and 1, where logits have no end.
+_MARGIN = 0.005
 
 
 class Grids:
@@ -82,7 +83,8 @@ class Materials:
 
     Parameters
     ----------
-    mesh : Mesh
+    points : (v, 3) float array
+        Where the materials are: vertices, or centres of surfels.
     parametrisation : str
     coarse : int
     colour : (3,) array
@@ -92,15 +94,15 @@ class Materials:
     """
 
     def __init__(
-        self, mesh: Mesh, parametrisation: str, coarse: int, colour: Array = _GREY, palette: Palette | None = None
+        self, points: Array, parametrisation: str, coarse: int, colour: Array = _GREY, palette: Palette | None = None
     ) -> None:
         self.specular, self.metallic = parametrisation == "specular", parametrisation == "metallic"
         more = [_SPECULAR] * 3 if self.specular else [_METALLIC] * self.metallic
         hue = np.asarray(colour) / max(float(np.mean(colour)), 1e-6)
         start = np.array([*np.clip(_ALBEDO * hue, *_WITHIN), _ROUGHNESS, *more])
         self._start = torch.from_numpy(np.log(start / (1 - start)).astype(np.float32))
-        self._grids = Grids(mesh.vertices, coarse)
-        self._count, columns = len(mesh.vertices), len(start)
+        self._grids = Grids(points, coarse)
+        self._count, columns = len(points), len(start)
         self.parameters = {"detail": torch.zeros(self._count, columns)}
         for level, size in enumerate(self._grids.sizes):
             self.parameters[f"grid{level}"] = torch.zeros(size, columns)
@@ -109,7 +111,7 @@ class Materials:
             self.parameters["palette"] = torch.zeros(palette.size, columns)
 
     def at(self, vertices: Tensor) -> Tensor:
-        """Columns (k, c) of `vertices` (k,), activated: all within [0, 1]."""
+        """Columns (k, c) of the points `vertices` (k,), activated: all within [0, 1]."""
         value = self._start + self.parameters["detail"].index_select(0, vertices)
         for level, (index, share) in enumerate(zip(self._grids.index, self._grids.share)):
             value = value + blend(self.parameters[f"grid{level}"], index[vertices], share[vertices])
@@ -137,10 +139,18 @@ class Materials:
         return _SMOOTHEST + (1 - _SMOOTHEST) * columns[:, 3]
 
     def values(self) -> tuple[Array, Array, Array]:
-        """Albedo (v, 3), roughness (v,) and metallic (v,) of all vertices."""
+        """Albedo (v, 3), roughness (v,) and metallic (v,) of all points."""
         with torch.no_grad():
-            columns = self.at(torch.arange(self._count))
-            roughness = self.roughness(columns).numpy()
+            return self.described(self.at(torch.arange(self._count)))
+
+    def begin(self, columns: Tensor) -> None:
+        """Begin with these columns (v, c) of the points."""
+        inside = columns.clamp(_MARGIN, 1 - _MARGIN)
+        self.parameters["detail"].copy_(torch.log(inside / (1 - inside)) - self._start)
+
+    def described(self, columns: Tensor) -> tuple[Array, Array, Array]:
+        """Albedo (n, 3), roughness (n,) and metallic (n,) of `columns` (n, c)."""
+        roughness = self.roughness(columns).numpy()
         values = columns.numpy()
         if self.specular:
             albedo, metallic = from_specular(values[:, :3], values[:, 4:7])

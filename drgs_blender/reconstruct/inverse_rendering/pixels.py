@@ -40,6 +40,8 @@ class Pixels:
     ----------
     view : (n,) int32 array
         Index among the training views.
+    place : (n,) int32 array
+        Index in the view's picture, row by row.
     face : (n,) int32 array
     corners : (n, 3) float32 array
         Barycentric coordinates on the face.
@@ -58,6 +60,7 @@ class Pixels:
     """
 
     view: Array
+    place: Array
     face: Array
     corners: Array
     origin: Array
@@ -145,6 +148,7 @@ def pixels_of(index: int, view: View, mesh: Mesh, tree: TriangleBVH, normals: No
     given = None if normals is None else np.asarray(normals(view), np.float32)
     part = Pixels(
         np.full(len(row), index, np.int32),
+        row.astype(np.int32),
         face,
         np.stack([1 - u - v, u, v], -1),
         origin + t[:, None] * direction,

@@ -6,12 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...core.asset.model import Mesh
 from .environment import LearnedLight, colour_cast
 from .losses import blotches, dullness
-from .radiance_cache import edges_of
 from .settings import Settings
-from .surface import SurfaceSamples, at_both
+from .surface import Pairs, SurfaceSamples, at_both
 
 Array = np.ndarray
 
@@ -30,17 +28,18 @@ class Regularisers:
 
     Parameters
     ----------
-    faces : (f, 3) int32 array
+    edges : (e, 2) int64 array
+        Pairs of vertices, or of surfels, that lie side by side.
     colours : (v, 3) float32 array
-        Mean colour of the photographs at the vertices.
+        Mean colour of the photographs there.
     settings : Settings
     finer : float
-        `fineness` of the mesh: the factor of differences along edges.
+        Their `fineness`: the factor of differences along edges.
     """
 
-    def __init__(self, faces: Array, colours: Array, settings: Settings, finer: float = 1.0) -> None:
+    def __init__(self, edges: Array, colours: Array, settings: Settings, finer: float = 1.0) -> None:
         self._settings, self._finer = settings, finer
-        self._edges = edges_of(faces)
+        self._edges = edges
         self._likeness = _likeness(self._edges, colours)
 
     def draw(self, generator: np.random.Generator) -> Array:
@@ -80,12 +79,11 @@ class Regularisers:
             loss = loss + s.metal_albedo_prior * dullness(samples.materials[:, :3], samples.materials[:, 4])
         return loss
 
-    def of_likeness(self, samples: SurfaceSamples, weight: Array) -> Tensor:
-        """Alike where photographs are, by weights (p,) of the pairs of `samples`."""
-        assert samples.pairs is not None
-        pair = at_both(samples.columns, samples.pairs)
-        differences = torch.from_numpy(weight)[:, None] * (pair[:, 0] - pair[:, 1]).abs()
-        weights = torch.tensor(_ALIKE[: samples.columns.shape[1]])
+    def of_likeness(self, columns: Tensor, pairs: Pairs) -> Tensor:
+        """Columns (u, c) of `Materials`, alike at pairs of points that photographs show alike."""
+        pair = at_both(columns, pairs.ends)
+        differences = pairs.weight[:, None] * (pair[:, 0] - pair[:, 1]).abs()
+        weights = torch.tensor(_ALIKE[: columns.shape[1]])
         return self._settings.same_material * (differences.mean(0) * weights).sum()
 
     def of_light(self, light: LearnedLight, radiance: Tensor) -> Tensor:
@@ -106,14 +104,14 @@ class Regularisers:
         return self._settings.normal_smoothness * (self._finer * alike + 0.02 * (samples.offsets**2).sum(1).mean())
 
 
-def fineness(mesh: Mesh) -> float:
-    """How many times shorter edges are than those of the meshes that weights were chosen on, from 1 to `FINEST`.
+def fineness(points: Array, edges: Array) -> float:
+    """How many times shorter edges (e, 2) of points (n, 3) are than those of which weights were chosen: 1 to `FINEST`.
 
     Along shorter edges the same materials differ less, and a vertex is seen by fewer pixels.
     """
-    corners = mesh.vertices[mesh.faces[:, :2]]
-    edge = float(np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1).mean())
-    return min(max(EDGE * float(np.ptp(mesh.vertices, axis=0).max()) / max(edge, 1e-30), 1.0), FINEST)
+    ends = points[edges]
+    edge = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
+    return min(max(EDGE * float(np.ptp(points, axis=0).max()) / max(edge, 1e-30), 1.0), FINEST)
 
 
 def _likeness(edges: Array, colours: Array) -> Array:

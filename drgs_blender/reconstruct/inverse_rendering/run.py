@@ -23,16 +23,17 @@ from ...render.scene.triangle_bvh import TriangleBVH
 from .. import checkpoint as states
 from ..backend import CPU, LearningBackend
 from ..capture.capture import Capture
+from ..model.gaussians import Gaussians
 from ..optim.adam import Adam
 from .lighting import Lighting
-from .likeness import LikeVertices, features, palette
+from .likeness import LikePoints, features, palette
 from .losses import log_loss, unbiased_loss
 from .pixels import Normals, Pixels, foreground_pixels
-from .radiance_cache import filled, radiance_cache
+from .radiance_cache import edges_of, filled, radiance_cache
 from .regularisers import Regularisers, fineness
 from .schedule import Schedule
 from .settings import Settings
-from .surface import Surface, SurfaceSamples
+from .surface import Pairs, Surface, SurfaceSamples
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
@@ -60,6 +61,8 @@ class Decoupled:
     report : dict
         JSON-able: "views", "pixels", "iterations", "seconds", "psnr" (of the pixels of the last steps, dB in sRGB),
         "loss", "unseen_vertices", "exposures" (factors of the views, when learned).
+    shape : Shape, optional
+        Where the shape was learned, too; the arrays above are of its mesh then.
     """
 
     albedo: Array
@@ -68,6 +71,31 @@ class Decoupled:
     environment: Array
     normals: Array
     report: dict[str, Any] = field(default_factory=dict)
+    shape: Shape | None = None
+
+
+@dataclass(slots=True)
+class Shape:
+    """Surfels that were learned with materials and light.
+
+    Attributes
+    ----------
+    mesh : Mesh
+        Fused from them; its materials mean nothing.
+    fusion : dict
+        Report of that, see `depth_fusion.fuse`.
+    gaussians : Gaussians
+    albedo : (n, 3) float32 array
+    roughness, metallic : (n,) float32 array
+        The surfels' own, as of `Decoupled`.
+    """
+
+    mesh: Mesh
+    fusion: dict[str, Any]
+    gaussians: Gaussians
+    albedo: Array
+    roughness: Array
+    metallic: Array
 
 
 @dataclass(slots=True)
@@ -127,14 +155,15 @@ def decouple(
         The mesh has no faces.
     Cancelled
     """
-    settings.check()
-    if not len(mesh.faces):
-        raise AssetError("mesh", "has no faces", "Decoupling needs the surface")
-    if not capture.training:
-        raise UsageError(str(capture.source), "has no training view", "Leave fewer views out for the test")
-    if len(capture.training) < 4:
-        log.warning("only %d views: light and materials can hardly be separated", len(capture.training))
     job = Job(capture, mesh, settings, checkpoint, backend, normals, start, now)
+    return learned(job, on_progress, cancelled)
+
+
+def learned(
+    job: Job, on_progress: Callable[[Progress], None] | None, cancelled: Callable[[], bool] | None
+) -> Decoupled:
+    """Run a job to its end, as `decouple` says."""
+    job.go_on()
     schedule = job.schedule
     while schedule.going():
         if cancelled is not None and cancelled():
@@ -194,7 +223,14 @@ class Job:
         self, capture: Capture, mesh: Mesh, settings: Settings, checkpoint: Path | None, backend: LearningBackend,
         normals: Normals | None, start: Array | None, now: Callable[[], float],
     ) -> None:  # fmt: skip
-        self._mesh, self._settings, self._views = mesh, settings, len(capture.training)
+        settings.check()
+        if not len(mesh.faces):
+            raise AssetError("mesh", "has no faces", "Decoupling needs the surface")
+        if not capture.training:
+            raise UsageError(str(capture.source), "has no training view", "Leave fewer views out for the test")
+        if len(capture.training) < 4:
+            log.warning("only %d views: light and materials can hardly be separated", len(capture.training))
+        self._mesh, self._settings, self._capture = mesh, settings, capture
         self.schedule, self.score = Schedule(settings, now), Score()
         tree = TriangleBVH()
         tree.build(mesh.vertices, mesh.faces)
@@ -210,21 +246,25 @@ class Job:
         # without any detail: light is to explain shading before albedo can.
         mean = self._pixels.colour.mean(axis=0)
         self.lighting = Lighting(gatherer, settings, 2.5 * float(mean.mean()))
-        finer = fineness(mesh)
+        finer = fineness(mesh.vertices, mesh.faces[:, :2])
         grids = settings.coarse and settings.coarse + round(math.log2(finer))
+        #: Features of the vertices; none where they are not wanted.
         wanted = settings.palette > 0 or settings.same_material > 0
-        shown = features(self._pixels, mesh) if wanted else np.empty((0, 4), np.float32)
-        shared = palette(shown, settings.palette, settings.seed) if settings.palette else None
+        self._shown = features(self._pixels, mesh) if wanted else np.empty((0, 4), np.float32)
+        shared = palette(self._shown, settings.palette, settings.seed) if settings.palette else None
         self.surface = Surface(mesh, replace(settings, coarse=grids), mean, normals is not None, start, shared)
-        self._like = LikeVertices(shown, mesh, settings.seed) if settings.same_material > 0 else None
+        self._like = LikePoints(self._shown, mesh.vertices, settings.seed) if settings.same_material > 0 else None
         colours = np.maximum(cache[:, 0] * 0.28209479, 0)
-        self._regularisers = Regularisers(mesh.faces, colours, settings, finer)
+        self._regularisers = Regularisers(edges_of(mesh.faces), colours, settings, finer)
         #: Logarithm of the brightness of the photographs, one each.
         self._exposure = torch.zeros(len(capture.training)) if settings.exposure else None
         self._adam = Adam(self._learned())
         shape = _digest(mesh.vertices, mesh.faces, self._pixels.detail_normal, self.surface.normals())
         key = states.fingerprint(capture, mesh=shape, **asdict(settings))
         self.checkpoint = states.Checkpoint(checkpoint, key, _SAVE, now)
+
+    def go_on(self) -> None:
+        """Go on from the checkpoint, if there is one."""
         if (state := self.checkpoint.load()) is not None:
             self._restore(state)
 
@@ -233,7 +273,7 @@ class Job:
         s, part = self._settings, self.schedule.part
         self._prepare_light(part)
         generator = np.random.default_rng([s.seed, self.schedule.iteration])
-        row = generator.integers(0, len(self._pixels), s.pixels)
+        row = generator.integers(*self._range(), s.pixels)
         edge = self._regularisers.draw(generator)
         key = generator.integers(0, 2**32, s.pixels, dtype=np.uint32)
         pairs = self._like.draw(generator) if self._like is not None and self.schedule.knows_metals() else None
@@ -241,7 +281,7 @@ class Job:
         learned = self._learned()
         for tensor in learned.values():
             tensor.requires_grad_(True)
-        self._loss(self._pixels.select(row), key, edge, pairs).backward()
+        self._backward(self._pixels.select(row), key, edge, pairs)
         for tensor in learned.values():
             tensor.requires_grad_(False)
             if tensor.grad is not None:
@@ -261,14 +301,21 @@ class Job:
         if stale:
             self.lighting.aim(self.lighting.learned.radiance().numpy())
 
-    def _loss(self, pixels: Pixels, key: Array, edge: Array, pairs: tuple[Array, Array] | None) -> Tensor:
-        samples = self.surface.at(pixels, self._regularisers.edges(edge), None if pairs is None else pairs[0])
+    def _range(self) -> tuple[int, int]:
+        """First and last of the pixels that a step draws from, half-open."""
+        return 0, len(self._pixels)
+
+    def _backward(self, pixels: Pixels, key: Array, edge: Array, pairs: Pairs | None) -> None:
+        """Gradients of all that is learned, from these pixels, edges and pairs."""
+        self._loss(self.surface.at(pixels, self._regularisers.edges(edge), pairs), pixels, key, edge).backward()
+
+    def _loss(self, samples: SurfaceSamples, pixels: Pixels, key: Array, edge: Array) -> Tensor:
         radiance = self.lighting.learned.radiance()
         loss = self._difference(pixels, key, samples, radiance)
         has_metallic, knows_metals = self.surface.materials.metallic, self.schedule.knows_metals()
         loss = loss + self._regularisers.of_materials(samples, edge, has_metallic, knows_metals)
-        if pairs is not None:
-            loss = loss + self._regularisers.of_likeness(samples, pairs[1])
+        if samples.pairs is not None:
+            loss = loss + self._regularisers.of_likeness(samples.columns, samples.pairs)
         loss = loss + self._regularisers.of_light(self.lighting.learned, radiance)
         return loss + self._regularisers.of_normals(samples)
 
@@ -299,8 +346,12 @@ class Job:
         known = self._weight > 1e-3
         values = np.column_stack(self.surface.materials.values())
         values = np.clip(filled(values, known, self._mesh), 0, 1)
+        return self._found(values, self.surface.normals(), known)
+
+    def _found(self, values: Array, normals: Array, known: Array) -> Decoupled:
+        """The result: materials (v, 5) and normals of vertices, and which of them (v,) photographs show."""
         report: dict[str, Any] = {
-            "views": self._views,
+            "views": len(self._capture.training),
             "pixels": len(self._pixels),
             "iterations": self.schedule.iteration,
             "seconds": round(self.schedule.elapsed, 1),
@@ -311,7 +362,7 @@ class Job:
         if self._exposure is not None:
             report["exposures"] = torch.exp(self._exposure - self._exposure.mean()).tolist()
         environment = self.lighting.learned.radiance().numpy().copy()
-        return Decoupled(values[:, :3], values[:, 3], values[:, 4], environment, self.surface.normals(), report)
+        return Decoupled(values[:, :3], values[:, 3], values[:, 4], environment, normals, report)
 
     def _learned(self) -> dict[str, Tensor]:
         exposure = {} if self._exposure is None else {"exposure": self._exposure}
@@ -319,13 +370,17 @@ class Job:
 
     def save(self) -> None:
         """Leave a checkpoint behind, if one is wanted."""
+        self.checkpoint.save(self._state())
+
+    def _state(self) -> dict[str, Array]:
+        """All that `_restore` needs."""
         state = {f"value/{name}": tensor.numpy() for name, tensor in self._learned().items()}
         for order, moments in (("first", self._adam.first), ("second", self._adam.second)):
             state |= {f"{order}/{name}": value.numpy() for name, value in moments.items()}
         state["aimed"] = self.lighting.aimed
         schedule, score = self.schedule, self.score
         state["numbers"] = np.array([schedule.iteration, schedule.elapsed, score.loss, score.error])
-        self.checkpoint.save(state)
+        return state
 
     def _restore(self, state: dict[str, Array]) -> None:
         self.lighting.learned.log = torch.from_numpy(state["value/light"].copy())

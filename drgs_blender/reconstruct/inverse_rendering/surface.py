@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,6 +19,20 @@ from .pixels import Pixels
 from .settings import Settings
 
 Array = np.ndarray
+
+
+class Pairs(NamedTuple):
+    """Pairs of vertices that photographs show alike.
+
+    Attributes
+    ----------
+    ends : (p, 2) int64 tensor
+    weight : (p,) float32 tensor
+        In [0, 1]: how alike.
+    """
+
+    ends: Tensor
+    weight: Tensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +51,8 @@ class SurfaceSamples:
         Learned offsets of their normals.
     ends : (e, 2) int64 tensor
         The ends of the edges among those vertices.
-    pairs : (p, 2) int64 tensor, optional
-        Pairs of like vertices among them.
+    pairs : Pairs, optional
+        Of like ones among them.
     """
 
     materials: Tensor
@@ -45,7 +60,7 @@ class SurfaceSamples:
     columns: Tensor
     offsets: Tensor | None
     ends: Tensor
-    pairs: Tensor | None = None
+    pairs: Pairs | None = None
 
     def at_ends(self, values: Tensor) -> Tensor:
         """Values (u, k) of the vertices at the ends of the edges, (e, 2, k)."""
@@ -89,15 +104,17 @@ class Surface:
         self._normals = torch.from_numpy(start)
         self._faces = torch.from_numpy(mesh.faces.astype(np.int64))
         self._given_normals = given_normals
-        self.materials = Materials(mesh, settings.parametrisation, settings.coarse, mean, palette)
+        self.materials = Materials(mesh.vertices, settings.parametrisation, settings.coarse, mean, palette)
         self.parameters = dict(self.materials.parameters)
         if settings.normals:
             self.parameters["normals"] = torch.zeros(len(mesh.vertices), 3)
 
-    def at(self, pixels: Pixels, edges: Array, pairs: Array | None = None) -> SurfaceSamples:
-        """The surface at pixels, at edges (e, 2) of vertices, and at pairs (p, 2) of like ones."""
+    def at(self, pixels: Pixels, edges: Array, pairs: Pairs | None = None) -> SurfaceSamples:
+        """The surface at pixels, at edges (e, 2) of vertices, and at pairs of like ones."""
         corner = self._faces[torch.from_numpy(pixels.face)]
-        ends = torch.from_numpy(edges if pairs is None else np.concatenate([edges, pairs]))
+        ends = torch.from_numpy(edges)
+        if pairs is not None:
+            ends = torch.cat([ends, pairs.ends])
         used, index = torch.unique(torch.cat([corner.flatten(), ends.flatten()]), return_inverse=True)
         corner_index, end_index = index[: corner.numel()].view(-1, 3), index[corner.numel() :].view(-1, 2)
         shares = torch.from_numpy(pixels.corners)
@@ -111,7 +128,7 @@ class Surface:
         normal = normalise(blend(smooth, corner_index, shares))
         if self._given_normals:
             normal = _with_detail(pixels, normal, None if offsets is None else blend(offsets, corner_index, shares))
-        like = None if pairs is None else end_index[len(edges) :]
+        like = None if pairs is None else Pairs(end_index[len(edges) :], pairs.weight)
         return SurfaceSamples(materials, normal, columns, offsets, end_index[: len(edges)], like)
 
     def normals(self) -> Array:

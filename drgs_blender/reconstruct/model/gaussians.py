@@ -38,11 +38,14 @@ class RenderedView:
         Sum of weighted normals that face the viewer, world space.
     maps : Maps
         Alpha, depth, median, distortion.
+    materials : (h, w, c) tensor, optional
+        Sum of weighted materials, where they were asked for.
     """
 
     colour: Tensor
     normal: Tensor
     maps: Maps
+    materials: Tensor | None = None
 
 
 class Gaussians:
@@ -113,21 +116,27 @@ class Gaussians:
         statistics: GradientStatistics | None = None,
         rays: Tensor | None = None,
         reflections: bool = True,
+        materials: Tensor | None = None,
     ) -> RenderedView:
         """Render a view over `background`, (3,) or (h, w, 3).
 
-        `rays` are `training_views.pixel_rays` where they are at hand.
+        `rays` are `training_views.pixel_rays` where they are at hand, `materials` (n, c) values to blend as well.
         """
         reflections = reflections and self.light is not None
         centre, eye = self.centres(), np.asarray(camera.matrix_world)[:3, 3]
         u, v, opacity, features = self.backend.attributes(self.parameters, centre, eye, bands, reflections)
+        known = features.shape[1]
+        if materials is not None:
+            features = torch.cat([features, materials], 1)
         maps = self.backend.rasterise(centre, u, v, opacity, features, camera, statistics)
+        blended = None if materials is None else maps.features[..., known:]
+        maps.features = maps.features[..., :known].contiguous()
         colour = maps.features[..., COLOUR : COLOUR + 3] + (1 - maps.alpha)[..., None] * background
         if reflections:
             assert self.light is not None
             rays = pixel_rays(camera, self.backend.device) if rays is None else rays
             colour = colour + self.backend.mirrored(maps.features, maps.alpha, rays, pyramid(self.light))
-        return RenderedView(colour, maps.features[..., NORMAL : NORMAL + 3], maps)
+        return RenderedView(colour, maps.features[..., NORMAL : NORMAL + 3], maps, blended)
 
     def select(self, rows: Array) -> Gaussians:
         """The surfels `rows`, in this order, as a set of their own."""

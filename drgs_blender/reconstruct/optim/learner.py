@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -67,7 +67,14 @@ class Learner:
         self.statistics = GradientStatistics.of(len(self.gaussians), backend.device)
         self.iteration, self.error = 0, 0.0
 
-    def step(self, target: Target, part: float, beside: Target | None = None) -> None:
+    def step(
+        self,
+        target: Target,
+        part: float,
+        beside: Target | None = None,
+        materials: Tensor | None = None,
+        loss_of: Callable[[RenderedView], Tensor] | None = None,
+    ) -> None:
         """Learn from one view, and from what it has in common with another.
 
         Parameters
@@ -78,21 +85,28 @@ class Learner:
             Fraction of the schedule that is done, 0..1.
         beside : Target, optional
             A view of the same from another place, for the consistency of patches.
+        materials : (n, c) tensor, optional
+            To be blended beside the colours.
+        loss_of : callable, optional
+            A further loss, of the rendered view.
         """
         # Also when done again, after a device has left it half-done.
         self.optimiser.steps = self.light.steps = self.iteration
         with _one_thread():
-            rendered, rays = self._render(target, part)
+            rendered, rays = self._render(target, part, materials)
             loss = self._loss(rendered, target, rays, part)
             if beside is not None:
                 loss = loss + self._schedule.patches * self._patch_loss(rendered, target, rays, beside)
-            (target.share * loss).backward()
+            loss = target.share * loss
+            if loss_of is not None:
+                loss = loss + loss_of(rendered)
+            loss.backward()
             self._optimise(part)
             squared = _squared_error(rendered, target)
         self.error = squared if not self.iteration else 0.98 * self.error + 0.02 * squared
         self.iteration += 1
 
-    def _render(self, target: Target, part: float) -> tuple[RenderedView, Tensor]:
+    def _render(self, target: Target, part: float, materials: Tensor | None) -> tuple[RenderedView, Tensor]:
         """The surfels as the view sees them, and its rays."""
         schedule = self._schedule
         rays = pixel_rays(target.camera, self._backend.device)
@@ -100,7 +114,7 @@ class Learner:
         reflections = part >= schedule.reflections < 1
         bands = min(schedule.bands, int(part * 8))
         behind = self._behind(target)
-        return self.gaussians.render(target.camera, behind, bands, statistics, rays, reflections), rays
+        return self.gaussians.render(target.camera, behind, bands, statistics, rays, reflections, materials), rays
 
     def _behind(self, target: Target) -> Tensor:
         """What is behind the surfels: (3,), or (h, w, 3)."""

@@ -12,7 +12,9 @@ the mesh point that belongs to it:
 4. else the nearest face along the camera ray within the window, whichever way it is turned;
 5. else (no mesh near) the point stays where it is, lifted by the window along its normal.
 
-Where light meets the surfels themselves, points stay where they are, and say which surfels are their own.
+Where light meets the surfels themselves, points stay where they are, and say which surfels are their own. Those of an
+object whose light meets sheets (`surfels.sheets`) are lifted by the window along their normals: sheets lie at all
+angles, and would shade each other.
 
 A surfel's normal that is turned away from its face by more than 60 degrees would lose most of the light between both;
 the face's own is used then.
@@ -64,9 +66,14 @@ NOWHERE, ALONG_VIEW, ALONG_NORMAL, ANY_SIDE, FACING = 0, 1, 2, 3, 4
 
 
 def snap_windows(scene: TraceScene, object_count: int) -> Array:
-    """(max(object_count, 1),) float32 metres: `WINDOW_EDGES` times the mean edge length of each object's mesh."""
+    """(max(object_count, 1),) float32 metres: `WINDOW_EDGES` times the mean edge length of each object's mesh.
+
+    Negative where light does not meet that mesh: points are not tied to it.
+    """
     total, count = np.zeros((2, max(object_count, 1)))
     _edge_lengths(scene.vertices, scene.faces, scene.face_object, total, count)
+    loose = scene.seen_only[: len(total)]
+    total[: len(loose)][loose] *= -1
     return (WINDOW_EDGES * total / np.maximum(count, 1)).astype(np.float32)
 
 
@@ -276,8 +283,10 @@ def attach_points(thread, stride, scratch, tracer, rules, view_of, samples, keys
             if nx * nx + ny * ny + nz * nz < 0.5:
                 nx, ny, nz = vx, vy, vz
             window = np.float64(WINDOW_SCALES) * surface[row, column, k, SIZE]
+            loose = not tied
             if who < len(windows):
-                window = max(window, np.float64(windows[who]))
+                window = max(window, abs(np.float64(windows[who])))
+                loose = loose or windows[who] < 0.0
             # The window starts in front of the surfel, yet not behind the camera.
             ahead = min(window, 0.999 * s * slope)
             how = NOWHERE
@@ -287,14 +296,14 @@ def attach_points(thread, stride, scratch, tracer, rules, view_of, samples, keys
                 how, hx, hy, hz, gx, gy, gz, face, u, v = _find(
                     tracer, (x, y, z), (nx, ny, nz), (vx, vy, vz), ahead, window
                 )  # fmt: skip
-            if not tied:  # the face says how the point moves, nothing else
+            if loose:  # the face says how the point moves, nothing else
                 how, hx, hy, hz, gx, gy, gz = NOWHERE, x, y, z, nx, ny, nz
             # A face met by the camera ray shows which side is seen; else the surfel does, save at its rim.
             if how in (ALONG_VIEW, ANY_SIDE, FACING):
                 behind = gx * vx + gy * vy + gz * vz < 0.0
             else:
                 # Without a mesh it may be a leaf, of which the back is as good as the front.
-                closed = who < len(windows) and windows[who] > 0.0
+                closed = who < len(windows) and (windows[who] > 0.0 if tied else windows[who] != 0.0)
                 behind = nx * vx + ny * vy + nz * vz < (-RIM if closed else 0.0)
             if behind:
                 gx, gy, gz = -gx, -gy, -gz

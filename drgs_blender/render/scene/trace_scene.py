@@ -71,8 +71,8 @@ class TraceScene:
         Of meshes; object space where these have several instances.
     vertex_faces : int
         How many faces are of DR-GS objects without an `ObjectMesh`; those come first.
-    any_drgs : bool
-        Whether any faces are of DR-GS objects.
+    any_drgs, any_ordinary : bool
+        Whether any faces are of DR-GS objects, and whether the camera may see an ordinary mesh.
     instances : (p, 3, 4) float32 array
         Object-to-world matrices of meshes of several instances.
     instance_object : (p,) int32 array
@@ -81,10 +81,10 @@ class TraceScene:
         Whether there is an object that diffuse rays meet and glossy ones do not, or the other way.
     pass_index, object_flags : (objects,) int32 array
         Blender's object index pass; bits HOLDOUT and CATCHER.
+    seen_only : (n,) bool array
+        Of the frame's objects, as of `TraceObject`.
     source : (objects,) int64 array
         Which of the frame's objects, or behind them which of its meshes, each is.
-    any_ordinary : bool
-        Whether the camera may see an ordinary mesh.
     mesh_materials : MeshMaterials
         Materials and texture coordinates of the meshes, whose faces begin at `vertex_faces`.
     extent : float
@@ -103,13 +103,13 @@ class TraceScene:
         self.normals: Array = np.empty((0, 3), np.float32)
         self.face_object: Array = np.empty(0, np.int32)
         self.vertex_faces = 0
-        self.any_drgs = False
+        self.any_drgs = self.any_ordinary = False
         self.instances: Array = np.empty((0, 3, 4), np.float32)
         self.pass_index: Array = np.empty(0, np.int32)
         self.source: Array = np.empty(0, np.int64)
         self.object_flags: Array = np.empty(0, np.int32)
+        self.seen_only: Array = np.empty(0, bool)
         self.rays_differ = False
-        self.any_ordinary = False
         self.mesh_materials = MeshMaterials()
         self.extent = 0.0
         self.cut: set[int] = set()
@@ -331,16 +331,16 @@ class TraceScene:
 
     def _number(self, objects: Sequence[TraceObject], meshes: Sequence[MeshState], where: Sequence[Instances]) -> None:
         """Pass index and flags of all objects and instances; see the class."""
-        index = [np.array([o.pass_index for o in objects], np.int32)]
-        index.append(np.array([p.pass_index[0] if len(p.pass_index) else 0 for p in where], np.int32))
-        index += [p.pass_index for p in where if p.instanced]
-        self.pass_index = np.concatenate(index)
+        first = [o.pass_index for o in objects] + [p.pass_index[0] if len(p.pass_index) else 0 for p in where]
+        more = [p.pass_index for p in where if p.instanced]
+        self.pass_index = np.concatenate([np.array(first, np.int32), *more])
         seen = [o.visibility for o in objects] + [mesh.visibility for mesh in meshes]
         self.rays_differ = any(v.diffuse != v.glossy for v in seen)
         flags = np.array([object_flags(visibility) for visibility in seen], np.int32)
         counts = [0] * len(objects) + [len(p.matrices) if p.instanced else 0 for p in where]
         self.source = np.concatenate([np.arange(len(seen)), np.repeat(np.arange(len(seen)), counts)])
         self.object_flags = flags[self.source]
+        self.seen_only = np.array([o.seen_only for o in objects], bool)
         self._offsets.take(objects, meshes, self.source)
         visible = [len(p.matrices) > 0 and m.visibility.camera for m, p in zip(meshes, where)]
         self.any_ordinary = any(v and (not isinstance(m, ObjectMesh) or m.clear) for v, m in zip(visible, meshes))

@@ -1,0 +1,275 @@
+"""Joint learning, the paper's inverse rendering: surfels, materials of their own and light are learned together.
+
+After a first part on the mesh (`run.Job`), each step renders one photograph's view. The surfels' radiance is held to
+the photograph as in stage (i), with its losses of shape; of some pixels the blended normals and materials of the
+surfels are lit as the mesh was before, and that loss moves surfels, materials and light. Rays meet the mesh of stage
+(i); a last one is fused from the surfels as they are at the end.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from ...core.asset.model import Mesh
+from ...core.color import srgb_to_linear
+from ...deform.binding import bind, clamp_weights
+from ...render.gbuffer.surfels import ALIKE
+from ...render.reference.brdf import dot, normalise
+from ...render.scene.triangle_bvh import TriangleBVH
+from ..backend import CPU
+from ..capture.capture import Capture
+from ..capture.training_views import background_of, targets
+from ..meshing.surfel_normals import with_surfel_normals
+from ..model.gaussians import SH0, Gaussians, RenderedView
+from ..model.thin_structures import normals_of
+from ..optim.adam import Adam
+from ..optim.learner import Learner
+from ..optim.schedule import Schedule as SurfelSchedule
+from .blend import blend
+from .likeness import LikePoints
+from .materials import Materials
+from .pixels import Normals, Pixels, pixels_of
+from .radiance_cache import filled
+from .regularisers import Regularisers, fineness
+from .run import Decoupled, Job, Progress, Shape, learned
+from .settings import Settings
+from .surface import Pairs, SurfaceSamples
+
+Array = np.ndarray
+
+#: Neighbours of a surfel along which its materials are smooth, and the least cosine between their planes.
+_NEIGHBOURS, _COPLANAR = 6, 0.5
+#: What is learned on the mesh and with surfels alike.
+_SHARED = ("exposure", "light")
+#: Part of the schedule of stage (i) at which surfels go on: its step sizes at the end.
+_LATE = 0.9
+#: Pixels covered less show no surfel's normal, and coverage counts as so much at the least.
+_COVERED, _LEAST = 0.5, 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class LearnedSurfels:
+    """Surfels of stage (i), and what learning them further needs.
+
+    Attributes
+    ----------
+    gaussians : Gaussians
+        On the CPU; changed in place.
+    schedule : Schedule
+        Of stage (i): weights of its losses.
+    radius : float
+        Of the object, metres.
+    fused : callable
+        Makes a mesh from the surfels, and a report of it.
+    """
+
+    gaussians: Gaussians
+    schedule: SurfelSchedule
+    radius: float
+    fused: Callable[[Gaussians], tuple[Mesh, dict[str, Any]]]
+
+
+def decouple_jointly(
+    capture: Capture,
+    mesh: Mesh,
+    surfels: LearnedSurfels,
+    settings: Settings,
+    on_progress: Callable[[Progress], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+    checkpoint: Path | None = None,
+    normals: Normals | None = None,
+    start: Array | None = None,
+    now: Callable[[], float] = time.monotonic,
+) -> Decoupled:
+    """`run.decouple` on the CPU, in whose last part (`Settings.joint`) the surfels are learned, too.
+
+    Parameters
+    ----------
+    capture : Capture
+    mesh : Mesh
+    surfels : LearnedSurfels
+    settings : Settings
+    on_progress : callable, optional
+    cancelled : callable, optional
+    checkpoint : Path, optional
+    normals : callable, optional
+    start : (v, 3) float32 array, optional
+    now : callable
+
+    Returns
+    -------
+    Decoupled
+        Of `Decoupled.shape`, the surfels and the mesh as they came out.
+    """
+    job = JointJob(capture, mesh, surfels, settings, checkpoint, normals, start, now)
+    return learned(job, on_progress, cancelled)
+
+
+class JointJob(Job):
+    """A run whose last steps move surfels; see `decouple_jointly` for the parameters.
+
+    Attributes
+    ----------
+    learner : Learner
+        Of the surfels.
+    """
+
+    def __init__(
+        self, capture: Capture, mesh: Mesh, surfels: LearnedSurfels, settings: Settings, checkpoint: Path | None,
+        normals: Normals | None, start: Array | None, now: Callable[[], float],
+    ) -> None:  # fmt: skip
+        #: Materials of the surfels, once they are learned.
+        self._own: Materials | None = None
+        super().__init__(capture, mesh, settings, checkpoint, CPU, normals, start, now)
+        self._fused, self._targets = surfels.fused, targets(capture)[0]
+        background = torch.tensor(background_of(capture), dtype=torch.float32)
+        self.learner = Learner(surfels.gaussians, surfels.schedule, surfels.radius, background, CPU)
+        #: Where the pixels of each view begin, and the views that have any.
+        self._first = np.searchsorted(self._pixels.view, np.arange(len(capture.training) + 1))
+        self._views = np.flatnonzero(np.diff(self._first))
+
+    def step(self) -> None:
+        """One step of the optimiser."""
+        if self._own is None and self.schedule.part >= 1 - (self._settings.joint or 0.0):
+            self._begin()
+        super().step()
+
+    def _begin(self) -> None:
+        """Learn materials of the surfels from now on, beginning with those of the mesh."""
+        gaussians, settings = self.learner.gaussians, self._settings
+        surfels = gaussians.surfels()
+        assert surfels.sh is not None
+        own = Materials(surfels.centre, settings.parametrisation, settings.coarse)
+        binding, _ = bind(self._mesh, surfels)
+        with torch.no_grad():
+            known = self.surface.materials.at(torch.arange(len(self._mesh.vertices)))
+            corners = torch.from_numpy(self._mesh.faces[binding.face].astype(np.int64))
+            shares = torch.from_numpy(clamp_weights(binding.barycentric).astype(np.float32))
+            own.begin(blend(known, corners, shares))
+            if self._like is not None:
+                shown = blend(torch.from_numpy(self._shown), corners, shares).numpy()
+                self._like = LikePoints(shown, surfels.centre, settings.seed)
+        edges = _neighbours(surfels.centre, gaussians.frames()[2])
+        colours = srgb_to_linear(np.clip(0.5 + SH0 * surfels.sh[:, 0], 0, 1))
+        self._regularisers = Regularisers(edges, colours, settings, fineness(surfels.centre, edges))
+        before, self._own = self._adam, own
+        self._adam = Adam(self._learned())
+        self._adam.steps = before.steps
+        for moments, known in ((self._adam.first, before.first), (self._adam.second, before.second)):
+            moments |= {name: known[name] for name in moments if name in known and name in _SHARED}
+
+    def _learned(self) -> dict[str, Tensor]:
+        known = super()._learned()
+        if self._own is None:
+            return known
+        return self._own.parameters | {name: known[name] for name in _SHARED if name in known}
+
+    def _view(self) -> int:
+        """Number of the view of a step: all in turn, in an order drawn again each time."""
+        turn, place = divmod(self.schedule.iteration, len(self._views))
+        return int(np.random.default_rng([self._settings.seed, turn]).permutation(self._views)[place])
+
+    def _range(self) -> tuple[int, int]:
+        if self._own is None:
+            return super()._range()
+        k = self._view()
+        return int(self._first[k]), int(self._first[k + 1])
+
+    def _backward(self, pixels: Pixels, key: Array, edge: Array, pairs: Pairs | None) -> None:
+        if self._own is None:
+            return super()._backward(pixels, key, edge, pairs)
+        k = self._view()
+        columns, ends = self._columns(), torch.from_numpy(self._regularisers.edges(edge))
+
+        def lit(rendered: RenderedView) -> Tensor:
+            materials, normal = self._seen(rendered, k, pixels)
+            return self._loss(SurfaceSamples(materials, normal, columns, None, ends, pairs), pixels, key, edge)
+
+        part = _LATE + (1 - _LATE) * min(self.schedule.part, 1.0)
+        self.learner.step(self._targets[k], part, materials=columns, loss_of=lit)
+
+    def _columns(self) -> Tensor:
+        """Columns (n, c) of all surfels, with derivatives."""
+        assert self._own is not None
+        return self._own.at(torch.arange(len(self.learner.gaussians)))
+
+    def _seen(self, rendered: RenderedView, k: int, pixels: Pixels) -> tuple[Tensor, Tensor]:
+        """Blended materials (m, c) and unit normals (m, 3) of pixels of view `k`."""
+        whole, cut = self._capture.training[k].camera, self._targets[k].camera
+        y, x = (torch.from_numpy(at) for at in np.divmod(pixels.place.astype(np.int64), whole.width))
+        y, x = y - round(whole.cy - cut.cy), x - round(whole.cx - cut.cx)
+        assert rendered.materials is not None
+        alpha, normal = rendered.maps.alpha[y, x][:, None], rendered.normal[y, x]
+        materials = (rendered.materials[y, x] / alpha.clamp(min=_LEAST)).clamp(0, 1)
+        flat = torch.from_numpy(pixels.flat)
+        # As surfels are shaded when they are rendered.
+        unit = normalise(normal)
+        believed = (alpha > _COVERED) & (normal.norm(dim=1, keepdim=True) > _LEAST)
+        return materials, torch.where(believed & (dot(unit, flat)[:, None] >= ALIKE), unit, flat)
+
+    def result(self) -> Decoupled:
+        """What is learned so far; with surfels the mesh is fused anew."""
+        if self._own is None:
+            return super().result()
+        gaussians, views = self.learner.gaussians, self._capture.training
+        mesh, fusion = self._fused(gaussians)
+        with torch.no_grad():
+            columns, weight = self._carried(mesh, gaussians)
+            known = weight > 1e-3
+            own = np.column_stack(self._own.described(torch.from_numpy(columns)))
+            values = np.clip(filled(own, known, mesh), 0, 1)
+        found = self._found(values, with_surfel_normals(mesh, views, normals_of(gaussians)), known)
+        found.shape = Shape(mesh, fusion, gaussians, *self._own.values())
+        return found
+
+    def _carried(self, mesh: Mesh, gaussians: Gaussians) -> tuple[Array, Array]:
+        """Columns (v, c) of the vertices of `mesh`, means of what the views show of surfels, and their weight (v,)."""
+        tree = TriangleBVH()
+        tree.build(mesh.vertices, mesh.faces)
+        columns = self._columns()
+        total = np.zeros((len(mesh.vertices), columns.shape[1] + 1))
+        for k, view in enumerate(self._capture.training):
+            pixels = pixels_of(k, view, mesh, tree)
+            shown = gaussians.render(view.camera, torch.zeros(3), 0, reflections=False, materials=columns)
+            assert shown.materials is not None
+            maps = torch.cat([shown.materials, shown.maps.alpha[..., None]], 2)
+            values = maps.flatten(0, 1).numpy()[pixels.place]
+            weight = pixels.corners * (pixels.flat * pixels.towards).sum(axis=1, keepdims=True)
+            corner = mesh.faces[pixels.face].ravel()
+            for c in range(total.shape[1]):
+                total[:, c] += np.bincount(corner, (weight * values[:, c, None]).ravel(), len(total))
+        return (total[:, :-1] / np.maximum(total[:, -1:], 1e-9)).astype(np.float32), total[:, -1]
+
+    def _state(self) -> dict[str, Array]:
+        state = super()._state()
+        if self._own is None:
+            return state
+        learner = self.learner
+        state |= {f"surfels/{name}": values for name, values in learner.arrays().items()}
+        return state | {"surfels.numbers": np.array([learner.iteration, learner.error])}
+
+    def _restore(self, state: dict[str, Array]) -> None:
+        if "surfels.numbers" in state:
+            prefix = "surfels/"
+            self._begin()
+            self.learner.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+            iteration, self.learner.error = (float(x) for x in state["surfels.numbers"])
+            self.learner.iteration = int(iteration)
+        super()._restore(state)
+
+
+def _neighbours(centres: Array, normals: Array) -> Array:
+    """Pairs (e, 2) of surfels that lie side by side on one surface, each once."""
+    _, near = cKDTree(centres).query(centres, min(_NEIGHBOURS + 1, len(centres)))
+    pairs = np.stack([np.repeat(np.arange(len(centres)), near.shape[1] - 1), near[:, 1:].ravel()], 1)
+    coplanar = np.abs(np.einsum("nc,nc->n", normals[pairs[:, 0]], normals[pairs[:, 1]])) > _COPLANAR
+    return np.unique(np.sort(pairs[coplanar], axis=1), axis=0).astype(np.int64)

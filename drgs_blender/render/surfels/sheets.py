@@ -1,0 +1,26 @@
+"""Sheets: a flat quadrilateral for each surfel, as what rays meet where no good mesh can be fused.
+
+Blending surfels along rays, `surfel_tracer`, takes several times as long; a sheet is opaque and two triangles.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...core.arrays import Array
+
+#: Sides, in parts of those whose area is all that the kernel covers: surfels overlap, and cover less together.
+COVER = 0.7
+
+
+def sheets(centre: Array, tangent_u: Array, tangent_v: Array, opacity: Array) -> tuple[Array, Array]:
+    """Vertices (4 n, 3) float32 and faces (2 n, 3) int32 of the sheets of n surfels, as of `PosedSurfels`.
+
+    The sides are along the tangents. Their area is the kernel's, 2 pi opacity |u| |v|, times the square of `COVER`.
+    """
+    half = COVER * np.sqrt(0.5 * np.pi * opacity.astype(np.float64))[:, None]
+    u, v = half * tangent_u, half * tangent_v
+    corners = np.stack([centre - u - v, centre + u - v, centre + u + v, centre - u + v], axis=1)
+    first = 4 * np.arange(len(centre), dtype=np.int32)[:, None, None]
+    faces = first + np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return corners.reshape(-1, 3).astype(np.float32), faces.reshape(-1, 3)
