@@ -34,7 +34,8 @@ def pixels(mesh: Mesh, colour: np.ndarray) -> Pixels:
     view = np.repeat(np.arange(VIEWS, dtype=np.int32), len(face))
     face = np.tile(face, VIEWS)
     third, none = np.full((len(face), 3), 1 / 3, np.float32), np.zeros((len(face), 3), np.float32)
-    return Pixels(view, face, third, none, none, none, colour[view, face].astype(np.float32), none > 0, none)
+    place = np.arange(len(face), dtype=np.int32)
+    return Pixels(view, place, face, third, none, none, none, colour[view, face].astype(np.float32), none > 0, none)
 
 
 def painted(mesh: Mesh) -> np.ndarray:

@@ -28,7 +28,7 @@ from ..optim.adam import Adam
 from .lighting import Lighting
 from .likeness import LikePoints, features, palette
 from .losses import log_loss, unbiased_loss
-from .pixels import Normals, Pixels, foreground_pixels
+from .pixels import PLACES, Normals, Pixels, Subpixels, foreground_pixels
 from .radiance_cache import edges_of, filled, radiance_cache
 from .regularisers import Regularisers, fineness
 from .schedule import Schedule
@@ -236,7 +236,9 @@ class Job:
         tree.build(mesh.vertices, mesh.faces)
         self._pixels = foreground_pixels(capture.training, mesh, tree, settings.most_pixels, settings.seed, normals)
         cache, self._weight = radiance_cache(self._pixels, mesh)
-        counts = (settings.cosine, settings.ggx, settings.light)
+        self._subpixels = Subpixels(self._pixels, capture.training, mesh, tree)
+        # Of either estimate of a pixel, in two halves.
+        counts = tuple(2 * -(-count // 4) for count in (settings.cosine, settings.ggx, settings.light))
         if not settings.shadows:
             tree = TriangleBVH()
             tree.build(mesh.vertices, mesh.faces[:0])
@@ -275,13 +277,14 @@ class Job:
         generator = np.random.default_rng([s.seed, self.schedule.iteration])
         row = generator.integers(*self._range(), s.pixels)
         edge = self._regularisers.draw(generator)
-        key = generator.integers(0, 2**32, s.pixels, dtype=np.uint32)
+        key = generator.integers(0, 2**32, 2 * s.pixels, dtype=np.uint32)
         pairs = self._like.draw(generator) if self._like is not None and self.schedule.knows_metals() else None
 
         learned = self._learned()
         for tensor in learned.values():
             tensor.requires_grad_(True)
-        self._backward(self._pixels.select(row), key, edge, pairs)
+        place = generator.integers(0, len(PLACES), 2 * s.pixels)
+        self._backward(self._subpixels.select(np.concatenate([row, row]), place), key, edge, pairs)
         for tensor in learned.values():
             tensor.requires_grad_(False)
             if tensor.grad is not None:
@@ -320,7 +323,7 @@ class Job:
         return loss + self._regularisers.of_normals(samples)
 
     def _difference(self, pixels: Pixels, key: Array, samples: SurfaceSamples, radiance: Tensor) -> Tensor:
-        """Loss between predicted and photographed colours."""
+        """Loss between predicted and photographed colours, of pixels that come twice, with a point each."""
         s, materials = self._settings, self.surface.materials
         roughness = materials.roughness(samples.materials)
         alpha2 = (roughness**2).clamp(min=MIN_GGX_ALPHA) ** 2
@@ -330,10 +333,12 @@ class Job:
         if self._exposure is not None:
             factor = torch.exp(self._exposure - self._exposure.mean())
             predicted = predicted * factor[torch.from_numpy(pixels.view).long()][:, None, None]
-        photographed = torch.from_numpy(pixels.colour)
+        count = len(pixels) // 2
+        predicted = predicted.mean(1).view(2, count, 3).transpose(0, 1)
+        photographed = torch.from_numpy(pixels.colour[:count])
         if s.unbiased:
             weight_by_prediction = self.schedule.weighs_by_prediction()
-            beside = torch.from_numpy(pixels.next_to_clipped)
+            beside = torch.from_numpy(pixels.next_to_clipped[:count])
             counts = torch.where(beside, s.clipped_neighbour_weight, 1.0) if weight_by_prediction else None
             loss = unbiased_loss(predicted, photographed, weight_by_prediction, counts)
         else:
