@@ -25,7 +25,7 @@ from ..backend import CPU, LearningBackend
 from ..capture.capture import Capture
 from ..optim.adam import Adam
 from .lighting import Lighting
-from .likeness import LikeVertices, features, palette
+from .likeness import LikeVertices, features
 from .losses import log_loss, unbiased_loss
 from .pixels import Normals, Pixels, foreground_pixels
 from .radiance_cache import filled, radiance_cache
@@ -212,11 +212,9 @@ class Job:
         self.lighting = Lighting(gatherer, settings, 2.5 * float(mean.mean()))
         finer = fineness(mesh)
         grids = settings.coarse and settings.coarse + round(math.log2(finer))
-        wanted = settings.palette > 0 or settings.same_material > 0
-        shown = features(self._pixels, mesh) if wanted else np.empty((0, 4), np.float32)
-        shared = palette(shown, settings.palette, settings.seed) if settings.palette else None
-        self.surface = Surface(mesh, replace(settings, coarse=grids), mean, normals is not None, start, shared)
-        self._like = LikeVertices(shown, mesh, settings.seed) if settings.same_material > 0 else None
+        self.surface = Surface(mesh, replace(settings, coarse=grids), mean, normals is not None, start)
+        likes = settings.same_material > 0
+        self._like = LikeVertices(features(self._pixels, mesh), mesh, settings.seed) if likes else None
         colours = np.maximum(cache[:, 0] * 0.28209479, 0)
         self._regularisers = Regularisers(mesh.faces, colours, settings, finer)
         #: Logarithm of the brightness of the photographs, one each.
