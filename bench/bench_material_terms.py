@@ -34,14 +34,12 @@ from drgs_blender.reconstruct.settings import Settings
 #: The light of relit pictures.
 LIGHT = "city"
 #: The row that others are held against.
-PLAIN = "as it is"
+PLAIN = "none of them"
 #: Row -> settings of decoupling that differ.
 ROWS: dict[str, dict[str, Any]] = {
     PLAIN: {"same_material": 0.0},
-    "vertices that photographs show alike, .003": {"same_material": 0.003},
-    "vertices that photographs show alike, .01": {"same_material": 0.01},
-    "palette of 16 materials": {"same_material": 0.0, "palette": 16},
-    "palette of 32 materials": {"same_material": 0.0, "palette": 32},
+    "like vertices held alike, .003": {"same_material": 0.003},
+    "like vertices held alike, .01": {"same_material": 0.01},
 }
 #: The row with four times the faces, about four vertices a pixel.
 CUT = "faces cut in four"

@@ -519,7 +519,7 @@ def test_without_shadows_a_room_around_all_does_not_stand_before_the_light(ball,
     "more",
     [
         pytest.param({}, marks=pytest.mark.slow),
-        {"normals": True, "exposure": True, "parametrisation": "specular", "same_material": 0.01, "palette": 4},
+        {"normals": True, "exposure": True, "parametrisation": "specular"},
     ],
 )
 def test_an_interrupted_run_ends_where_an_undisturbed_one_does(ball, capture, tmp_path, more):

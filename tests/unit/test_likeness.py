@@ -10,8 +10,7 @@ from shapes import plain_mesh
 torch = pytest.importorskip("torch")
 
 from drgs_blender.core.asset import Mesh  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.likeness import LikePoints, features, palette  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.materials import Materials  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.likeness import LikePoints, features  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.pixels import Pixels  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.regularisers import Regularisers  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
@@ -95,24 +94,3 @@ def test_likeness_makes_materials_of_pairs_alike_by_their_weight():
     assert float(loss.detach()) == pytest.approx(0.5 * 0.1 * 6 / 2, rel=1e-5)
     loss.backward()
     assert (columns.grad[0] < 0).all() and (columns.grad[1] > 0).all() and not columns.grad[2].any()
-
-
-def test_a_palette_teaches_a_vertex_what_another_of_the_same_look_has_learned(ball):
-    left, right = sides(ball)
-    shared = palette(features(pixels(ball, painted(ball)), ball), 2, 0)
-    assert shared.size == 2 and shared.share.sum(1).numpy() == pytest.approx(1, abs=1e-5)
-    materials = Materials(ball.vertices, "metallic", 0, palette=shared)
-    palette_of = materials.parameters["palette"].requires_grad_(True)
-    materials.at(torch.from_numpy(np.flatnonzero(left)[:1]))[:, 3].sum().backward()
-    with torch.no_grad():
-        palette_of += palette_of.grad * 4
-    roughness = materials.values()[1]
-    assert roughness[left].min() > roughness[right].max() + 0.1 and np.ptp(roughness[left]) < 0.02
-
-
-@pytest.mark.parametrize("looks", [1, 3])
-def test_a_palette_has_no_more_materials_than_there_are_looks(looks):
-    shown = np.repeat(np.arange(looks, dtype=np.float32), 5)[:, None] * np.ones((1, 4), np.float32)
-    shared = palette(shown, 16, 0)
-    assert shared.size <= looks and np.isfinite(shared.share.numpy()).all()
-    assert int(shared.index.max()) < shared.size

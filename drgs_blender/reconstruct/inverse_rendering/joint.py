@@ -155,7 +155,7 @@ class JointJob(Job):
             corners = torch.from_numpy(self._mesh.faces[binding.face].astype(np.int64))
             shares = torch.from_numpy(clamp_weights(binding.barycentric).astype(np.float32))
             own.begin(blend(known, corners, shares))
-            if self._like is not None:
+            if self._shown is not None:
                 shown = blend(torch.from_numpy(self._shown), corners, shares).numpy()
                 self._like = LikePoints(shown, surfels.centre, settings.seed)
         edges = _neighbours(surfels.centre, gaussians.frames()[2])

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 
 from ...core.arrays import Array
 from ...core.asset.model import Mesh
-from .materials import Palette
 from .pixels import Pixels
 from .radiance_cache import filled
 from .surface import Pairs
@@ -26,8 +24,6 @@ _CHROMA, _BRIGHTNESS, _SCORE, _PLACE = 0.03, 0.5, 0.4, 0.25
 _KNEE = 0.02
 #: Vertices among which others look for their like, how many each finds, and pairs of a step.
 _ANCHORS, _NEAREST, _PAIRS = 4096, 12, 4096
-#: Vertices that a palette is chosen from, and the most of its materials that a vertex has part in.
-_SAMPLE, _PARTS = 4096, 4
 
 
 def features(pixels: Pixels, mesh: Mesh) -> Array:
@@ -86,16 +82,3 @@ class LikePoints:
         each = generator.integers(0, self._like.shape[1], _PAIRS)
         both = np.stack([one, self._like[one, each]], -1)
         return Pairs(torch.from_numpy(both), torch.from_numpy(self._weight[one, each]))
-
-
-def palette(features: Array, most: int, seed: int) -> Palette:
-    """Soft assignment of vertices to at most `most` groups of alike ones."""
-    generator = np.random.default_rng(seed)
-    chosen = generator.choice(len(features), min(len(features), _SAMPLE), replace=False)
-    sample = np.unique(features[chosen].astype(np.float64), axis=0)
-    centres, _ = kmeans2(sample, min(most, len(sample)), iter=20, minit="++", missing="warn", seed=seed)
-    parts = min(_PARTS, len(centres))
-    far, near = (x.reshape(len(features), -1) for x in cKDTree(centres).query(features, parts))
-    weight = np.exp(-0.5 * (far**2 - far[:, :1] ** 2))
-    share = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
-    return Palette(torch.from_numpy(near.astype(np.int64)), torch.from_numpy(share), len(centres))

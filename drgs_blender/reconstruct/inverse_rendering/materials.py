@@ -6,8 +6,6 @@ vertices keep the detail. The grids are interpolated linearly, so that they have
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -53,33 +51,15 @@ class Grids:
             self.sizes.append(len(used))
 
 
-class Palette(NamedTuple):
-    """Materials that vertices share.
-
-    Attributes
-    ----------
-    index : (v, k) int64 tensor
-        Numbers of those that a vertex has part in.
-    share : (v, k) float32 tensor
-        How much; sums to 1.
-    size : int
-        How many there are.
-    """
-
-    index: Tensor
-    share: Tensor
-    size: int
-
-
 class Materials:
     """The learned materials of the surface.
 
     Attributes
     ----------
     parameters : dict of str to tensor
-        Name -> tensor: "detail" (v, c), "grid0" ... (corners, c), "palette" (k, c). With "metallic" the c = 5 columns
-        are albedo, roughness, metallic; with "dielectric" c = 4, without the last; with "specular" c = 7: diffuse
-        colour, roughness, specular colour.
+        Name -> tensor: "detail" (v, c), "grid0" ... (corners, c). With "metallic" the c = 5 columns are
+        albedo, roughness, metallic; with "dielectric" c = 4, without the last; with "specular" c = 7: diffuse colour,
+        roughness, specular colour.
 
     Parameters
     ----------
@@ -90,12 +70,9 @@ class Materials:
     colour : (3,) array
         In the hue of which all begins: what all photographs together show. Light that is learned faster than albedo
         would take it on, and leave its complement to the albedo.
-    palette : Palette, optional
     """
 
-    def __init__(
-        self, points: Array, parametrisation: str, coarse: int, colour: Array = _GREY, palette: Palette | None = None
-    ) -> None:
+    def __init__(self, points: Array, parametrisation: str, coarse: int, colour: Array = _GREY) -> None:
         self.specular, self.metallic = parametrisation == "specular", parametrisation == "metallic"
         more = [_SPECULAR] * 3 if self.specular else [_METALLIC] * self.metallic
         hue = np.asarray(colour) / max(float(np.mean(colour)), 1e-6)
@@ -106,18 +83,12 @@ class Materials:
         self.parameters = {"detail": torch.zeros(self._count, columns)}
         for level, size in enumerate(self._grids.sizes):
             self.parameters[f"grid{level}"] = torch.zeros(size, columns)
-        self._palette = palette
-        if palette is not None:
-            self.parameters["palette"] = torch.zeros(palette.size, columns)
 
     def at(self, vertices: Tensor) -> Tensor:
         """Columns (k, c) of the points `vertices` (k,), activated: all within [0, 1]."""
         value = self._start + self.parameters["detail"].index_select(0, vertices)
         for level, (index, share) in enumerate(zip(self._grids.index, self._grids.share)):
             value = value + blend(self.parameters[f"grid{level}"], index[vertices], share[vertices])
-        if self._palette is not None:
-            index, share, _ = self._palette
-            value = value + blend(self.parameters["palette"], index[vertices], share[vertices])
         return torch.sigmoid(value)
 
     def reflect(self, columns: Tensor, sums: Tensor, nv: Tensor, shading_model: str) -> Tensor:

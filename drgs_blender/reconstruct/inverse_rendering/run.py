@@ -26,7 +26,7 @@ from ..capture.capture import Capture
 from ..model.gaussians import Gaussians
 from ..optim.adam import Adam
 from .lighting import Lighting
-from .likeness import LikePoints, features, palette
+from .likeness import LikePoints, features
 from .losses import log_loss, unbiased_loss
 from .pixels import PLACES, Normals, Pixels, Subpixels, foreground_pixels
 from .radiance_cache import edges_of, filled, radiance_cache
@@ -250,12 +250,13 @@ class Job:
         self.lighting = Lighting(gatherer, settings, 2.5 * float(mean.mean()))
         finer = fineness(mesh.vertices, mesh.faces[:, :2])
         grids = settings.coarse and settings.coarse + round(math.log2(finer))
-        #: Features of the vertices; none where they are not wanted.
-        wanted = settings.palette > 0 or settings.same_material > 0
-        self._shown = features(self._pixels, mesh) if wanted else np.empty((0, 4), np.float32)
-        shared = palette(self._shown, settings.palette, settings.seed) if settings.palette else None
-        self.surface = Surface(mesh, replace(settings, coarse=grids), mean, normals is not None, start, shared)
-        self._like = LikePoints(self._shown, mesh.vertices, settings.seed) if settings.same_material > 0 else None
+        self.surface = Surface(mesh, replace(settings, coarse=grids), mean, normals is not None, start)
+        #: What photographs show of the vertices, where it is wanted.
+        self._shown: Array | None = None
+        self._like: LikePoints | None = None
+        if settings.same_material > 0:
+            self._shown = features(self._pixels, mesh)
+            self._like = LikePoints(self._shown, mesh.vertices, settings.seed)
         colours = np.maximum(cache[:, 0] * 0.28209479, 0)
         self._regularisers = Regularisers(edges_of(mesh.faces), colours, settings, finer)
         #: Logarithm of the brightness of the photographs, one each.

@@ -58,8 +58,6 @@ class Settings:
     same_material : float
         Weight of the differences of materials between vertices that photographs show alike, up to about a quarter of
         the object apart.
-    palette : int
-        Also learn this many materials that all vertices share which photographs show alike; 0: none.
     unbiased : bool
         Compare two independent estimates of each pixel, so that their noise is not learned from.
     weight_by_prediction : bool
@@ -109,7 +107,6 @@ class Settings:
     metal_albedo_prior: Weight = 0.05
     metal_smoothness: Weight = 5.0
     same_material: Weight = 0.003
-    palette: Annotated[int, Range(0, 64)] = 0
     unbiased: bool = True
     weight_by_prediction: bool = True
     clipped_neighbour_weight: Part = 0.5

@@ -14,7 +14,7 @@ from ...geometry.normals import VertexNormals
 from ...render.gbuffer.surfels import ALIKE
 from ...render.reference.brdf import dot, normalise
 from .blend import blend
-from .materials import Materials, Palette
+from .materials import Materials
 from .pixels import Pixels
 from .settings import Settings
 
@@ -85,8 +85,6 @@ class Surface:
         Whether pixels have normals from elsewhere than the mesh.
     start : (v, 3) float32 array, optional
         Unit normals of the vertices to begin with, in place of the mesh's smooth ones.
-    palette : Palette, optional
-        Materials that vertices share.
 
     Attributes
     ----------
@@ -96,15 +94,14 @@ class Surface:
     """
 
     def __init__(
-        self, mesh: Mesh, settings: Settings, mean: Array, given_normals: bool, start: Array | None = None,
-        palette: Palette | None = None,
-    ) -> None:  # fmt: skip
+        self, mesh: Mesh, settings: Settings, mean: Array, given_normals: bool, start: Array | None = None
+    ) -> None:
         if start is None:
             start = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
         self._normals = torch.from_numpy(start)
         self._faces = torch.from_numpy(mesh.faces.astype(np.int64))
         self._given_normals = given_normals
-        self.materials = Materials(mesh.vertices, settings.parametrisation, settings.coarse, mean, palette)
+        self.materials = Materials(mesh.vertices, settings.parametrisation, settings.coarse, mean)
         self.parameters = dict(self.materials.parameters)
         if settings.normals:
             self.parameters["normals"] = torch.zeros(len(mesh.vertices), 3)
