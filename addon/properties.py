@@ -148,7 +148,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         name="Rays See",
         description="Representation of DR-GS objects for shadows, reflections and indirect light",
         items=(
-            ("mesh", "Mesh", "The triangle mesh that carries the surfels; fast"),
+            ("mesh", "Mesh", "The mesh that carries the surfels, and sheets of those of thin objects; fast"),
             (
                 "surfels",
                 "Surfels",

@@ -384,7 +384,8 @@ class RenderSettings:
         (`subpixel_count`), in a session as of "mesh" where the camera sees no surfels anyway.
     camera_sees, rays_see : {"surfels", "mesh"}
         Representation of DR-GS objects for camera rays, and for shadow and indirect rays: their meshes, or the
-        surfels, blended along each ray (slower; for thin things without a good mesh).
+        surfels, blended along each ray (slower; for thin things without a good mesh). With "surfels" and "mesh" light
+        meets sheets of the surfels of objects that were reconstructed as thin (`engine.surfel_sheets`).
     denoise : {"none", "svgf", "oidn"}
     shading_model : {"principled", "paper"}
         Blender's Principled BSDF, or the paper's BRDF.
