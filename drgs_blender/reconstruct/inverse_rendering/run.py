@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from ...core.asset.model import Mesh
-from ...core.color import linear_to_srgb
 from ...core.errors import AssetError, Cancelled, UsageError
 from ...render.reference.brdf import MIN_GGX_ALPHA, dot
 from ...render.scene.triangle_bvh import TriangleBVH
@@ -32,6 +31,7 @@ from .pixels import PLACES, Normals, Pixels, Subpixels, foreground_pixels
 from .radiance_cache import edges_of, filled, radiance_cache
 from .regularisers import Regularisers, fineness
 from .schedule import Schedule
+from .score import Score
 from .settings import Settings
 from .surface import Pairs, Surface, SurfaceSamples
 
@@ -178,33 +178,6 @@ def learned(
     return result
 
 
-class Score:
-    """Running means of loss and error of the last steps.
-
-    Attributes
-    ----------
-    loss : float
-    error : float
-        Squared, in sRGB. Both are NaN before the first step.
-    """
-
-    def __init__(self) -> None:
-        self.loss, self.error = float("nan"), float("nan")
-
-    @property
-    def psnr(self) -> float:
-        """Decibels in sRGB; NaN before the first step."""
-        return float(-10 * np.log10(np.maximum(self.error, 1e-12)))
-
-    def note(self, loss: float, predicted: Tensor, photographed: Tensor) -> None:
-        """Add a step's loss and pixels (n, 3), linear Rec.709."""
-        a, b = (linear_to_srgb(x.clamp(0, 1).numpy()) for x in (predicted, photographed))
-        error = float(((a - b) ** 2).mean())
-        first = not self.error >= 0
-        self.loss = loss if first else 0.95 * self.loss + 0.05 * loss
-        self.error = error if first else 0.95 * self.error + 0.05 * error
-
-
 class Job:
     """A run, a `step` at a time.
 
@@ -238,7 +211,7 @@ class Job:
         cache, self._weight = radiance_cache(self._pixels, mesh)
         self._subpixels = Subpixels(self._pixels, capture.training, mesh, tree)
         # Of either estimate of a pixel, in two halves.
-        counts = tuple(2 * -(-count // 4) for count in (settings.cosine, settings.ggx, settings.light))
+        counts = _halved(settings.cosine), _halved(settings.ggx), _halved(settings.light)
         if not settings.shadows:
             tree = TriangleBVH()
             tree.build(mesh.vertices, mesh.faces[:0])
@@ -400,6 +373,11 @@ class Job:
         self._adam.steps = int(iteration)
         self.schedule.go_on(int(iteration), spent)
         log.info("materials: going on at step %d", self.schedule.iteration)
+
+
+def _halved(count: int) -> int:
+    """Half of an even number, rounded up to an even one."""
+    return 2 * -(-count // 4)
 
 
 def _digest(*arrays: Array) -> str:
