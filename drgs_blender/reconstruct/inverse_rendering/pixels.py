@@ -203,6 +203,10 @@ class Subpixels:
                 self._face[rows[usable], k] = face[usable]
                 self._corners[rows[usable], k] = np.stack([u, v], -1)[usable]
 
+    def draw(self, index: Array, generator: np.random.Generator) -> Pixels:
+        """The pixels at `index` (n,), each as seen at any of its places."""
+        return self.select(index, generator.integers(0, self._face.shape[1], len(index)))
+
     def select(self, index: Array, which: Array) -> Pixels:
         """The pixels at `index` (n,), each as seen at the place of number `which` (n,)."""
         face, last = self._face[index, which], self._corners[index, which]

@@ -27,7 +27,7 @@ from ..optim.adam import Adam
 from .lighting import Lighting
 from .likeness import LikePoints, features
 from .losses import log_loss, unbiased_loss
-from .pixels import PLACES, Normals, Pixels, Subpixels, foreground_pixels
+from .pixels import Normals, Pixels, Subpixels, foreground_pixels
 from .radiance_cache import edges_of, filled, radiance_cache
 from .regularisers import Regularisers, fineness
 from .schedule import Schedule
@@ -257,8 +257,7 @@ class Job:
         learned = self._learned()
         for tensor in learned.values():
             tensor.requires_grad_(True)
-        place = generator.integers(0, len(PLACES), 2 * s.pixels)
-        self._backward(self._subpixels.select(np.concatenate([row, row]), place), key, edge, pairs)
+        self._backward(self._subpixels.draw(np.concatenate([row, row]), generator), key, edge, pairs)
         for tensor in learned.values():
             tensor.requires_grad_(False)
             if tensor.grad is not None:
