@@ -140,9 +140,8 @@ def main() -> None:
         rows = store_row(FOLDER / "terms.json", f"{key}|{label}", cells)
     body = (
         f"The same surfels, of photographs of 256 pixels, {options.steps} steps of materials and light, one change a "
-        f"row, pixels seen through their centres where nothing else is said; "
-        "camera sees surfels. PSNR of the foreground in dB, relit under {LIGHT!r} scaled by one factor a "
-        "channel.\n\n"
+        "row, pixels seen through their centres where nothing else is said; camera sees surfels. PSNR of the "
+        f"foreground in dB, relit under {LIGHT!r} scaled by one factor a channel.\n\n"
     )
     lines = [(*name.split("|"), *cells) for name, cells in sorted(rows.items())]
     write_section("material-terms", "Further terms of the materials' stage", body + table(HEAD, lines))

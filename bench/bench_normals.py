@@ -1,6 +1,7 @@
 """Where normals are lost between surfels and mesh, and what that costs relit pictures.
 
 python bench/bench_normals.py --part chain --capture scenes/cat [--size 256]
+python bench/bench_normals.py --part creases --capture scenes/cat [--size 256]
 python bench/bench_normals.py --part relit --capture scenes/cat [--steps 1000]
 python bench/bench_normals.py --part prior --capture scenes/cat --size 128 [--steps 800]
 
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +24,11 @@ from bench_evaluate import mean, score, under_other_lights
 from bench_reconstruct import first_hits, trained
 from bench_shape import VOXELS, Truth, true_depth
 from report import OUT, processor_seconds, store_row, table, write_section
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.asset.model import Mesh
+from drgs_blender.core.frame import Camera
 from drgs_blender.evaluate.truth import read_truth
 from drgs_blender.geometry.normals import unit
 from drgs_blender.reconstruct import pipeline
@@ -42,6 +45,12 @@ from drgs_blender.reconstruct.settings import Settings
 FOLDER = OUT / "reconstruct"
 #: The light of relit pictures.
 LIGHT = "city"
+#: Neighbouring pixels whose true normals are farther apart are on a crease or an outline, degrees.
+CREASE = 20.0
+#: Distances from creases between which pixels are counted together, pixels.
+APART = (0.0, 1.0, 3.0, np.inf)
+#: True normals are blurred by these standard deviations, pixels, sampled so finely.
+BLURS, FINER = (0.5, 1.0, 2.0), 4
 #: Name -> whether triangles are evened, and whether learning begins with the surfels' normals, too.
 STEPS = {
     "triangles as marching cubes leaves them": (False, False),
@@ -138,6 +147,49 @@ def chain(capture: Capture, truth: Truth, name: str) -> dict[str, float]:
     return found
 
 
+def crease_distance(true: np.ndarray) -> np.ndarray:
+    """(h, w) pixels to the nearest one on a crease or an outline of normals (h, w, 3)."""
+    cosine, crease = np.cos(np.radians(CREASE)), np.zeros(true.shape[:2], bool)
+    for axis in (0, 1):
+        crease |= (true * np.roll(true, 1, axis)).sum(-1) < cosine
+    return np.asarray(distance_transform_edt(~crease))
+
+
+def blurred_normals(truth: Truth, camera: Camera, deviation: float) -> np.ndarray:
+    """Unit normals (h, w, 3) of the true mesh, blurred by a Gaussian of so many pixels."""
+    size = {"width": camera.width * FINER, "height": camera.height * FINER}
+    lens = {name: getattr(camera, name) * FINER for name in ("fx", "fy", "cx", "cy")}
+    depth, normal = truth.maps(replace(camera, **size, **lens))
+    shown = normal * (depth > 0)[..., None]
+    blurred = [gaussian_filter(shown[..., c], deviation * FINER) for c in range(3)]
+    return unit(np.stack(blurred, -1)[FINER // 2 :: FINER, FINER // 2 :: FINER])
+
+
+def creases(capture: Capture, truth: Truth, name: str) -> dict[str, str]:
+    """Errors of the surfels' normals by distance from creases, and of the true ones, blurred."""
+    gaussians, views = learned(capture, name), capture.testing
+    angles, distances = [], []
+    blurs: dict[float, list[np.ndarray]] = {deviation: [] for deviation in BLURS}
+    for view in views:
+        depth, true = truth.maps(view.camera)
+        shown = normals_of(gaussians)(view)
+        seen = (depth > 0) & (np.abs(shown).sum(-1) > 0)
+        angles.append(np.degrees(np.arccos((unit(shown) * true).sum(-1)[seen].clip(-1, 1))))
+        distances.append(crease_distance(true)[seen])
+        for deviation, found in blurs.items():
+            blurred = blurred_normals(truth, view.camera, deviation)
+            found.append(np.degrees(np.arccos((blurred * true).sum(-1)[seen].clip(-1, 1))))
+    angle, distance = np.concatenate(angles), np.concatenate(distances)
+    row = {"surfels' own normals": f"{angle.mean():.2f}", "median": f"{np.median(angle):.2f}"}
+    for low, high in pairwise(APART):
+        label = f"to {high:g} pixels from a crease" if np.isfinite(high) else "farther"
+        there = (distance >= low if low == 0 else distance > low) & (distance <= high)
+        row[label] = f"{angle[there].mean():.2f} ({100 * there.mean():.0f} %)"
+    for deviation, found in blurs.items():
+        row[f"true normals, blurred by {deviation:g} pixels"] = f"{np.concatenate(found).mean():.2f}"
+    return row
+
+
 def relit(capture: Capture, folder: Path, name: str, steps: int) -> dict[str, list[str]]:
     """Figures of the finished asset with and without the steps, from the same surfels."""
     gaussians, truth = learned(capture, name), read_truth(folder)
@@ -220,6 +272,18 @@ def write_chain(capture: Capture, folder: Path, name: str, _: int) -> None:
     write_section("reconstruct-chain", "Where stage (i) loses normals", body + table(head, cells))
 
 
+def write_creases(capture: Capture, folder: Path, name: str, _: int) -> None:
+    """Measure and write the errors by distance from creases."""
+    rows = store_row(FOLDER / "creases.json", name, creases(capture, Truth(folder), name))
+    body = (
+        f"Mean degrees in the views left out, and the share of the pixels; a crease is where true normals of "
+        f"neighbouring pixels are over {CREASE:g} degrees apart, outlines included.\n\n"
+    )
+    head = ("Object-pixels", *next(iter(rows.values())))
+    cells = [(key, *values.values()) for key, values in rows.items()]
+    write_section("reconstruct-creases", "Normals of stage (i) on creases and off them", body + table(head, cells))
+
+
 def write_relit(capture: Capture, folder: Path, name: str, steps: int) -> None:
     """Measure and write what the steps bring."""
     rows: dict[str, Any] = {}
@@ -241,6 +305,7 @@ def write_relit(capture: Capture, folder: Path, name: str, steps: int) -> None:
 
 PARTS: dict[str, Callable[[Capture, Path, str, int], None]] = {
     "chain": write_chain,
+    "creases": write_creases,
     "relit": write_relit,
     "prior": write_prior,
 }

@@ -4,6 +4,7 @@ python bench/bench_reconstruct.py --part raster
 python bench/bench_reconstruct.py --part surfels --capture scenes/spot [--time-budget 2] [--size 200]
 python bench/bench_reconstruct.py --part photographs --capture lego_400 [--time-budget 2] [--size 256]
 python bench/bench_reconstruct.py --part ablations --capture scenes/spot [--iterations 800] [--only NAME ...]
+python bench/bench_reconstruct.py --part paces --capture scenes/spot [--iterations 800] [--only NAME ...]
 python bench/bench_reconstruct.py --part variants --capture scenes/spot [--iterations 1500]
 
 Scenes are those of `drgs evaluate --make-scenes scenes`. Rows are kept, so that captures may be measured one by one.
@@ -13,7 +14,8 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +34,7 @@ from drgs_blender.reconstruct.meshing.visual_hull import find_region
 from drgs_blender.reconstruct.model.attached import attach_learned
 from drgs_blender.reconstruct.model.gaussians import Gaussians
 from drgs_blender.reconstruct.model.raster import rasterise
-from drgs_blender.reconstruct.optim.schedule import Schedule
+from drgs_blender.reconstruct.optim.schedule import RATES, Schedule
 from drgs_blender.reconstruct.optim.train import Training
 from drgs_blender.reconstruct.pipeline import ON_MESH, held_out_metrics, mesh_of
 from drgs_blender.reconstruct.readers import read_capture
@@ -41,16 +43,24 @@ ROWS = OUT / "reconstruct"
 #: Ablations of stage (i): name -> change of the schedule.
 ABLATIONS: dict[str, dict[str, Any]] = {
     "as it is": {},
-    "harmonics alone, nothing mirrored": {"mirrors": 1.0},
+    "harmonics alone, nothing mirrored": {"reflections": 1.0},
     "without normal consistency": {"consistency": 0.0},
     "normal consistency with the median depth": {"median": 1.0},
     "consistency of patches of two views": {"patches": 1.0},
     "without distortion": {"distortion": 0.0},
     "without mask": {"mask": 0.0},
     "without harmonics beyond the mean": {"bands": 0},
-    "full size from the start": {"coarse": 0.0},
-    "half size for half as long": {"coarse": 0.15},
     "without densification": {"rounds": 0},
+}
+#: Learning rates of places and of turns at the start, half of those of `schedule.RATES`.
+SLOWLY = {name: (RATES[name][0] / 2, RATES[name][1]) for name in ("centre", "rotation")}
+#: How fast stage (i) learns: name -> change of the schedule, and of "rates" those of learning.
+PACES: dict[str, dict[str, Any]] = {
+    "as it is": {},
+    "half size for three tenths of the steps": {"coarse": 0.3},
+    "places and turns learned half as fast": {"rates": SLOWLY},
+    "both of these": {"coarse": 0.3, "rates": SLOWLY},
+    "both of these, a fifth more steps": {"coarse": 0.3, "rates": SLOWLY, "iterations": 960},
 }
 
 
@@ -190,27 +200,45 @@ def formatted(value: Any) -> Any:
     return value if not isinstance(value, float) else f"{value:.4f}" if abs(value) < 1 else f"{value:.2f}"
 
 
-def ablations(options: argparse.Namespace) -> None:
+@contextmanager
+def learning_at(rates: dict[str, tuple[float, float]]) -> Iterator[None]:
+    """Within it, surfels are learned at these rates in place of those of `schedule.RATES`."""
+    kept = dict(RATES)
+    RATES.update(rates)
+    try:
+        yield
+    finally:
+        RATES.update(kept)
+
+
+def ablations(options: argparse.Namespace, part: str = "ablations") -> None:
     """What each part of stage (i) is worth, at equal steps, on the capture's object and on those measured before."""
     capture = read_capture(options.capture, options.size, 8)
     warm(capture)
     base = Schedule(iterations=options.iterations or 800, surfels=8000)
     pixels = capture.views[0].camera.width
-    file, rows = ROWS / "ablations.json", {}
-    for name, change in ABLATIONS.items():
+    changes, title = {
+        "ablations": (ABLATIONS, "Ablations of stage (i)"),
+        "paces": (PACES, "How fast stage (i) learns"),
+    }[part]
+    file, rows = ROWS / f"{part}.json", {}
+    for name, change in changes.items():
         if options.only and name not in options.only:
             continue
-        training, row = trained(capture, replace(base, **change), None)
-        row |= against_truth(training.gaussians, training, capture, options.capture)
+        fields = {key: value for key, value in change.items() if key != "rates"}
+        with learning_at(change.get("rates", {})):
+            training, row = trained(capture, replace(base, **fields), None)
+        if (options.capture / "mesh.npz").exists():
+            row |= against_truth(training.gaussians, training, capture, options.capture)
         row["run"] = f"{base.iterations} steps, {base.surfels} surfels, {pixels} pixels"
         rows = store_row(file, f"{name}|{options.capture.name}", row)
-    order = {name: k for k, name in enumerate(ABLATIONS)}
+    order = {name: k for k, name in enumerate(changes)}
     named = sorted((key.split("|")[1], order[key.split("|")[0]], row) for key, row in rows.items())
     names = ("psnr", "ssim", "normal", "depth", "overlap", "cpu")
-    cells = [(one, [*ABLATIONS][k], *(formatted(row[name]) for name in names)) for one, k, row in named]
+    cells = [(one, [*changes][k], *(formatted(row.get(name, "-")) for name in names)) for one, k, row in named]
     head = ("Object", "Stage (i)", "PSNR dB", "SSIM", "Normals deg", "Depth", "Silhouettes", "processor s")
     body = " / ".join(sorted({row["run"] for row in rows.values()})) + ".\n\n"
-    write_section("reconstruct-ablations", "Ablations of stage (i)", body + table(head, cells))
+    write_section(f"reconstruct-{part}", title, body + table(head, cells))
 
 
 def variants(options: argparse.Namespace) -> None:
@@ -247,6 +275,7 @@ PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
     "surfels": surfels,
     "photographs": lambda options: surfels(options, "photographs"),
     "ablations": ablations,
+    "paces": lambda options: ablations(options, "paces"),
     "variants": variants,
 }
 
@@ -259,7 +288,7 @@ def main() -> None:
     parser.add_argument("--time-budget", type=float, default=2.0, help="of stage (i); 0: the steps alone decide")
     parser.add_argument("--surfels", type=int, default=Schedule().surfels, help="at most")
     parser.add_argument("--iterations", type=int)
-    parser.add_argument("--only", nargs="+", choices=tuple(ABLATIONS))
+    parser.add_argument("--only", nargs="+", choices=tuple(ABLATIONS | PACES))
     options = parser.parse_args()
     if options.part != "raster" and options.capture is None:
         parser.error(f"--part {options.part} needs --capture")

@@ -74,7 +74,8 @@ def with_truth(folder: Path) -> Made:
     truth = json.loads((folder / "truth.json").read_text())
     frames = []
     for name, matrix in truth["frames"].items():
-        with Image.open(folder / "images" / name) as picture, Image.open(folder / "truth" / f"{Path(name).stem}.png") as mask:
+        true_mask = folder / "truth" / f"{Path(name).stem}.png"
+        with Image.open(folder / "images" / name) as picture, Image.open(true_mask) as mask:
             width, height = picture.size
             picture.putalpha(mask.getchannel("A"))
             picture.save(capture / f"{Path(name).stem}.png")

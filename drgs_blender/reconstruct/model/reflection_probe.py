@@ -1,8 +1,9 @@
 """The reflection probe: a learned cube of light around the object, looked up along reflected rays.
 
-Deferred shading with the split-sum approximation (Karis 2013), as Ref-Gaussian (Yao et al. 2025) pre-trains: each
-pixel's blended normal reflects the view, each surfel says how much and how blurred. Values are display-encoded, like
-the colours that they are added to; occlusion is left to the materials' own stage.
+A blurred mirror, deferred: each pixel's blended normal reflects the view, each surfel says how much and how blurred.
+Values are display-encoded, like the colours that they are added to; Fresnel and occlusion are left to the materials'
+own stage. It is less than the split-sum shading of Ref-Gaussian (Yao et al. 2025), whose other parts did not change
+shapes: docs/decoupling.md has the figures.
 """
 
 from __future__ import annotations

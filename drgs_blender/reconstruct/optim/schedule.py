@@ -12,9 +12,11 @@ from ...core.errors import UsageError
 from ..ranges import Part, Range, Weight, check
 
 #: Learning rates at the start, and what is left of them at the end; of centres a part of the object's radius.
-RATES = {"centre": (1.5e-3, 0.01), "scale": (8e-3, 0.2), "rotation": (4e-3, 0.2), "opacity": (4e-2, 0.3)}
+RATES = {"centre": (3e-3, 0.01), "scale": (8e-3, 0.2), "rotation": (8e-3, 0.2), "opacity": (4e-2, 0.3)}
 RATES |= {"tint": (6e-2, 0.2), "blur": (6e-2, 0.2)}
 LIGHT_RATE = (4e-2, 0.1)
+#: Of the offsets of surfels on faces, edges of the face.
+OFFSET_RATE = (4.5e-2, 0.01)
 COLOUR_RATE, HIGHER_BANDS = (2e-2, 0.1), 0.1
 
 
@@ -30,7 +32,7 @@ class Schedule:
         At most so many at the end of densification; for small pictures fewer. None: as many as the photographs show,
         see `initialisation.surfel_limit`.
     coarse : float
-        Part of the steps that is done at half size.
+        Part of the steps that is done at half size: they take a quarter of the time, and cost detail.
     densify : tuple of float
         Parts of the steps between which surfels are cut, `rounds` times.
     rounds : int
@@ -65,7 +67,7 @@ class Schedule:
 
     iterations: Annotated[int, Range(1, 10_000_000)] = 3000
     surfels: Annotated[int | None, Range(10, 5_000_000)] = None
-    coarse: Part = 0.3
+    coarse: Part = 0.0
     densify: tuple[Part, Part] = (0.08, 0.6)
     rounds: Annotated[int, Range(0, 1000)] = 16
     shape: Part = 0.15
@@ -116,7 +118,7 @@ def learning_rates(part: float, radius: float, harmonics: int) -> dict[str, floa
     """
     rates: dict[str, float | Array] = {k: first * rest**part for k, (first, rest) in RATES.items()}
     rates["centre"] = float(rates["centre"]) * radius
-    rates["offset"] = RATES["centre"][0] * RATES["centre"][1] ** part * 30
+    rates["offset"] = OFFSET_RATE[0] * OFFSET_RATE[1] ** part
     colour = COLOUR_RATE[0] * COLOUR_RATE[1] ** part
     rates["sh"] = np.repeat(np.where(np.arange(harmonics) == 0, colour, HIGHER_BANDS * colour), 3)
     return rates

@@ -2,7 +2,7 @@
 
 Each step renders one view. The loss is L1 and SSIM of the picture, the mask, distortion and the agreement of the
 surfels' normals with those of the depth map (Huang et al. 2024, "2D Gaussian Splatting"), the last two once shape has
-begun to form. The first part runs at half size, where a step costs a quarter.
+begun to form. A first part may run at half size, where a step costs a quarter.
 """
 
 from __future__ import annotations
