@@ -26,14 +26,11 @@ from drgs_blender.core.asset.model import BASE_CHANNELS, Mesh
 from drgs_blender.evaluate.truth import Truth, read_truth
 from drgs_blender.reconstruct import pipeline
 from drgs_blender.reconstruct.capture.capture import Capture
-from drgs_blender.reconstruct.inverse_rendering import pixels
 from drgs_blender.reconstruct.inverse_rendering.radiance_cache import edges_of
 from drgs_blender.reconstruct.model.gaussians import Gaussians
 from drgs_blender.reconstruct.readers import read_capture
 from drgs_blender.reconstruct.settings import Settings
 
-#: Places in a pixel by default.
-PLACES = pixels.PLACES
 #: The light of relit pictures.
 LIGHT = "city"
 #: The row that others are held against.
@@ -46,8 +43,6 @@ ROWS: dict[str, dict[str, Any]] = {
 }
 #: The row with four times the faces, about four vertices a pixel.
 CUT = "faces cut in four"
-#: The row as it is by default; all others see pixels through their centres alone.
-DEFAULT = "like vertices held alike, .003, and pixels seen through two places"
 HEAD = ("Object-pixels", "", "Relit", "Views left out", "Albedo scaled", "Roughness / metallic RMSE", "Processor s")
 
 
@@ -79,8 +74,8 @@ def same_surfels(gaussians: Gaussians, cut: bool = False) -> Iterator[None]:
     names = "mesh_of", "held_out_metrics", "Training"
     kept, learn = {name: getattr(pipeline, name) for name in names}, pipeline._Work.learn
 
-    def mesh_of(*given: Any) -> Any:
-        mesh, report = kept["mesh_of"](*given)
+    def mesh_of(*given: Any, **named: Any) -> Any:
+        mesh, report = kept["mesh_of"](*given, **named)
         return cut_in_four(mesh) if cut else mesh, report
 
     replaced = {"mesh_of": mesh_of, "held_out_metrics": lambda *_: {}, "Training": lambda *_, **__: None}
@@ -118,7 +113,7 @@ def main() -> None:
     parser.add_argument("--capture", type=Path, required=True)
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--steps", type=int, default=1000, help="of materials and light")
-    parser.add_argument("--rows", nargs="+", choices=[*ROWS, CUT, DEFAULT], default=[*ROWS, CUT, DEFAULT])
+    parser.add_argument("--rows", nargs="+", choices=[*ROWS, CUT], default=[*ROWS, CUT])
     options = parser.parse_args()
     torch.set_num_threads(1)
     capture, key = read_capture(options.capture, options.size), f"{options.capture.name}-{options.size}"
@@ -131,16 +126,14 @@ def main() -> None:
     rows: dict[str, Any] = {}
     gaussians = learned(capture, f"{options.capture.name}-256")
     for label in options.rows:
-        changes = {} if label == DEFAULT else ROWS.get(label, ROWS[PLAIN])
-        settings = replace(base, decoupling=replace(base.decoupling, **changes))
-        pixels.PLACES = PLACES if label == DEFAULT else ((0.0, 0.0),)
+        settings = replace(base, decoupling=replace(base.decoupling, **ROWS.get(label, ROWS[PLAIN])))
         with same_surfels(gaussians, label == CUT):
             cells = measured(capture, options.capture, truth, settings, key)
         print(key, label, *cells, flush=True)
         rows = store_row(FOLDER / "terms.json", f"{key}|{label}", cells)
     body = (
         f"The same surfels, of photographs of 256 pixels, {options.steps} steps of materials and light, one change a "
-        "row, pixels seen through their centres where nothing else is said; camera sees surfels. PSNR of the "
+        "row; camera sees surfels. PSNR of the "
         f"foreground in dB, relit under {LIGHT!r} scaled by one factor a channel.\n\n"
     )
     lines = [(*name.split("|"), *cells) for name, cells in sorted(rows.items())]

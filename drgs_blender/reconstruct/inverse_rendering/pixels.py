@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
-import torch
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from ...core.asset.model import Mesh
@@ -31,8 +30,6 @@ _INSIDE = 0.99
 _GRAZING = 0.1
 #: Pixels around clipped ones that may well mirror the same, as far as normals are known.
 _BESIDE = 2
-#: Places in a pixel at which it is looked through, in pixels from its centre.
-PLACES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 
 
 @dataclass(slots=True)
@@ -143,7 +140,9 @@ def pixels_of(index: int, view: View, mesh: Mesh, tree: TriangleBVH, normals: No
     row = np.flatnonzero(binary_erosion(seen, border_value=1) if min(seen.shape) > 2 else seen)
     t, face, u, v, origin, direction = t[row], face[row], u[row], v[row], origin[row], direction[row]
 
-    flat = _face_normals(mesh.vertices[mesh.faces[face]])
+    corners = mesh.vertices[mesh.faces[face]]
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
     towards = -direction / np.linalg.norm(direction, axis=1, keepdims=True)
     colour = srgb_to_linear(view.colour)
     given = None if normals is None else np.asarray(normals(view), np.float32)
@@ -162,62 +161,6 @@ def pixels_of(index: int, view: View, mesh: Mesh, tree: TriangleBVH, normals: No
     # A face seen from behind is an error of the mesh, or of its orientation: nothing can be learned there.
     usable = ((flat * towards).sum(1) > _GRAZING) & np.isfinite(part.colour).all(1)
     return part.select(np.flatnonzero(usable))
-
-
-def _face_normals(corners: Array) -> Array:
-    """Unit normals (n, 3) of faces with corners (n, 3, 3)."""
-    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
-
-
-class Subpixels:
-    """Points of the surface behind several places of each pixel: what a photograph shows is the mean over the pixel.
-
-    Parameters
-    ----------
-    pixels : Pixels
-    views : list of View
-    mesh : Mesh
-    tree : TriangleBVH
-        Of the mesh's triangles.
-    """
-
-    def __init__(self, pixels: Pixels, views: list[View], mesh: Mesh, tree: TriangleBVH) -> None:
-        self._pixels, self._mesh = pixels, mesh
-        self._eyes = np.stack([np.asarray(view.camera.matrix_world)[:3, 3] for view in views]).astype(np.float32)
-        #: Face and barycentric coordinates of its last two corners, of each place.
-        self._face = np.repeat(pixels.face[:, None], len(PLACES), axis=1)
-        self._corners = np.repeat(pixels.corners[:, None, 1:], len(PLACES), axis=1)
-        for index, view in enumerate(views):
-            rows = np.flatnonzero(pixels.view == index)
-            centres = pixel_centres(view.camera).reshape(-1, 2)[pixels.place[rows]]
-            for k, place in enumerate(PLACES):
-                rays = camera_rays(view.camera, centres + torch.tensor(place, dtype=centres.dtype))
-                origin, direction = (a.numpy().astype(np.float32) for a in rays)
-                _, face, u, v = tree.intersect(
-                    origin, direction, tnear=view.camera.clip_start, tfar=view.camera.clip_end
-                )
-                flat = _face_normals(mesh.vertices[mesh.faces[face]])
-                cosine = -(flat * direction).sum(1) / np.linalg.norm(direction, axis=1)
-                usable = (face >= 0) & (cosine > _GRAZING)  # else the pixel's centre stands in
-                self._face[rows[usable], k] = face[usable]
-                self._corners[rows[usable], k] = np.stack([u, v], -1)[usable]
-
-    def draw(self, index: Array, generator: np.random.Generator) -> Pixels:
-        """The pixels at `index` (n,), each as seen at any of its places."""
-        return self.select(index, generator.integers(0, self._face.shape[1], len(index)))
-
-    def select(self, index: Array, which: Array) -> Pixels:
-        """The pixels at `index` (n,), each as seen at the place of number `which` (n,)."""
-        face, last = self._face[index, which], self._corners[index, which]
-        corners = np.concatenate([1 - last.sum(axis=1, keepdims=True), last], axis=1)
-        points = self._mesh.vertices[self._mesh.faces[face]]
-        whole = self._pixels.select(index)
-        origin = np.einsum("nk,nkc->nc", corners, points)
-        return replace(
-            whole, face=face, corners=corners, origin=origin, flat=_face_normals(points),
-            towards=unit(self._eyes[whole.view] - origin).astype(np.float32),
-        )  # fmt: skip
 
 
 def _beside(clipped: Array) -> Array:

@@ -27,7 +27,7 @@ from ..optim.adam import Adam
 from .lighting import Lighting
 from .likeness import LikePoints, features
 from .losses import log_loss, unbiased_loss
-from .pixels import Normals, Pixels, Subpixels, foreground_pixels
+from .pixels import Normals, Pixels, foreground_pixels
 from .radiance_cache import edges_of, filled, radiance_cache
 from .regularisers import Regularisers, fineness
 from .schedule import Schedule
@@ -209,9 +209,7 @@ class Job:
         tree.build(mesh.vertices, mesh.faces)
         self._pixels = foreground_pixels(capture.training, mesh, tree, settings.most_pixels, settings.seed, normals)
         cache, self._weight = radiance_cache(self._pixels, mesh)
-        self._subpixels = Subpixels(self._pixels, capture.training, mesh, tree)
-        # Of either estimate of a pixel, in two halves.
-        counts = _halved(settings.cosine), _halved(settings.ggx), _halved(settings.light)
+        counts = (settings.cosine, settings.ggx, settings.light)
         if not settings.shadows:
             tree = TriangleBVH()
             tree.build(mesh.vertices, mesh.faces[:0])
@@ -251,13 +249,13 @@ class Job:
         generator = np.random.default_rng([s.seed, self.schedule.iteration])
         row = generator.integers(*self._range(), s.pixels)
         edge = self._regularisers.draw(generator)
-        key = generator.integers(0, 2**32, 2 * s.pixels, dtype=np.uint32)
+        key = generator.integers(0, 2**32, s.pixels, dtype=np.uint32)
         pairs = self._like.draw(generator) if self._like is not None and self.schedule.knows_metals() else None
 
         learned = self._learned()
         for tensor in learned.values():
             tensor.requires_grad_(True)
-        self._backward(self._subpixels.draw(np.concatenate([row, row]), generator), key, edge, pairs)
+        self._backward(self._pixels.select(row), key, edge, pairs)
         for tensor in learned.values():
             tensor.requires_grad_(False)
             if tensor.grad is not None:
@@ -296,7 +294,7 @@ class Job:
         return loss + self._regularisers.of_normals(samples)
 
     def _difference(self, pixels: Pixels, key: Array, samples: SurfaceSamples, radiance: Tensor) -> Tensor:
-        """Loss between predicted and photographed colours, of pixels that come twice, with a point each."""
+        """Loss between predicted and photographed colours."""
         s, materials = self._settings, self.surface.materials
         roughness = materials.roughness(samples.materials)
         alpha2 = (roughness**2).clamp(min=MIN_GGX_ALPHA) ** 2
@@ -306,12 +304,10 @@ class Job:
         if self._exposure is not None:
             factor = torch.exp(self._exposure - self._exposure.mean())
             predicted = predicted * factor[torch.from_numpy(pixels.view).long()][:, None, None]
-        count = len(pixels) // 2
-        predicted = predicted.mean(1).view(2, count, 3).transpose(0, 1)
-        photographed = torch.from_numpy(pixels.colour[:count])
+        photographed = torch.from_numpy(pixels.colour)
         if s.unbiased:
             weight_by_prediction = self.schedule.weighs_by_prediction()
-            beside = torch.from_numpy(pixels.next_to_clipped[:count])
+            beside = torch.from_numpy(pixels.next_to_clipped)
             counts = torch.where(beside, s.clipped_neighbour_weight, 1.0) if weight_by_prediction else None
             loss = unbiased_loss(predicted, photographed, weight_by_prediction, counts)
         else:
@@ -372,11 +368,6 @@ class Job:
         self._adam.steps = int(iteration)
         self.schedule.go_on(int(iteration), spent)
         log.info("materials: going on at step %d", self.schedule.iteration)
-
-
-def _halved(count: int) -> int:
-    """Half of an even number, rounded up to an even one."""
-    return 2 * -(-count // 4)
 
 
 def _digest(*arrays: Array) -> str:
