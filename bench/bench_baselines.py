@@ -71,7 +71,7 @@ METHODS = {
     "split sum of each surfel, then blended (forward, as GS-ROR2)": Method(
         {"shadows": False, "indirect": False}, {"bounces": 0}, UNSEEN, "split sum"
     ),
-    "mean colours of the day, carried by faces (as GaussianMesh, SuGaR, Mani-GS)": Method(None, picture="albedo"),
+    "colours of the day, carried along (as PhysGaussian, GaussianMesh, SuGaR, Mani-GS)": Method(None, picture="albedo"),
     "colours of the day with harmonics, carried by particles (as GSP, PhysGaussian)": Method(None, picture="baked"),
 }
 
@@ -81,7 +81,7 @@ def renderer(session: Session, key: str, method: Method, samples: int) -> Render
     lit = session_renderer(session, key, RenderSettings(samples, **method.rendering), method.visibility)
     asset = session.asset(key)
     baked = Baked(asset) if method.picture == "baked" else None
-    lights: dict[int, Prefiltered] = {}
+    lights: dict[bytes, Prefiltered] = {}
 
     def draw(camera: Camera, radiance: Array, vertices: Array | None) -> dict[str, Array]:
         passes = lit(camera, radiance, vertices)
@@ -90,11 +90,12 @@ def renderer(session: Session, key: str, method: Method, samples: int) -> Render
         elif baked is not None:
             passes["Combined"] = baked(camera, vertices)
         elif method.picture == "split sum":
-            light = lights.get(id(radiance)) or lights.setdefault(id(radiance), Prefiltered(radiance))
+            if (key_of_light := radiance.tobytes()) not in lights:
+                lights[key_of_light] = Prefiltered(radiance)
             assert asset.binding is not None
             rest = asset.mesh.vertices if vertices is None else vertices
             posed = MeshDriven(asset.mesh, asset.surfels, asset.binding).pose(rest)
-            passes["Combined"] = split_sum(posed, light, camera)
+            passes["Combined"] = split_sum(posed, lights[key_of_light], camera)
         return passes
 
     return draw
@@ -142,8 +143,8 @@ def main() -> None:
         "of learning and of rendering; the integrals are ours, so the rows show what the idea costs and not what the "
         "original programs reach. PSNR of the foreground in dB; all but the views left out scaled by one factor a "
         "channel; SSIM and FLIP of scaled frames on white; relit: means over the lights that were not photographed. "
-        "GSP simulates by XPBD; here its particles follow the true motion, so that the row is about driving and light "
-        "alone (`other_methods.py`).\n\n"
+        "Colours of the day that are carried along are their mean over all views. GSP simulates by XPBD; here its "
+        "particles follow the true motion, so that the row is about driving and light alone (`other_methods.py`).\n\n"
     )
     cells = [(*key.split("|"), *cells) for key, cells in rows.items()]
     write_section("baselines", "What other methods leave out", body + table(COLUMNS, cells))

@@ -126,7 +126,7 @@ def main() -> None:
     rows: dict[str, Any] = {}
     gaussians = learned(capture, f"{options.capture.name}-256")
     for label in options.rows:
-        settings = replace(base, decoupling=replace(base.decoupling, **ROWS.get(label, ROWS[PLAIN])))
+        settings = replace(base, decoupling=replace(base.decoupling, joint=0.0, **ROWS.get(label, ROWS[PLAIN])))
         with same_surfels(gaussians, label == CUT):
             cells = measured(capture, options.capture, truth, settings, key)
         print(key, label, *cells, flush=True)

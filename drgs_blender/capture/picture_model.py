@@ -84,8 +84,8 @@ class PictureModel:
                 "%d x %d", path, ", ".join(filter(None, known)), *self.size,
             )  # fmt: skip
 
-    def run(self, pixels: Array, subject: str, white: int = 255) -> Array:
-        """The model's first result.
+    def run(self, pixels: Array, subject: str, white: int = 255) -> list[Array]:
+        """All that the model gives.
 
         Parameters
         ----------
@@ -98,7 +98,7 @@ class PictureModel:
 
         Returns
         -------
-        float32 array
+        list of float32 array
 
         Raises
         ------
@@ -110,11 +110,11 @@ class PictureModel:
         _, mean, deviation = self._preparation
         given = ((values - np.asarray(mean, np.float32)) / np.asarray(deviation, np.float32)).transpose(2, 0, 1)[None]
         try:
-            found = np.asarray(self._session.run(None, {self._input: given})[0], np.float32)
+            found = [np.asarray(one, np.float32) for one in self._session.run(None, {self._input: given})]
         except Exception as error:
             raise AssetError(str(self.path), f"fails on {subject} ({_first_line(error)})",
                              f"Check that it is a {self._kind} model") from error  # fmt: skip
-        if not np.isfinite(found).all():
+        if not all(np.isfinite(one).all() for one in found):
             raise AssetError(str(self.path), f"gives NaN or infinity for {subject}", "Use another model")
         return found
 

@@ -62,7 +62,12 @@ def no() -> bool:
     return False
 
 
-def test_normals_are_turned_to_the_world_whatever_the_axes_of_the_model(capture: Capture, copies: Path) -> None:
+@pytest.mark.parametrize("channels", [3, 4])
+def test_normals_are_turned_to_the_world_whatever_the_axes_of_the_model(
+    capture: Capture, tmp_path: Path, channels: int
+) -> None:
+    """A fourth channel is a confidence, as some have it."""
+    copies = write_model(tmp_path / "omnidata.onnx", side=64, outputs=channels)
     give_normals(capture, str(copies), silent, no)
     for view in capture.training:
         _, alpha, true = ball(view.camera)
@@ -77,8 +82,13 @@ def test_what_are_no_normals_is_not_used(capture: Capture, copies: Path, caplog:
     for view in capture.views:
         view.colour = noise.random(view.colour.shape, np.float32)
     give_normals(capture, str(copies), silent, no)
-    assert "degrees off the surface" in caplog.text
+    assert "no better than normals that all face" in caplog.text
     assert all(view.normals is None for view in capture.views)
+    caplog.clear()
+    for view in capture.views:  # the model's axes: away from the viewer
+        view.colour = np.broadcast_to(np.float32([0.5, 0.5, 0.0]), view.colour.shape)
+    give_normals(capture, str(copies), silent, no)
+    assert "no better than normals that all face" in caplog.text and capture.training[0].normals is None
 
 
 def test_without_masks_axes_are_not_guessed(capture: Capture, copies: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -90,9 +100,9 @@ def test_without_masks_axes_are_not_guessed(capture: Capture, copies: Path, capl
 def test_a_file_that_is_no_such_model_is_named(tmp_path: Path, capture: Capture) -> None:
     with pytest.raises(UsageError, match="no such file"):
         NormalModel(str(tmp_path / "gone.onnx"))
-    one = write_model(tmp_path / "dsine-one.onnx", side=64)
-    with pytest.raises(AssetError, match=r"one.onnx.*shape \(1, 64, 64\)"):
-        NormalModel(str(one))(capture.views[0])
+    one = write_model(tmp_path / "one.onnx", side=64)
+    with pytest.raises(AssetError, match=r"one.onnx.*shape \(1, 1, 64, 64\)"):
+        NormalModel(str(one))
     with pytest.raises(Cancelled):
         give_normals(capture, str(write_model(tmp_path / "omnidata.onnx", 64, outputs=3)), silent, lambda: True)
 

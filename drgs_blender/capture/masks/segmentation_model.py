@@ -116,7 +116,7 @@ class SegmentationModel(PictureModel):
             What the model gives is no mask.
         """
         height, width = pixels.shape[:2]
-        found = self.run(pixels, subject, max(int(pixels.max()), 1))  # as rembg does
+        found, *_ = self.run(pixels, subject, max(int(pixels.max()), 1))  # as rembg does
         if found.ndim not in (3, 4) or found.shape[0] != 1 or found.size != found.shape[-1] * found.shape[-2]:
             raise AssetError(str(self.path), f"gives values of the shape {found.shape}",
                              "A segmentation model gives one mask: (1, 1, height, width)")  # fmt: skip
