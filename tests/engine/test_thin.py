@@ -13,7 +13,7 @@ from pictures import assert_same_bits, fresh
 from drgs_blender.core.asset.container import read_asset, write_asset
 from drgs_blender.core.frame import Frame, MeshState, Visibility, World
 from drgs_blender.engine.session import Session
-from drgs_blender.render.surfels.sheets import COVER, OFF, sheets
+from drgs_blender.render.surfels.sheets import OFF, sheets
 
 THIN = {"report": {"thin": True}}
 
@@ -47,7 +47,7 @@ def test_a_sheet_has_the_area_and_the_plane_of_its_surfel():
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = 0.5 * np.linalg.norm(cross, axis=1).reshape(5, 2).sum(1)
     kernel = 2 * np.pi * opacity * np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1)
-    assert area == pytest.approx(COVER**2 * kernel, rel=1e-4)
+    assert area == pytest.approx(kernel, rel=1e-4)
     normal = np.cross(u, v)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     off = np.einsum("nkc,nc->nk", vertices.reshape(5, 4, 3) - centre[:, None], normal)
