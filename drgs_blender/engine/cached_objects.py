@@ -91,7 +91,7 @@ def begun(state: ObjectState, loaded: LoadedAsset, mode: tuple[bool, bool, bool,
     met, shown, textured, sheeted = mode
     asset = loaded.asset
     channels = {} if shown else optional_channels(state, asset)
-    traced = traced_object(state, asset, met or shown or (sheeted and not channels))
+    traced = traced_object(state, asset, met or shown, sheeted and not channels)
     item = CachedObject(state, loaded, traced, traced, mode=mode)
     item.faults = [*(f"{state.name}: {fault}" for fault in loaded.faults), *material_faults(state)]
     if shown:

@@ -138,8 +138,8 @@ class SceneCache:
             return False
         known = [state for state in frame.objects if state.asset in self._assets]
         assets = [self._assets[state.asset].asset for state in known]
-        if any(shows_captured(state, asset, frame) for state, asset in zip(known, assets, strict=True)):
-            return False
+        if any(shows_captured(*of, frame) or meets_sheets(*of, frame) for of in zip(known, assets, strict=True)):
+            return False  # points on a mesh would lie among sheets, in their shade
         return all(len(a.surfels) <= _SURFELS_A_VERTEX * len(a.mesh.vertices) for a in assets)
 
     def jobs_of(self, frame: Frame) -> tuple[str, ...]:

@@ -117,11 +117,11 @@ def _has(state: ObjectState, name: str) -> bool:
     return getattr(state, name) is not None
 
 
-def traced_object(state: ObjectState, asset: Asset, seen_only: bool = False) -> TraceObject:
+def traced_object(state: ObjectState, asset: Asset, seen_only: bool = False, sheeted: bool = False) -> TraceObject:
     """The object's mesh in world space with this frame's materials.
 
     Faces are counter-clockwise seen from outside also where the object's matrix mirrors it. `seen_only`: light meets
-    the object's surfels instead.
+    the object's surfels instead; `sheeted`: sheets of them.
 
     Raises
     ------
@@ -170,7 +170,8 @@ def traced_object(state: ObjectState, asset: Asset, seen_only: bool = False) -> 
         corner_normals=normals,
         pass_index=state.pass_index,
         visibility=state.visibility,
-        seen_only=seen_only,
+        seen_only=seen_only or sheeted,
+        sheeted=sheeted,
         torn=torn if torn is not None and torn.any() else None,
         terminator_offset=state.terminator_offset,
     )

@@ -19,6 +19,7 @@ from drgs_blender.core.frame import Adjustment, Frame, MeshState, MotionStep, Ob
 from drgs_blender.core.materials import Material
 from drgs_blender.deform.attach import attach
 from drgs_blender.engine.session import Session
+from drgs_blender.render.gbuffer.surfels import snap_windows
 
 #: Colour of the display that the plain ball has from all sides, and the constant harmonic.
 COLOUR, CONSTANT = (0.6, 0.3, 0.8), 0.28209479177387814
@@ -204,6 +205,17 @@ def test_a_mirrored_object_is_seen_as_in_a_mirror(shiny_path, frame_of):
     mirrored.objects[0].matrix_world = np.diag([-1.0, 1.0, 1.0, 1.0])
     a, b = (session.render(frame)["Combined"] for frame in (plain, mirrored))
     assert np.abs(a - b[:, ::-1]).mean() < 2e-3 < 0.02 < np.abs(a - b).mean()
+
+
+def test_its_points_are_tied_to_its_mesh(shiny_path, frame_of, monkeypatch):
+    """Light meets a mesh of it, no sheets: its passes are those of windows without a sign, and not of negative ones."""
+    passes = "Combined", "Emit", "Normal", "Depth", "Position"
+    frame, pictures = frame_of(shiny_path, passes, size=(96, 72)), []
+    for windows in (snap_windows, lambda *of: abs(snap_windows(*of)), lambda *of: -abs(snap_windows(*of))):
+        monkeypatch.setattr("drgs_blender.render.pipeline.snap_windows", windows)
+        pictures.append(session_of(shiny_path).render(frame))
+    assert_same_bits(*pictures[:2])
+    assert (pictures[0]["Normal"] != pictures[2]["Normal"]).any()
 
 
 def test_steps_end_in_the_whole_picture(shiny_path, asset_path, frame_of):

@@ -68,12 +68,12 @@ NOWHERE, ALONG_VIEW, ALONG_NORMAL, ANY_SIDE, FACING = 0, 1, 2, 3, 4
 def snap_windows(scene: TraceScene, object_count: int) -> Array:
     """(max(object_count, 1),) float32 metres: `WINDOW_EDGES` times the mean edge length of each object's mesh.
 
-    Negative where light does not meet that mesh: points are not tied to it.
+    Negative where light meets sheets of the object's surfels: points are not tied to the mesh.
     """
     total, count = np.zeros((2, max(object_count, 1)))
     _edge_lengths(scene.vertices, scene.faces, scene.face_object, total, count)
-    loose = scene.seen_only[: len(total)]
-    total[: len(loose)][loose] *= -1
+    sheeted = scene.sheeted[: len(total)]
+    total[: len(sheeted)][sheeted] *= -1
     return (WINDOW_EDGES * total / np.maximum(count, 1)).astype(np.float32)
 
 

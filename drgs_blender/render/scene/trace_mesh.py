@@ -59,6 +59,8 @@ class TraceObject:
         Which rays meet it.
     seen_only : bool
         Whether only the camera meets its triangles, light its surfels.
+    sheeted : bool
+        Whether light meets sheets of its surfels (`surfels.sheets`).
     torn : (m,) bool array, optional
         Faces that no ray meets.
     terminator_offset : float
@@ -75,6 +77,7 @@ class TraceObject:
     pass_index: int = 0
     visibility: Visibility = field(default_factory=Visibility)
     seen_only: bool = False
+    sheeted: bool = False
     torn: Array | None = None
     terminator_offset: float = 0.0
 

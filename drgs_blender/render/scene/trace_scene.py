@@ -81,7 +81,7 @@ class TraceScene:
         Whether there is an object that diffuse rays meet and glossy ones do not, or the other way.
     pass_index, object_flags : (objects,) int32 array
         Blender's object index pass; bits HOLDOUT and CATCHER.
-    seen_only : (n,) bool array
+    sheeted : (n,) bool array
         Of the frame's objects, as of `TraceObject`.
     source : (objects,) int64 array
         Which of the frame's objects, or behind them which of its meshes, each is.
@@ -108,7 +108,7 @@ class TraceScene:
         self.pass_index: Array = np.empty(0, np.int32)
         self.source: Array = np.empty(0, np.int64)
         self.object_flags: Array = np.empty(0, np.int32)
-        self.seen_only: Array = np.empty(0, bool)
+        self.sheeted: Array = np.empty(0, bool)
         self.rays_differ = False
         self.mesh_materials = MeshMaterials()
         self.extent = 0.0
@@ -340,7 +340,7 @@ class TraceScene:
         counts = [0] * len(objects) + [len(p.matrices) if p.instanced else 0 for p in where]
         self.source = np.concatenate([np.arange(len(seen)), np.repeat(np.arange(len(seen)), counts)])
         self.object_flags = flags[self.source]
-        self.seen_only = np.array([o.seen_only for o in objects], bool)
+        self.sheeted = np.array([o.sheeted for o in objects], bool)
         self._offsets.take(objects, meshes, self.source)
         visible = [len(p.matrices) > 0 and m.visibility.camera for m, p in zip(meshes, where)]
         self.any_ordinary = any(v and (not isinstance(m, ObjectMesh) or m.clear) for v, m in zip(visible, meshes))
