@@ -84,7 +84,7 @@ def with_truth(folder: Path) -> Made:
     data = lens | {"applied_transform": np.eye(4)[:3].tolist(), "frames": frames}
     (capture / "transforms.json").write_text(json.dumps(data))
     asset = folder / "true.drgs"
-    spent, wall = run("reconstruct", capture, "--out", asset)
+    spent, wall = run("reconstruct", capture, "--out", asset, "--up", "z")  # the world as it is
     return Made(asset, np.eye(4), f"{len(frames)} of {len(frames)}", "true", spent, wall)
 
 
@@ -107,7 +107,7 @@ def without(folder: Path) -> Made:
 
 def relit(made: Made, folder: Path, sky: Path, samples: int) -> list[str]:
     """Cells of an asset under the other sky: PSNR of the foreground in dB, SSIM and FLIP of the scaled pictures."""
-    truth = read_relit(folder / "relit", sky)
+    truth = read_relit(folder / "relit", sky, up="z")
     session = Session()
     key = session.load_asset(made.asset)
     state, settings = ObjectState(made.asset.stem, key, made.placed), RenderSettings(samples, bounces=3)
