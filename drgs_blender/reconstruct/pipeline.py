@@ -311,6 +311,11 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, thin: bool, rep
     if (seconds := work.seconds(MATERIAL_TIME_FRACTION)) is not None:
         settings = replace(settings, seconds=seconds)
     if settings.joint is None:
+        if thin and work.backend is not CPU and work.settings.variant == "p":
+            log.info(
+                "thin objects learn surfels with their materials on the CPU alone: on the card they stay; "
+                "decoupling.joint = %g learns them, on the CPU", JOINT_OF_THIN,
+            )  # fmt: skip
         settings = replace(settings, joint=JOINT_OF_THIN if thin and work.backend is CPU else 0.0)
     own, count = shown if thin else None, len(surfels.gaussians)
     told = lambda at: work.on_progress(Progress("materials", 0.7 + 0.3 * at.part, count, at.psnr))  # noqa: E731

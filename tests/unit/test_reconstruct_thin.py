@@ -117,7 +117,9 @@ def test_a_card_does_not_learn_surfels_with_materials_and_says_so(monkeypatch, c
         learn = getattr(pipeline, name)
         monkeypatch.setattr(pipeline, name, lambda *given, name=name, learn=learn: used.append(name) or learn(*given))
     monkeypatch.setattr(pipeline, "select_backend", lambda _: LearningBackend())
+    caplog.set_level("INFO", "drgs_blender")
     for joint in (None, 0.5):
         reconstruct(balls(), replace(QUICK, decoupling=replace(QUICK.decoupling, joint=joint)))
     assert used == ["decouple", "decouple_jointly"]
+    assert "decoupling.joint = 0.5 learns them, on the CPU" in caplog.text
     assert "decoupling.joint: surfels, materials and light are learned on the CPU" in caplog.text
