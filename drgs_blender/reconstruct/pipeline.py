@@ -55,8 +55,6 @@ SURFEL_TIME_FRACTION, MESH_SURFEL_TIME_FRACTION = 0.45, 0.15
 MATERIAL_TIME_FRACTION = 0.35
 #: Voxels where none are asked for and each face gets a surfel, or time decides.
 FEW_VOXELS = 256
-#: Last part of the steps of materials in which the surfels of thin objects are learned, too.
-JOINT_OF_THIN = 0.5
 #: Fewer steps of materials than this separate them poorly from the light.
 FEW_STEPS = 300
 #: Phase -> the settings that decide its result.
@@ -310,8 +308,6 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, thin: bool, rep
         start = with_surfel_normals(mesh, work.capture.training, shown)
     if (seconds := work.seconds(MATERIAL_TIME_FRACTION)) is not None:
         settings = replace(settings, seconds=seconds)
-    if settings.joint is None:
-        settings = replace(settings, joint=JOINT_OF_THIN if thin and work.backend is CPU else 0.0)
     own, count = shown if thin else None, len(surfels.gaussians)
     told = lambda at: work.on_progress(Progress("materials", 0.7 + 0.3 * at.part, count, at.psnr))  # noqa: E731
     rest = told, work.cancelled, work.file("materials")

@@ -14,7 +14,10 @@ pytest.importorskip("skimage")
 
 from drgs_blender.core.errors import Cancelled  # noqa: E402
 from drgs_blender.geometry.normals import unit  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.joint import LearnedSurfels, decouple_jointly  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering import joint  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.joint import JointJob, LearnedSurfels, decouple_jointly  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.materials import levels  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.regularisers import fineness  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.run import Decoupled, decouple  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
 from drgs_blender.reconstruct.model.gaussians import Gaussians  # noqa: E402
@@ -41,6 +44,10 @@ def surfels(mesh) -> LearnedSurfels:
     points = mesh.vertices.astype(np.float64)
     gaussians = Gaussians.on_surface(points, unit(points), np.full(points.shape, 0.5), 0.04)
     return LearnedSurfels(gaussians, Schedule(), 1.0, lambda _: (mesh, {}))
+
+
+def job_of(capture, mesh, settings: Settings) -> JointJob:
+    return JointJob(capture, mesh, surfels(mesh), settings, None, None, None, lambda: 0.0)
 
 
 def arrays(found: Decoupled) -> list[np.ndarray]:
@@ -112,6 +119,92 @@ def test_an_interrupted_run_ends_where_an_undisturbed_one_does(mesh, capture, tm
     resumed = decouple_jointly(capture, mesh, surfels(mesh), settings, checkpoint=path)
     for a, b in zip(arrays(whole), arrays(resumed), strict=True):
         assert np.array_equal(a, b)
+
+
+def test_materials_of_surfels_begin_with_steps_as_long_as_any(mesh, capture):
+    """Adam steps by the rate where gradients stay, by twice that where it forgets that moments began at 0."""
+    settings = replace(SMALL, iterations=240, joint=0.5)
+    job = job_of(capture, mesh, settings)
+    job.schedule.iteration = job._adam.steps = 120
+    job._begin()
+    learned, rates = job._learned(), job.schedule.rates(0.5, job._learned())
+    before = {name: tensor.clone() for name, tensor in learned.items()}
+    for _ in range(20):
+        for tensor in learned.values():
+            tensor.grad = torch.ones_like(tensor)
+        job._descend(learned, rates)
+    for name in ("detail", "grid0"):
+        assert (before[name] - learned[name]).numpy() == pytest.approx(20 * rates[name], rel=0.01)
+    assert job._adam.steps == 140 and job._adam.first.keys() == {"light"}
+
+
+def test_close_surfels_have_as_fine_grids_as_close_vertices(mesh, capture, monkeypatch):
+    monkeypatch.setattr(joint, "fineness", lambda *_: 4.0)
+    job = job_of(capture, mesh, SMALL)
+    job._begin()
+    assert sum(name.startswith("grid") for name in job._own.parameters) == levels(SMALL.coarse, 4.0) == 3
+
+
+def test_surfels_without_neighbours_count_as_far_apart():
+    assert fineness(np.zeros((3, 3)), np.zeros((0, 2), np.int64)) == 1.0
+
+
+def test_pixels_beside_the_cut_photographs_are_left_out(capture):
+    """Silhouettes told from a background may lack what the mesh has: such pixels were read from the other side."""
+    vertices, faces = sphere_mesh(3)
+    large = plain_mesh((0.95 * vertices).astype(np.float32), faces)
+    views = [replace(view, mask=None, colour=shrunk(view.colour)) for view in capture.views]
+    plain = replace(capture, views=views, background=(0.0, 0.0, 0.0))
+    job = job_of(plain, large, replace(SMALL, joint=1.0))
+    all_of_them = len(job._pixels)
+    job.step()
+    assert 0 < len(job._pixels) < all_of_them
+    y, x = job._places(job._pixels)
+    for k, target in enumerate(job._targets):
+        mine = job._pixels.view == k
+        assert mine.sum() == job._first[k + 1] - job._first[k]
+        assert (y[mine] >= 0).all() and (y[mine] < target.camera.height).all()
+        assert (x[mine] >= 0).all() and (x[mine] < target.camera.width).all()
+        rows, columns = np.divmod(job._pixels.place[mine], plain.training[k].camera.width)
+        found = target.colour.numpy()[y[mine], x[mine]]
+        assert np.array_equal(found, plain.training[k].colour[rows, columns])
+
+
+def shrunk(colour: np.ndarray) -> np.ndarray:
+    """The middle of a picture alone, off which the rest is black."""
+    found, (height, width) = np.zeros_like(colour), colour.shape[:2]
+    middle = slice(height * 5 // 12, height * 7 // 12), slice(width * 5 // 12, width * 7 // 12)
+    found[middle] = 0.5 + 0.5 * colour[middle]
+    return found
+
+
+def test_materials_are_carried_by_parts_of_the_photographs(mesh, capture, monkeypatch):
+    """The same as from whole ones, fewer pixels."""
+    job = job_of(capture, mesh, SMALL)
+    job._begin()
+    gaussians, drawn = job.learner.gaussians, []
+    render = Gaussians.render
+    monkeypatch.setattr(Gaussians, "render", lambda self, camera, *rest, **named: (
+        drawn.append(camera.width * camera.height) or render(self, camera, *rest, **named)))  # fmt: skip
+    with torch.no_grad():
+        parts = job._carried(mesh, gaussians)
+        fewer = sum(drawn)
+        monkeypatch.setattr(joint, "cropped_views", lambda views, _: views)
+        whole = job._carried(mesh, gaussians)
+    assert fewer < 0.6 * (sum(drawn) - fewer)
+    for a, b in zip(parts, whole, strict=True):
+        assert a == pytest.approx(b, abs=1e-4)
+
+
+def test_photographs_are_cut_when_surfels_are_learned(mesh, capture, monkeypatch):
+    made = []
+    monkeypatch.setattr(joint, "targets", lambda given, known=joint.targets: made.append(0) or known(given))
+    job = job_of(capture, mesh, SMALL)
+    for _ in range(4):
+        job.step()
+    assert not made
+    job.step()
+    assert made
 
 
 def test_surfels_on_the_mesh_are_not_learned_again():

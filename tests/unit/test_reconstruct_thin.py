@@ -87,8 +87,8 @@ def test_surfels_of_thin_things_are_shaded_by_their_own_normals(thin, monkeypatc
     assert (np.quantile(cosine, 0.02) > 0.999) == thin
 
 
-@pytest.mark.parametrize("thin", [True, False])
-def test_surfels_of_thin_things_are_learned_with_materials_of_their_own(thin, monkeypatch):
+@pytest.mark.parametrize("asked", [True, False])
+def test_surfels_of_thin_things_are_learned_with_materials_of_their_own_where_asked_for(asked, monkeypatch):
     together, shapes = pipeline.decouple_jointly, []
 
     def learn(*given):
@@ -96,11 +96,12 @@ def test_surfels_of_thin_things_are_learned_with_materials_of_their_own(thin, mo
         shapes.append(found.shape)
         return found
 
-    monkeypatch.setattr(pipeline, "is_thin", lambda *_: thin)
+    monkeypatch.setattr(pipeline, "is_thin", lambda *_: True)
     monkeypatch.setattr(pipeline, "decouple_jointly", learn)
-    asset = reconstruct(balls(), QUICK)
-    assert len(shapes) == thin
-    if thin:
+    settings = replace(QUICK, decoupling=replace(QUICK.decoupling, joint=0.5)) if asked else QUICK
+    asset = reconstruct(balls(), settings)
+    assert len(shapes) == asked
+    if asked:
         [shape] = shapes
         visible = shape.gaussians.opacities().detach().numpy() >= pipeline.UNSEEN
         assert np.array_equal(asset.surfels.roughness, shape.roughness[visible])
@@ -117,7 +118,7 @@ def test_a_card_does_not_learn_surfels_with_materials_and_says_so(monkeypatch, c
         learn = getattr(pipeline, name)
         monkeypatch.setattr(pipeline, name, lambda *given, name=name, learn=learn: used.append(name) or learn(*given))
     monkeypatch.setattr(pipeline, "select_backend", lambda _: LearningBackend())
-    for joint in (None, 0.5):
+    for joint in (0.0, 0.5):
         reconstruct(balls(), replace(QUICK, decoupling=replace(QUICK.decoupling, joint=joint)))
     assert used == ["decouple", "decouple_jointly"]
     assert "decoupling.joint: surfels, materials and light are learned on the CPU" in caplog.text

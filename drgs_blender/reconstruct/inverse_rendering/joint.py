@@ -8,6 +8,7 @@ surfels are lit as the mesh was before, and that loss moves surfels, materials a
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from ...core.asset.model import Mesh
 from ...core.color import srgb_to_linear
+from ...core.errors import UsageError
 from ...deform.binding import bind, clamp_weights
 from ...render.gbuffer.surfels import ALIKE
 from ...render.reference.brdf import dot, normalise
@@ -28,6 +30,7 @@ from ...render.scene.triangle_bvh import TriangleBVH
 from ..backend import CPU
 from ..capture.capture import Capture
 from ..capture.training_views import background_of, targets
+from ..meshing.crops import cropped_views
 from ..meshing.surfel_normals import with_surfel_normals
 from ..model.gaussians import SH0, Gaussians, RenderedView
 from ..model.thin_structures import normals_of
@@ -36,7 +39,7 @@ from ..optim.learner import Learner
 from ..optim.schedule import Schedule as SurfelSchedule
 from .blend import blend
 from .likeness import LikePoints
-from .materials import Materials
+from .materials import Materials, levels
 from .pixels import Normals, Pixels, pixels_of
 from .radiance_cache import filled
 from .regularisers import Regularisers, fineness
@@ -45,6 +48,7 @@ from .settings import Settings
 from .surface import Pairs, SurfaceSamples
 
 Array = np.ndarray
+log = logging.getLogger(__name__)
 
 #: Neighbours of a surfel along which its materials are smooth, and the least cosine between their planes.
 _NEIGHBOURS, _COPLANAR = 6, 0.5
@@ -130,16 +134,13 @@ class JointJob(Job):
         #: Materials of the surfels, once they are learned.
         self._own: Materials | None = None
         super().__init__(capture, mesh, settings, checkpoint, CPU, normals, start, now)
-        self._fused, self._targets = surfels.fused, targets(capture)[0]
+        self._fused = surfels.fused
         background = torch.tensor(background_of(capture), dtype=torch.float32)
         self.learner = Learner(surfels.gaussians, surfels.schedule, surfels.radius, background, CPU)
-        #: Where the pixels of each view begin, and the views that have any.
-        self._first = np.searchsorted(self._pixels.view, np.arange(len(capture.training) + 1))
-        self._views = np.flatnonzero(np.diff(self._first))
 
     def step(self) -> None:
         """One step of the optimiser."""
-        if self._own is None and self.schedule.part >= 1 - (self._settings.joint or 0.0):
+        if self._own is None and self.schedule.part >= 1 - self._settings.joint:
             self._begin()
         super().step()
 
@@ -148,7 +149,9 @@ class JointJob(Job):
         gaussians, settings = self.learner.gaussians, self._settings
         surfels = gaussians.surfels()
         assert surfels.sh is not None
-        own = Materials(surfels.centre, settings.parametrisation, settings.coarse)
+        edges = _neighbours(surfels.centre, gaussians.frames()[2])
+        finer = fineness(surfels.centre, edges)
+        own = Materials(surfels.centre, settings.parametrisation, levels(settings.coarse, finer))
         binding, _ = bind(self._mesh, surfels)
         with torch.no_grad():
             known = self.surface.materials.at(torch.arange(len(self._mesh.vertices)))
@@ -158,14 +161,50 @@ class JointJob(Job):
             if self._shown is not None:
                 shown = blend(torch.from_numpy(self._shown), corners, shares).numpy()
                 self._like = LikePoints(shown, surfels.centre, settings.seed)
-        edges = _neighbours(surfels.centre, gaussians.frames()[2])
         colours = srgb_to_linear(np.clip(0.5 + SH0 * surfels.sh[:, 0], 0, 1))
-        self._regularisers = Regularisers(edges, colours, settings, fineness(surfels.centre, edges))
-        before, self._own = self._adam, own
-        self._adam = Adam(self._learned())
-        self._adam.steps = before.steps
-        for moments, known in ((self._adam.first, before.first), (self._adam.second, before.second)):
-            moments |= {name: known[name] for name in moments if name in known and name in _SHARED}
+        self._regularisers = Regularisers(edges, colours, settings, finer)
+        # Light and exposures go on; moments that begin at 0 need a count of steps that does, too.
+        self._own, self._adam_of_own = own, Adam(own.parameters)
+        for moments in (self._adam.first, self._adam.second):
+            for name in self.surface.parameters:
+                del moments[name]
+        self._keep_views()
+
+    def _keep_views(self) -> None:
+        """Photographs as stage (i) cuts them, and the pixels within."""
+        views, self._targets = self._capture.training, targets(self._capture)[0]
+        y, x = self._places(self._pixels)
+        sizes = np.array([(target.camera.width, target.camera.height) for target in self._targets])
+        width, height = sizes[self._pixels.view].T
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        if not inside.any():
+            problem = "has no pixel of the surface where its masks show the object"
+            raise UsageError(str(self._capture.source), problem, "Check the masks, or set decoupling.joint to 0")
+        if not inside.all():
+            log.info("joint learning: %d of %d pixels are beside the cut photographs", (~inside).sum(), len(inside))
+            self._pixels = self._pixels.select(np.flatnonzero(inside))
+        #: Where the pixels of each view begin, and the views that have any.
+        self._first = np.searchsorted(self._pixels.view, np.arange(len(views) + 1))
+        self._views = np.flatnonzero(np.diff(self._first))
+
+    def _places(self, pixels: Pixels) -> tuple[Array, Array]:
+        """Rows and columns (m,) of pixels in the photographs as they are cut."""
+        cameras = [view.camera for view in self._capture.training]
+        cut = [target.camera for target in self._targets]
+        left = np.array([round(a.cx - b.cx) for a, b in zip(cameras, cut, strict=True)])
+        top = np.array([round(a.cy - b.cy) for a, b in zip(cameras, cut, strict=True)])
+        y, x = np.divmod(pixels.place.astype(np.int64), np.array([camera.width for camera in cameras])[pixels.view])
+        return y - top[pixels.view], x - left[pixels.view]
+
+    def _descend(self, learned: dict[str, Tensor], rates: dict[str, float | Array]) -> None:
+        if self._own is None:
+            return super()._descend(learned, rates)
+        own = self._own.parameters
+        self._adam_of_own.step(own, rates)
+        self._adam.step({name: value for name, value in learned.items() if name not in own}, rates)
+
+    def _optimisers(self) -> list[Adam]:
+        return super()._optimisers() + ([] if self._own is None else [self._adam_of_own])
 
     def _learned(self) -> dict[str, Tensor]:
         known = super()._learned()
@@ -191,7 +230,7 @@ class JointJob(Job):
         columns, ends = self._columns(), torch.from_numpy(self._regularisers.edges(edge))
 
         def lit(rendered: RenderedView) -> Tensor:
-            materials, normal = self._seen(rendered, k, pixels)
+            materials, normal = self._seen(rendered, pixels)
             return self._loss(SurfaceSamples(materials, normal, columns, None, ends, pairs), pixels, key, edge)
 
         part = _LATE + (1 - _LATE) * min(self.schedule.part, 1.0)
@@ -202,11 +241,9 @@ class JointJob(Job):
         assert self._own is not None
         return self._own.at(torch.arange(len(self.learner.gaussians)))
 
-    def _seen(self, rendered: RenderedView, k: int, pixels: Pixels) -> tuple[Tensor, Tensor]:
-        """Blended materials (m, c) and unit normals (m, 3) of pixels of view `k`."""
-        whole, cut = self._capture.training[k].camera, self._targets[k].camera
-        y, x = (torch.from_numpy(at) for at in np.divmod(pixels.place.astype(np.int64), whole.width))
-        y, x = y - round(whole.cy - cut.cy), x - round(whole.cx - cut.cx)
+    def _seen(self, rendered: RenderedView, pixels: Pixels) -> tuple[Tensor, Tensor]:
+        """Blended materials (m, c) and unit normals (m, 3) of pixels of the view that is rendered."""
+        y, x = (torch.from_numpy(at) for at in self._places(pixels))
         assert rendered.materials is not None
         alpha, normal = rendered.maps.alpha[y, x][:, None], rendered.normal[y, x]
         materials = (rendered.materials[y, x] / alpha.clamp(min=_LEAST)).clamp(0, 1)
@@ -237,7 +274,7 @@ class JointJob(Job):
         tree.build(mesh.vertices, mesh.faces)
         columns = self._columns()
         total = np.zeros((len(mesh.vertices), columns.shape[1] + 1))
-        for k, view in enumerate(self._capture.training):
+        for k, view in enumerate(cropped_views(self._capture.training, mesh.vertices)):
             pixels = pixels_of(k, view, mesh, tree)
             shown = gaussians.render(view.camera, torch.zeros(3), 0, reflections=False, materials=columns)
             assert shown.materials is not None
@@ -263,7 +300,8 @@ class JointJob(Job):
             self._begin()
             self.learner.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
             iteration, self.learner.error = (float(x) for x in state["surfels.numbers"])
-            self.learner.iteration = int(iteration)
+            # Both were made for the first of these steps.
+            self.learner.iteration = self._adam_of_own.steps = int(iteration)
         super()._restore(state)
 
 

@@ -6,6 +6,8 @@ vertices keep the detail. The grids are interpolated linearly, so that they have
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -25,6 +27,11 @@ _GREY, _WITHIN = np.ones(3), (0.05, 0.9)
 _DIELECTRIC = 0.04
 #: Given values are kept this far from 0 and 1, where logits have no end.
 _MARGIN = 0.005
+
+
+def levels(coarse: int, finer: float) -> int:
+    """Number of grids of points `finer` times as close (`regularisers.fineness`) as those that have `coarse`."""
+    return coarse and coarse + round(math.log2(finer))
 
 
 class Grids:

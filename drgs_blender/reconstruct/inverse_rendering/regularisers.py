@@ -109,6 +109,8 @@ def fineness(points: Array, edges: Array) -> float:
 
     Along shorter edges the same materials differ less, and a vertex is seen by fewer pixels.
     """
+    if not len(edges):
+        return 1.0
     ends = points[edges]
     edge = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
     return min(max(EDGE * float(np.ptp(points, axis=0).max()) / max(edge, 1e-30), 1.0), FINEST)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
@@ -27,6 +26,7 @@ from ..optim.adam import Adam
 from .lighting import Lighting
 from .likeness import LikePoints, features
 from .losses import log_loss, unbiased_loss
+from .materials import levels
 from .pixels import Normals, Pixels, foreground_pixels
 from .radiance_cache import edges_of, filled, radiance_cache
 from .regularisers import Regularisers, fineness
@@ -220,8 +220,8 @@ class Job:
         mean = self._pixels.colour.mean(axis=0)
         self.lighting = Lighting(gatherer, settings, 2.5 * float(mean.mean()))
         finer = fineness(mesh.vertices, mesh.faces[:, :2])
-        grids = settings.coarse and settings.coarse + round(math.log2(finer))
-        self.surface = Surface(mesh, replace(settings, coarse=grids), mean, normals is not None, start)
+        grids = replace(settings, coarse=levels(settings.coarse, finer))
+        self.surface = Surface(mesh, grids, mean, normals is not None, start)
         #: What photographs show of the vertices, where it is wanted.
         self._shown: Array | None = None
         self._like: LikePoints | None = None
@@ -260,10 +260,17 @@ class Job:
             tensor.requires_grad_(False)
             if tensor.grad is not None:
                 tensor.grad.nan_to_num_(0.0, 0.0, 0.0)
-        self._adam.step(learned, self.schedule.rates(part, learned))
+        self._descend(learned, self.schedule.rates(part, learned))
         self.schedule.iteration += 1
         if self.checkpoint.is_due():
             self.save()
+
+    def _descend(self, learned: dict[str, Tensor], rates: dict[str, float | Array]) -> None:
+        self._adam.step(learned, rates)
+
+    def _optimisers(self) -> list[Adam]:
+        """All that hold moments; no two of the same name."""
+        return [self._adam]
 
     def _prepare_light(self, part: float) -> None:
         """Let the environment grow, and aim at what is bright in it, when it is time."""
@@ -349,8 +356,9 @@ class Job:
     def _state(self) -> dict[str, Array]:
         """All that `_restore` needs."""
         state = {f"value/{name}": tensor.numpy() for name, tensor in self._learned().items()}
-        for order, moments in (("first", self._adam.first), ("second", self._adam.second)):
-            state |= {f"{order}/{name}": value.numpy() for name, value in moments.items()}
+        for adam in self._optimisers():
+            for order, moments in (("first", adam.first), ("second", adam.second)):
+                state |= {f"{order}/{name}": value.numpy() for name, value in moments.items()}
         state["aimed"] = self.lighting.aimed
         schedule, score = self.schedule, self.score
         state["numbers"] = np.array([schedule.iteration, schedule.elapsed, score.loss, score.error])
@@ -360,9 +368,10 @@ class Job:
         self.lighting.learned.log = torch.from_numpy(state["value/light"].copy())
         for name, tensor in self._learned().items():
             tensor.copy_(torch.from_numpy(state[f"value/{name}"].copy()))
-        for order, moments in (("first", self._adam.first), ("second", self._adam.second)):
-            for name in moments:
-                moments[name] = torch.from_numpy(state[f"{order}/{name}"].copy())
+        for adam in self._optimisers():
+            for order, moments in (("first", adam.first), ("second", adam.second)):
+                for name in moments:
+                    moments[name] = torch.from_numpy(state[f"{order}/{name}"].copy())
         self.lighting.aim(state["aimed"])
         iteration, spent, self.score.loss, self.score.error = (float(x) for x in state["numbers"])
         self._adam.steps = int(iteration)
