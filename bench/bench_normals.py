@@ -156,7 +156,7 @@ def crease_distance(true: np.ndarray) -> np.ndarray:
 
 
 def blurred_normals(truth: Truth, camera: Camera, deviation: float) -> np.ndarray:
-    """Unit normals (h, w, 3) of the true mesh, blurred by a Gaussian of so many pixels."""
+    """Unit normals (h, w, 3) of the true mesh, blurred by a Gaussian that many pixels wide."""
     size = {"width": camera.width * FINER, "height": camera.height * FINER}
     lens = {name: getattr(camera, name) * FINER for name in ("fx", "fy", "cx", "cy")}
     depth, normal = truth.maps(replace(camera, **size, **lens))

@@ -18,6 +18,7 @@ from ..core.arrays import Array
 from ..core.errors import AssetError, Cancelled, UsageError
 from ..geometry.normals import unit
 from ..reconstruct.capture.capture import Capture, View
+from ..reconstruct.meshing.crops import box_of
 from ..reconstruct.meshing.visual_hull import Region, find_region, silhouettes, world_to_pixel
 from .features import Tell
 from .picture_model import IMAGENET, PictureModel, Preparation
@@ -52,10 +53,8 @@ class NormalModel(PictureModel):
 
     Raises
     ------
-    AssetError
-        The file is no such model.
-    DeviceError
-        ONNX Runtime is not installed.
+    AssetError, DeviceError
+        As of `PictureModel`.
     UsageError
         There is no such file.
     """
@@ -64,7 +63,7 @@ class NormalModel(PictureModel):
         if not Path(given).is_file():
             raise UsageError("normals", f"is {given!r}: no such file", "Give a model of normals in ONNX format")
         super().__init__(Path(given), KNOWN, "normal")
-        self._shown(self.run(np.full((8, 8, 3), 128, np.uint8), "a grey picture"))  # what gives no normals is told now
+        self._shown(self.run(np.full((8, 8, 3), 128, np.uint8), "a grey picture"))  # what gives no normals fails now
 
     def __call__(self, view: View, mask: Array) -> Array:
         """(h, w, 3) float32 unit normals of a view's pixels in the model's axes; 0 outside of the mask (h, w).
@@ -109,9 +108,8 @@ class NormalModel(PictureModel):
 def _window(mask: Array, width: int, height: int, aspect: float) -> tuple[int, int, int, int]:
     """Pixels (x0, y0, x1, y1) around the object in the aspect, all where it is not to be seen; may reach beyond."""
     low, high = np.zeros(2), np.array([width, height], float)
-    if (shown := mask > 0.5).any():
-        columns, rows = np.flatnonzero(shown.any(0)), np.flatnonzero(shown.any(1))
-        low, high = np.array([columns[0], rows[0]], float), np.array([columns[-1] + 1, rows[-1] + 1], float)
+    if (box := box_of(mask > 0.5)) is not None:
+        low, high = np.array(box[:2], float), np.array(box[2:], float)
         margin = MARGIN * (high - low).max()
         low, high = low - margin, high + margin
     side = max((high - low)[1], (high - low)[0] / aspect)

@@ -29,6 +29,7 @@ from .capture.training_views import background_of, composed
 from .gpu.select_backend import select_backend
 from .inverse_rendering.joint import LearnedSurfels, decouple_jointly
 from .inverse_rendering.run import Decoupled, decouple
+from .inverse_rendering.run import Progress as MaterialProgress
 from .jit_warmup import warm_up
 from .losses.photometric import Photograph, structural_similarity
 from .meshing.depth_fusion import MOST, fuse, grid, voxels_that_fit
@@ -309,8 +310,11 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, thin: bool, rep
     if (seconds := work.seconds(MATERIAL_TIME_FRACTION)) is not None:
         settings = replace(settings, seconds=seconds)
     own, count = shown if thin else None, len(surfels.gaussians)
-    told = lambda at: work.on_progress(Progress("materials", 0.7 + 0.3 * at.part, count, at.psnr))  # noqa: E731
-    rest = told, work.cancelled, work.file("materials")
+
+    def tell(at: MaterialProgress) -> None:
+        work.on_progress(Progress("materials", 0.7 + 0.3 * at.part, count, at.psnr))
+
+    rest = tell, work.cancelled, work.file("materials")
     if settings.joint and work.settings.variant == "p":
         if work.backend is not CPU:
             log.warning("decoupling.joint: surfels, materials and light are learned on the CPU, not on the card")

@@ -198,7 +198,7 @@ def test_materials_are_carried_by_parts_of_the_photographs(mesh, capture, monkey
 
 def test_photographs_are_cut_when_surfels_are_learned(mesh, capture, monkeypatch):
     made = []
-    monkeypatch.setattr(joint, "targets", lambda given, known=joint.targets: made.append(0) or known(given))
+    monkeypatch.setattr(joint, "full_targets", lambda given, known=joint.full_targets: made.append(0) or known(given))
     job = job_of(capture, mesh, SMALL)
     for _ in range(4):
         job.step()

@@ -114,13 +114,16 @@ def test_starts_are_judged_by_the_views_that_neither_saw():
     capture = balls(24, 24)
     training = Training(capture, find_region(capture), replace(QUICK, surfels=200))
     expected = training.learner.error_of(training.views.held_out())
-    half = training.views.half
+    views = training.targets
     seen = [
-        k for k in range(len(half)) if k % initialisation_trial.HOLDOUT_EVERY != initialisation_trial.HOLDOUT_EVERY // 2
+        k
+        for k in range(len(views))
+        if k % initialisation_trial.HOLDOUT_EVERY != initialisation_trial.HOLDOUT_EVERY // 2
     ]
     for k in seen:
-        half[k] = None
-    assert training.learner.error_of(training.views.held_out()) == expected and len(half) - len(seen) == 3
+        views[k] = None
+    training.views._halves.clear()  # made anew of those that are left
+    assert training.learner.error_of(training.views.held_out()) == expected and len(views) - len(seen) == 3
 
 
 def test_the_clock_does_not_favour_the_start_that_came_second(monkeypatch):
@@ -180,13 +183,12 @@ def test_held_out_views_are_learned_from_after_the_trial(monkeypatch):
     monkeypatch.setattr(Views, "of_step", noted)
     while not training.finished:
         training.step()
-    full, half = training.targets
     kept = {
         id(view)
-        for k, view in enumerate(half)
+        for k, view in enumerate(training.targets)
         if k % initialisation_trial.HOLDOUT_EVERY == initialisation_trial.HOLDOUT_EVERY // 2
     }
-    assert kept and not kept & during and {id(view) for view in full} <= after
+    assert kept and not kept & during and {id(view) for view in training.targets} <= after
 
 
 def wired(view, across: float, samples: int = 5) -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,6 @@ import torch
 from ...core.arrays import Array
 from ...core.errors import Cancelled
 from ...reconstruct.capture.capture import Capture, View
-from ...reconstruct.capture.training_views import half_size
 from ...reconstruct.meshing.visual_hull import Region, colours_of
 from ...reconstruct.model.gaussians import Gaussians
 from ...reconstruct.optim.schedule import Schedule
@@ -90,9 +89,8 @@ def learn_scene(cv2: Any, views: Sequence[MaskView], box: ObjectBox, effort: Eff
     # by steps alone: the time they take would make masks differ from run to run
     training = Training(Capture(Path("photographs"), shown), region, schedule, first_surfels(shown, box, earlier))
     ground = GroundPicture(cv2, straight, box)
-    for view, full, half in zip(straight, *training.targets, strict=True):
-        behind = ground.without_object(view, box.outline(cv2, view), near_ground(box))
-        full.background, half.background = torch.from_numpy(behind), torch.from_numpy(half_size(behind))
+    for view, target in zip(straight, training.targets, strict=True):
+        target.background = torch.from_numpy(ground.without_object(view, box.outline(cv2, view), near_ground(box)))
     while not training.finished:
         if cancelled():
             raise Cancelled

@@ -85,10 +85,8 @@ class SegmentationModel(PictureModel):
 
     Raises
     ------
-    AssetError
-        The file is no such model.
-    DeviceError
-        ONNX Runtime is not installed.
+    AssetError, DeviceError
+        As of `PictureModel`.
     UsageError
         There is no such file.
     """

@@ -18,6 +18,7 @@ from ...core.errors import AssetError
 from ...core.frame import Camera
 from ...geometry.normals import unit
 from ..losses.photometric import Photograph
+from ..meshing.crops import box_of, cut
 from ..meshing.visual_hull import silhouettes
 from .capture import Capture, View
 
@@ -83,7 +84,13 @@ def composed(view: View, capture: Capture) -> Array:
 
 
 def targets(capture: Capture) -> list[list[Target]]:
-    """Training views in full and in half size: [full, half].
+    """Training views in full and in half size: [full, half]; errors as of `full_targets`."""
+    full = full_targets(capture)
+    return [full, [half_target(target) for target in full]]
+
+
+def full_targets(capture: Capture) -> list[Target]:
+    """Training views in full size.
 
     Raises
     ------
@@ -96,32 +103,41 @@ def targets(capture: Capture) -> list[list[Target]]:
     masks: list[Array | None] = [None for _ in views] if drawn is None else [*drawn]
     windows = [_window(view.camera, mask) for view, mask in zip(views, masks, strict=True)]
     keep = sum((x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in windows) <= MAX_CACHED_PIXELS
-    full, half = [], []
+    found = []
     for view, mask, (x0, y0, x1, y1) in zip(views, masks, windows, strict=True):
         whole = view.camera
-        camera = replace(whole, width=x1 - x0, height=y1 - y0, cx=whole.cx - x0, cy=whole.cy - y0)
+        camera = cut(whole, x0, y0, x1 - x0, y1 - y0)
         colour = composed(view, capture)[y0:y1, x0:x1]
         share = camera.width * camera.height / (whole.width * whole.height)
         if mask is not None:
             mask = np.ascontiguousarray(mask[y0:y1, x0:x1], np.float32)
         normals = None if view.normals is None else view.normals[y0:y1, x0:x1]
-        full.append(_target(camera, colour, mask, normals, keep, share))
-        smaller = None if mask is None else half_size(mask[..., None])[..., 0]
-        coarser = None if normals is None else unit(half_size(normals), (0, 0, 0))
-        half.append(_target(halved(camera), half_size(colour), smaller, coarser, keep, share))
-    return [full, half]
+        found.append(_target(camera, colour, mask, normals, keep, share))
+    return found
+
+
+def half_target(target: Target) -> Target:
+    """A view of `full_targets` in half size."""
+    photograph = target.photograph
+    assert isinstance(photograph, Photograph)
+    mask = None if target.mask is None else half_size(target.mask.numpy()[..., None])[..., 0]
+    normals = None if target.normals is None else unit(half_size(target.normals.numpy()), (0, 0, 0))
+    keep = photograph.kept is not None
+    made = _target(halved(target.camera), half_size(photograph.colour), mask, normals, keep, target.share)
+    if target.background is not None:
+        made.background = torch.from_numpy(half_size(target.background.numpy()))
+    return made
 
 
 def _window(camera: Camera, mask: Array | None) -> tuple[int, int, int, int]:
     """Pixels (x0, y0, x1, y1) around the object, all where it is not to be seen; halves of x0 and y0 are whole."""
     whole = (0, 0, camera.width, camera.height)
-    if mask is None or not (shown := mask > TRACE).any():
+    if mask is None or (box := box_of(mask > TRACE)) is None:
         return whole
-    rows, columns = np.flatnonzero(shown.any(1)), np.flatnonzero(shown.any(0))
-    margin = max(LEAST_MARGIN, math.ceil(MARGIN * max(np.ptp(rows), np.ptp(columns))))
-    x0, y0 = (max(int(at[0]) - margin, 0) // 2 * 2 for at in (columns, rows))
-    x1, y1 = (min(int(at[-1]) + 1 + margin, size) for at, size in ((columns, camera.width), (rows, camera.height)))
-    return x0, y0, x1, y1
+    x0, y0, x1, y1 = box
+    margin = max(LEAST_MARGIN, math.ceil(MARGIN * max(x1 - x0 - 1, y1 - y0 - 1)))
+    x0, y0 = (max(at - margin, 0) // 2 * 2 for at in (x0, y0))
+    return x0, y0, min(x1 + margin, camera.width), min(y1 + margin, camera.height)
 
 
 def _target(

@@ -29,8 +29,8 @@ from ...render.reference.brdf import dot, normalise
 from ...render.scene.triangle_bvh import TriangleBVH
 from ..backend import CPU
 from ..capture.capture import Capture
-from ..capture.training_views import background_of, targets
-from ..meshing.crops import cropped_views
+from ..capture.training_views import background_of, full_targets
+from ..meshing.crops import corner_of, cropped_views
 from ..meshing.surfel_normals import with_surfel_normals
 from ..model.gaussians import SH0, Gaussians, RenderedView
 from ..model.thin_structures import normals_of
@@ -172,7 +172,7 @@ class JointJob(Job):
 
     def _keep_views(self) -> None:
         """Photographs as stage (i) cuts them, and the pixels within."""
-        views, self._targets = self._capture.training, targets(self._capture)[0]
+        views, self._targets = self._capture.training, full_targets(self._capture)
         y, x = self._places(self._pixels)
         sizes = np.array([(target.camera.width, target.camera.height) for target in self._targets])
         width, height = sizes[self._pixels.view].T
@@ -191,8 +191,7 @@ class JointJob(Job):
         """Rows and columns (m,) of pixels in the photographs as they are cut."""
         cameras = [view.camera for view in self._capture.training]
         cut = [target.camera for target in self._targets]
-        left = np.array([round(a.cx - b.cx) for a, b in zip(cameras, cut, strict=True)])
-        top = np.array([round(a.cy - b.cy) for a, b in zip(cameras, cut, strict=True)])
+        left, top = np.array([corner_of(a, b) for a, b in zip(cut, cameras, strict=True)]).T
         y, x = np.divmod(pixels.place.astype(np.int64), np.array([camera.width for camera in cameras])[pixels.view])
         return y - top[pixels.view], x - left[pixels.view]
 
@@ -279,11 +278,7 @@ class JointJob(Job):
             shown = gaussians.render(view.camera, torch.zeros(3), 0, reflections=False, materials=columns)
             assert shown.materials is not None
             maps = torch.cat([shown.materials, shown.maps.alpha[..., None]], 2)
-            values = maps.flatten(0, 1).numpy()[pixels.place]
-            weight = pixels.corners * (pixels.flat * pixels.towards).sum(axis=1, keepdims=True)
-            corner = mesh.faces[pixels.face].ravel()
-            for c in range(total.shape[1]):
-                total[:, c] += np.bincount(corner, (weight * values[:, c, None]).ravel(), len(total))
+            total += pixels.onto_vertices(maps.flatten(0, 1).numpy()[pixels.place], mesh.faces, len(total))
         return (total[:, :-1] / np.maximum(total[:, -1:], 1e-9)).astype(np.float32), total[:, -1]
 
     def _state(self) -> dict[str, Array]:

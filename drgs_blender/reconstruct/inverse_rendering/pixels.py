@@ -77,6 +77,12 @@ class Pixels:
         """The pixels at `index`."""
         return Pixels(**{f.name: np.ascontiguousarray(getattr(self, f.name)[index]) for f in fields(self)})
 
+    def onto_vertices(self, values: Array, faces: Array, count: int) -> Array:
+        """Sums (count, c) at vertices of what the pixels show (n, c), by share and by how squarely they see it."""
+        weight = self.corners * (self.flat * self.towards).sum(axis=1, keepdims=True)
+        corner = faces[self.face].ravel()
+        return np.stack([np.bincount(corner, (weight * column[:, None]).ravel(), count) for column in values.T], 1)
+
 
 def foreground_pixels(
     views: list[View], mesh: Mesh, tree: TriangleBVH, most: int, seed: int = 0, normals: Normals | None = None

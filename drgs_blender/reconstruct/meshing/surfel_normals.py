@@ -41,11 +41,7 @@ def with_surfel_normals(mesh: Mesh, views: list[View], normals: Normals) -> Arra
     total = np.zeros((len(own), 3))
     for index, view in enumerate(cropped_views(views, mesh.vertices)):
         pixels = pixels_of(index, view, mesh, tree, normals)
-        weight = pixels.corners * (pixels.flat * pixels.towards).sum(axis=1, keepdims=True)
-        corner = mesh.faces[pixels.face].ravel()
-        for axis in range(3):
-            values = (weight * pixels.detail_normal[:, axis, None]).ravel()
-            total[:, axis] += np.bincount(corner, values, len(own))
+        total += pixels.onto_vertices(pixels.detail_normal, mesh.faces, len(own))
     shown = unit(total, (0, 0, 0))
     alike = (shown * own).sum(axis=1, keepdims=True) > ALIKE
     return unit(own + np.where(alike, shown, 0)).astype(np.float32)

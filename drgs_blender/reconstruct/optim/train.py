@@ -17,7 +17,7 @@ from ...core.arrays import Array
 from ..backend import CPU, LearningBackend
 from ..capture.capture import Capture
 from ..capture.neighbours import neighbours
-from ..capture.training_views import background_of, targets
+from ..capture.training_views import background_of, full_targets
 from ..meshing.visual_hull import Region
 from ..model.gaussians import Gaussians
 from ..model.initialisation import inside_hull, on_hull, surfel_limit
@@ -57,8 +57,8 @@ class Training:
     schedule : Schedule
     surfels : int
         Their largest number, of the schedule and the photographs.
-    targets : list of list of Target
-        Training views in full and in half size.
+    targets : list of Target
+        Training views in full size.
     time_budget : TimeBudget
     trial : Trial
         Of the starts.
@@ -80,9 +80,9 @@ class Training:
         backend: LearningBackend = CPU,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.region, self.targets, self._background = region, targets(capture), background_of(capture)
+        self.region, self.targets, self._background = region, full_targets(capture), background_of(capture)
         self.schedule = schedule
-        self.surfels = surfel_limit(self.targets[0], schedule.surfels, seconds)
+        self.surfels = surfel_limit(self.targets, schedule.surfels, seconds)
         if schedule.patches:
             self._near = neighbours(capture.training, region.centre)
         rival = None
