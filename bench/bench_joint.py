@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from bench_evaluate import mean, score, under_other_lights
-from bench_normals import FOLDER, learned
+from bench_evaluate import mean, score
+from bench_normals import FOLDER, figures, learned, same_surfels
 from report import processor_seconds, store_row, table, write_section
 
 from drgs_blender.cli.evaluate import session_renderer
@@ -53,30 +53,17 @@ COLUMNS = (
 
 def ways(capture: Capture, folder: Path, truth: Truth, name: str, options: argparse.Namespace) -> None:
     """Measure and write the ways of stage (ii)."""
-    learned(capture, name)
-    learn, rows = pipeline._Work.learn, {}
+    gaussians, rows = learned(capture, name), {}
     for way in options.ways:
         label, joint = WAYS[way]
         settings = Settings()
         settings = replace(settings, decoupling=replace(settings.decoupling, iterations=options.steps, joint=joint))
-        pipeline._Work.learn = lambda *_: learned(capture, name)  # type: ignore[method-assign]
         begun = processor_seconds()
-        try:
+        with same_surfels(gaussians):
             asset = pipeline.reconstruct(capture, settings)
-        finally:
-            pipeline._Work.learn = learn  # type: ignore[method-assign]
         spent, path = processor_seconds() - begun, FOLDER / f"{name}-{way}.drgs"
         write_asset(path, asset)
-        report = score(path, folder, "surfels", options.samples, truth)
-        materials = report["materials"]
-        row = [
-            f"{report['geometry']['normal_degrees']:.2f}",
-            f"{mean(under_other_lights(report, False), 'scaled', 'foreground'):.2f}",
-            f"{report['novel']['psnr_foreground']:.2f}",
-            f"{materials['albedo_psnr_scaled']:.2f}",
-            f"{materials['roughness_rmse']:.3f} / {materials['metallic_rmse']:.3f}",
-            f"{spent:.0f}",
-        ]
+        row = figures(score(path, folder, "surfels", options.samples, truth), spent)
         rows = store_row(FOLDER / "joint.json", f"{name}|{label}", row)
         print(name, label, *row, flush=True)
     body = (

@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from bench_evaluate import mean, score, under_other_lights
-from bench_normals import FOLDER, learned
+from bench_evaluate import score
+from bench_normals import FOLDER, figures, learned, same_surfels
 from report import processor_seconds, store_row, table, write_section
 
 from drgs_blender.core.asset.container import write_asset
@@ -27,7 +27,6 @@ from drgs_blender.evaluate.truth import Truth, read_truth
 from drgs_blender.reconstruct import pipeline
 from drgs_blender.reconstruct.capture.capture import Capture
 from drgs_blender.reconstruct.inverse_rendering.radiance_cache import edges_of
-from drgs_blender.reconstruct.model.gaussians import Gaussians
 from drgs_blender.reconstruct.readers import read_capture
 from drgs_blender.reconstruct.settings import Settings
 
@@ -61,51 +60,30 @@ def cut_in_four(mesh: Mesh) -> Mesh:
     return replace(mesh, faces=np.concatenate([*corner, middle]).astype(mesh.faces.dtype), **channels)
 
 
-@contextmanager
-def same_surfels(gaussians: Gaussians, cut: bool = False) -> Iterator[None]:
-    """Let `pipeline.reconstruct` have these surfels in place of learning them.
-
-    Parameters
-    ----------
-    gaussians : Gaussians
-    cut : bool
-        Cut each face of the mesh in four.
-    """
-    names = "mesh_of", "held_out_metrics", "Training"
-    kept, learn = {name: getattr(pipeline, name) for name in names}, pipeline._Work.learn
-
-    def mesh_of(*given: Any, **named: Any) -> Any:
-        mesh, report = kept["mesh_of"](*given, **named)
-        return cut_in_four(mesh) if cut else mesh, report
-
-    replaced = {"mesh_of": mesh_of, "held_out_metrics": lambda *_: {}, "Training": lambda *_, **__: None}
-    for name, value in replaced.items():
-        setattr(pipeline, name, value)
-    pipeline._Work.learn = lambda *_: gaussians  # type: ignore[method-assign]
-    try:
-        yield
-    finally:
-        pipeline._Work.learn = learn  # type: ignore[method-assign]
-        for name, value in kept.items():
-            setattr(pipeline, name, value)
-
-
 def measured(capture: Capture, folder: Path, truth: Truth, settings: Settings, key: str) -> list[str]:
-    """Figures of the finished asset."""
+    """Figures of the finished asset, without those of normals."""
     begun = processor_seconds()
     asset = pipeline.reconstruct(capture, settings)
     spent = processor_seconds() - begun
     path = FOLDER / f"terms-{key}.drgs"
     write_asset(path, asset)
-    report = score(path, folder, "surfels", 32, truth)
-    materials = report["materials"]
-    return [
-        f"{mean(under_other_lights(report, False), 'scaled', 'foreground'):.2f}",
-        f"{report['novel']['psnr_foreground']:.2f}",
-        f"{materials['albedo_psnr_scaled']:.2f}",
-        f"{materials['roughness_rmse']:.3f} / {materials['metallic_rmse']:.3f}",
-        f"{spent:.0f}",
-    ]
+    return figures(score(path, folder, "surfels", 32, truth), spent)[1:]
+
+
+@contextmanager
+def meshes_cut_in_four() -> Iterator[None]:
+    """Let `pipeline.reconstruct` cut each face of its meshes in four."""
+    known = pipeline.mesh_of
+
+    def cut(*given: Any, **named: Any) -> Any:
+        mesh, report = known(*given, **named)
+        return cut_in_four(mesh), report
+
+    pipeline.mesh_of = cut
+    try:
+        yield
+    finally:
+        pipeline.mesh_of = known
 
 
 def main() -> None:
@@ -127,7 +105,7 @@ def main() -> None:
     gaussians = learned(capture, f"{options.capture.name}-256")
     for label in options.rows:
         settings = replace(base, decoupling=replace(base.decoupling, joint=0.0, **ROWS.get(label, ROWS[PLAIN])))
-        with same_surfels(gaussians, label == CUT):
+        with same_surfels(gaussians), meshes_cut_in_four() if label == CUT else nullcontext():
             cells = measured(capture, options.capture, truth, settings, key)
         print(key, label, *cells, flush=True)
         rows = store_row(FOLDER / "terms.json", f"{key}|{label}", cells)

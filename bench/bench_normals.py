@@ -12,7 +12,8 @@ captures may be measured one by one.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -83,6 +84,35 @@ PRIORS = {
 }
 #: Deviations of what makes normals of a model of true ones: of the blur, and of the errors' width, pixels.
 BLUR, WIDE = 1.5, 6.0
+
+
+@contextmanager
+def same_surfels(gaussians: Gaussians) -> Iterator[None]:
+    """Let `pipeline.reconstruct` have these surfels in place of learning them."""
+    names = "held_out_metrics", "Training"
+    kept, learn = {name: getattr(pipeline, name) for name in names}, pipeline._Work.learn
+    pipeline.held_out_metrics = lambda *_: {}
+    pipeline.Training = lambda *_, **__: None  # type: ignore[assignment,misc]
+    pipeline._Work.learn = lambda *_: gaussians  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        pipeline._Work.learn = learn  # type: ignore[method-assign]
+        for name, value in kept.items():
+            setattr(pipeline, name, value)
+
+
+def figures(report: dict, spent: float) -> list[str]:
+    """Cells of a report: normals, relit, views left out, albedo, roughness and metallic; and processor seconds."""
+    materials = report["materials"]
+    return [
+        f"{report['geometry']['normal_degrees']:.2f}",
+        f"{mean(under_other_lights(report, False), 'scaled', 'foreground'):.2f}",
+        f"{report['novel']['psnr_foreground']:.2f}",
+        f"{materials['albedo_psnr_scaled']:.2f}",
+        f"{materials['roughness_rmse']:.3f} / {materials['metallic_rmse']:.3f}",
+        f"{spent:.0f}",
+    ]
 
 
 class Chain:
@@ -198,30 +228,21 @@ def relit(capture: Capture, folder: Path, name: str, steps: int) -> dict[str, li
     truth = replace(truth, sets=[item for item in truth.sets if not item.posed and item.light in known])
     settings = Settings()
     settings = replace(settings, decoupling=replace(settings.decoupling, iterations=steps))
-    kept = depth_fusion.relaxed, pipeline.with_surfel_normals, pipeline._Work.learn
+    kept = depth_fusion.relaxed, pipeline.with_surfel_normals
     found = {}
     for label, (evened, shown) in STEPS.items():
         depth_fusion.relaxed = kept[0] if evened else lambda vertices, _: vertices
         pipeline.with_surfel_normals = kept[1] if shown else lambda *_: None
-        pipeline._Work.learn = lambda *_: gaussians  # type: ignore[method-assign]
         begun = processor_seconds()
         try:
-            asset = pipeline.reconstruct(capture, settings)
+            with same_surfels(gaussians):
+                asset = pipeline.reconstruct(capture, settings)
         finally:
-            depth_fusion.relaxed, pipeline.with_surfel_normals, pipeline._Work.learn = kept
+            depth_fusion.relaxed, pipeline.with_surfel_normals = kept
         spent = processor_seconds() - begun
         path = FOLDER / f"{name}.drgs"
         write_asset(path, asset)
-        report = score(path, folder, "surfels", 32, truth)
-        novel, materials = report["novel"], report["materials"]
-        found[label] = [
-            f"{report['geometry']['normal_degrees']:.2f}",
-            f"{mean(under_other_lights(report, False), 'scaled', 'foreground'):.2f}",
-            f"{novel['psnr_foreground']:.2f}",
-            f"{materials['albedo_psnr_scaled']:.2f}",
-            f"{materials['roughness_rmse']:.3f} / {materials['metallic_rmse']:.3f}",
-            f"{spent:.0f}",
-        ]
+        found[label] = figures(score(path, folder, "surfels", 32, truth), spent)
         print(name, label, *found[label], flush=True)
     return found
 

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from bench_recovered_light import directions, reduced
 
 from drgs_blender.core.asset import Asset
 from drgs_blender.core.asset.model import PosedSurfels
 from drgs_blender.core.color import srgb_to_linear
-from drgs_blender.core.frame import Camera
+from drgs_blender.core.frame import Camera, World
 from drgs_blender.deform.gmls import Weights, bind_points, carry
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.deform.sources import MeshSource
@@ -22,6 +23,7 @@ from drgs_blender.deform.surfel_update import paper_update
 from drgs_blender.formats.harmonics import basis
 from drgs_blender.geometry.normals import rotation_matrices, unit
 from drgs_blender.reconstruct.model.raster import rasterise
+from drgs_blender.render.reference.light import Light
 from drgs_blender.simulation.fill import fill
 
 Array = np.ndarray
@@ -92,22 +94,12 @@ class Baked:
         return np.concatenate([linear, alpha], axis=-1)
 
 
-def directions(rows: int) -> tuple[Array, Array]:
-    """(2 rows^2, 3) directions of the pixels of a lat-long map, and (2 rows^2,) solid angles."""
-    latitude = np.pi * (0.5 - (np.arange(rows) + 0.5) / rows)
-    longitude = np.pi * (1 - (np.arange(2 * rows) + 0.5) / rows)
-    la, lo = (a.ravel() for a in np.meshgrid(latitude, longitude, indexing="ij"))
-    found = np.stack([np.cos(la) * np.cos(lo), np.cos(la) * np.sin(lo), np.sin(la)], -1)
-    return found.astype(np.float32), (np.cos(la) * (np.pi / rows) ** 2).astype(np.float32)
-
-
 class Prefiltered:
     """A light (h, w, 3) as a diffuse surface and mirrors of several roughnesses see it, view along the normal."""
 
     def __init__(self, radiance: Array) -> None:
-        while len(radiance) >= 2 * SOURCE:
-            radiance = radiance.reshape(len(radiance) // 2, 2, radiance.shape[1] // 2, 2, 3).mean((1, 3))
-        source, angle = directions(len(radiance))
+        radiance = reduced(radiance, SOURCE)
+        source, angle = directions(SOURCE)
         light, out = radiance.reshape(-1, 3) * angle[:, None], directions(ROWS)[0]
         self.levels = []
         for roughness in ROUGHNESS:
@@ -135,14 +127,7 @@ class Prefiltered:
 
 def look_up(picture: Array, direction: Array) -> Array:
     """(n, 3) of a lat-long map, between its pixels."""
-    rows, columns = picture.shape[:2]
-    x = (1 - np.arctan2(direction[:, 1], direction[:, 0]) / np.pi) * rows - 0.5
-    y = np.clip((0.5 - np.arcsin(np.clip(direction[:, 2], -1, 1)) / np.pi) * rows - 0.5, 0, rows - 1)
-    x0, y0 = np.floor(x).astype(int), np.minimum(y.astype(int), rows - 2)
-    a, b = (x - x0)[:, None], (y - y0)[:, None]
-    at = lambda j, i: picture[j, i % columns]  # noqa: E731
-    top, bottom = (1 - a) * at(y0, x0) + a * at(y0, x0 + 1), (1 - a) * at(y0 + 1, x0) + a * at(y0 + 1, x0 + 1)
-    return (1 - b) * top + b * bottom
+    return Light.from_world(World(picture)).radiance(torch.from_numpy(direction).double()).numpy()
 
 
 def split_sum(surfels: PosedSurfels, light: Prefiltered, camera: Camera) -> Array:
