@@ -98,7 +98,7 @@ def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bo
             try:
                 result.markers[file] = detect(np.asarray(Pillow.fromarray(small).convert("L")))
             except DeviceError as error:
-                logger.info("markers are not looked for: %s", error)
+                logger.warning("marker sheets are not looked for: %s", error)
                 seek_markers = False
     _tell_unmasked(result, unmasked)
     return result

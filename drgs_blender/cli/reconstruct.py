@@ -197,7 +197,8 @@ def run(args: argparse.Namespace) -> int:
             raise
         finally:
             _remove_if_empty(work)  # where there is nothing to go on from
-    asset.provenance["settings"] = as_tables(settings, reading)
+    # Beside those that `reconstruct` kept, of which some follow from the photographs and this machine.
+    asset.provenance["settings"]["capture"] = as_tables(settings, reading)["capture"]
     write_and_report(args.out, asset)
     clear(work)
     report = asset.provenance["report"]

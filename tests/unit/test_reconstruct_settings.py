@@ -199,7 +199,7 @@ def test_masks_are_a_setting_that_the_asset_keeps(tmp_path, capsys, monkeypatch)
     photographs.mkdir()
     write(balls(8, 32), photographs)
     asset = object_asset(light(1))
-    asset.provenance["report"] = {"steps": {}}
+    asset.provenance |= {"report": {"steps": {}}, "settings": {}}
     monkeypatch.setattr("drgs_blender.reconstruct.pipeline.reconstruct", lambda *_: asset)
     monkeypatch.setattr("drgs_blender.capture.masks.of_capture.mask_capture", lambda _, mode, *__: modes.append(mode))
     words = ["reconstruct", str(photographs), "--out", str(tmp_path / "a.drgs")]

@@ -39,6 +39,8 @@ Array = np.ndarray
 log = logging.getLogger(__name__)
 
 DEFAULT = Settings()
+#: Mean of the photographs' linear colours to which the weights of losses belong.
+_BRIGHTNESS = 0.1
 #: Steps between two tables of light sampling, between two reports, and seconds between two checkpoints.
 _AIM, _REPORT, _SAVE = 25, 25, 20.0
 
@@ -208,6 +210,9 @@ class Job:
         tree = TriangleBVH()
         tree.build(mesh.vertices, mesh.faces)
         self._pixels = foreground_pixels(capture.training, mesh, tree, settings.most_pixels, settings.seed, normals)
+        # Weights of losses are of photographs of one brightness, whatever the object's and the exposure.
+        self._gain = _BRIGHTNESS / max(float(self._pixels.colour.mean()), 1e-6)
+        self._pixels.colour *= np.float32(self._gain)
         cache, self._weight = radiance_cache(self._pixels, mesh)
         counts = (settings.cosine, settings.ggx, settings.light)
         if not settings.shadows:
@@ -311,15 +316,15 @@ class Job:
         if self._exposure is not None:
             factor = torch.exp(self._exposure - self._exposure.mean())
             predicted = predicted * factor[torch.from_numpy(pixels.view).long()][:, None, None]
-        photographed = torch.from_numpy(pixels.colour)
+        photographed, clipped = torch.from_numpy(pixels.colour), torch.from_numpy(pixels.clipped)
         if s.unbiased:
             weight_by_prediction = self.schedule.weighs_by_prediction()
             beside = torch.from_numpy(pixels.next_to_clipped)
             counts = torch.where(beside, s.clipped_neighbour_weight, 1.0) if weight_by_prediction else None
-            loss = unbiased_loss(predicted, photographed, weight_by_prediction, counts)
+            loss = unbiased_loss(predicted, photographed, clipped, weight_by_prediction, counts)
         else:
-            loss = log_loss(predicted.mean(1), photographed)
-        self.score.note(float(loss.detach()), predicted.detach().mean(1), photographed)
+            loss = log_loss(predicted.mean(1), photographed, clipped)
+        self.score.note(float(loss.detach()), predicted.detach().mean(1) / self._gain, photographed / self._gain)
         return loss
 
     def result(self) -> Decoupled:
@@ -342,7 +347,7 @@ class Job:
         }
         if self._exposure is not None:
             report["exposures"] = torch.exp(self._exposure - self._exposure.mean()).tolist()
-        environment = self.lighting.learned.radiance().numpy().copy()
+        environment = self.lighting.learned.radiance().numpy() / np.float32(self._gain)
         return Decoupled(values[:, :3], values[:, 3], values[:, 4], environment, normals, report)
 
     def _learned(self) -> dict[str, Tensor]:

@@ -22,6 +22,8 @@ logger = logging.getLogger(__name__)
 WHITE = (1.0, 1.0, 1.0)
 #: Pixels darker than this everywhere, or that differ no more than this, are no photograph.
 _BLACK, _ALIKE = 0.02, 0.002
+#: Linear values above this are taken for damage.
+_BRIGHTEST = 1e4
 #: Pixels of the shorter side of the least picture that shows anything, also at half size.
 _LEAST = 4
 #: How much the surroundings may vary, and how much of the pixels must be surroundings, to be called one colour.
@@ -53,17 +55,18 @@ def load_photograph(
     subject = str(photograph.image)
     stored, notes = load_picture(photograph.image)
     layout.notes += [(photograph.image, note) for note in notes]
-    pixels = _shown(stored)
+    pixels, above = _shown(stored), _above_white(stored)
     height, width = pixels.shape[:2]
     lens = _fitting(photograph.lens, width, height, subject)
     mask = _mask(photograph, layout, pixels)
     if mask is not None and pixels.shape[2] == 4 and photograph.mask is None:
         # Premultiplied: colours of pixels that are not there must not bleed into those that are.
         pixels = pixels[..., :3] * mask[..., None]
+        above = None if above is None else above * mask[..., None]
         premultiplied = True
     else:
         pixels, premultiplied = pixels[..., :3], False
-    layers = pixels if mask is None else np.dstack([pixels, mask])
+    layers = np.dstack([layer for layer in (pixels, mask, above) if layer is not None])
     if lens.distorts:
         if lens not in known:
             known[lens] = undistorted(lens)
@@ -89,7 +92,8 @@ def load_photograph(
     camera = Camera(photograph.matrix, width, height, lens.fx, lens.fy, lens.cx, lens.cy)
     colour = np.ascontiguousarray(np.clip(colour, 0, 1), np.float32)
     mask = None if mask is None else np.ascontiguousarray(mask, np.float32)
-    return View(photograph.name, camera, colour, mask, photograph.test)
+    above = None if above is None else np.ascontiguousarray(layers[..., -3:], np.float32)
+    return View(photograph.name, camera, colour, mask, photograph.test, above_white=above)
 
 
 def _fitting(lens: Lens, width: int, height: int, subject: str) -> Lens:
@@ -109,6 +113,14 @@ def _shown(pixels: Array) -> Array:
         return to_unit(pixels)
     pixels = np.clip(pixels, 0, 1)
     return np.concatenate([linear_to_srgb(pixels[..., :3]), pixels[..., 3:]], axis=2)
+
+
+def _above_white(pixels: Array) -> Array | None:
+    """(h, w, 3) float32: how much brighter than white linear colours are; None where none is, or they are no floats."""
+    if pixels.dtype.kind != "f":
+        return None
+    above = np.clip(pixels[..., :3] - 1, 0, _BRIGHTEST).astype(np.float32)
+    return above if above.any() else None
 
 
 def _mask(photograph: Photograph, layout: Layout, pixels: Array) -> Array | None:
