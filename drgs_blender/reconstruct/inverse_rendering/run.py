@@ -39,8 +39,6 @@ Array = np.ndarray
 log = logging.getLogger(__name__)
 
 DEFAULT = Settings()
-#: Mean of the photographs' linear colours to which the weights of losses belong.
-_BRIGHTNESS = 0.1
 #: Steps between two tables of light sampling, between two reports, and seconds between two checkpoints.
 _AIM, _REPORT, _SAVE = 25, 25, 20.0
 
@@ -210,8 +208,7 @@ class Job:
         tree = TriangleBVH()
         tree.build(mesh.vertices, mesh.faces)
         self._pixels = foreground_pixels(capture.training, mesh, tree, settings.most_pixels, settings.seed, normals)
-        # Weights of losses are of photographs of one brightness, whatever the object's and the exposure.
-        self._gain = _BRIGHTNESS / max(float(self._pixels.colour.mean()), 1e-6)
+        self._gain = settings.brightness / max(float(self._pixels.colour.mean()), 1e-6)
         self._pixels.colour *= np.float32(self._gain)
         cache, self._weight = radiance_cache(self._pixels, mesh)
         counts = (settings.cosine, settings.ggx, settings.light)
