@@ -310,7 +310,8 @@ def _tell_left_out(found: Registration, photos: list[Photo], by_file: dict[str, 
     for group in found.apart:
         logger.warning(
             "%s: %d pictures fit together but share nothing with the others, as of another object: %s. Give them "
-            "a folder of their own, or add pictures between", source, len(group), first_of(group),
+            "a folder of their own, or add pictures between", source, len(group),
+            first_of([by_file[file].path.name for file in group]),
         )  # fmt: skip
 
 

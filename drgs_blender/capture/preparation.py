@@ -88,7 +88,7 @@ def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bo
             continue
         height, width = small.shape[:2]
         result.pictures.append(picture)
-        result.photos.append(Photo(file, picture.lens, picture.exif.focal, (width, height)))
+        result.photos.append(Photo(file, picture.lens, picture.exif.focal, (width, height), picture.path.name))
         result.looks.append(look(small, mask))
         if mask is not None:
             result.masks = masks

@@ -260,7 +260,7 @@ def _read(model: Any, method: str, apart: list[list[str]]) -> Registration:
 
 def _refuse(registered: list[str], photos: Sequence[Photo], subject: str) -> None:
     """Raise AssetError with the pictures that are not registered."""
-    missing = [photo.file for photo in photos if photo.file not in registered]
+    missing = [photo.given or photo.file for photo in photos if photo.file not in registered]
     listed = ", ".join(missing[:40]) + (", ..." if len(missing) > 40 else "")
     raise AssetError(
         subject,
