@@ -239,8 +239,8 @@ def _tell_cameras(pictures: Sequence[Picture], subject: str) -> None:
     unknown = [picture.path.name for picture in pictures if picture.exif.focal is None]
     if unknown:
         logger.warning(
-            "%s: %d of %d pictures do not say in EXIF how long their lens was, which begins as a guess and is found from "
-            "what they show: %s. Views from many sides settle it", subject, len(unknown), len(pictures),
+            "%s: %d of %d pictures do not say in EXIF how long their lens was, which begins as a guess and is found "
+            "from what they show: %s. Views from many sides settle it", subject, len(unknown), len(pictures),
             first_of(unknown),
         )  # fmt: skip
     lenses: dict[tuple[int, int, str], list[str]] = defaultdict(list)
@@ -265,8 +265,8 @@ def _tell_exposures(pictures: Sequence[Picture], looks: Sequence[Look], subject:
         least, most = max(known, key=known.__getitem__), min(known, key=known.__getitem__)
         unknown = len(pictures) - len(known)
         logger.warning(
-            "%s: exposures differ by %.1f stops (EXIF), from %s (least light) to %s. drgs reconstruct evens them out by "
-            "EXIF, but for what is clipped or in noise%s; lock exposure and white balance",
+            "%s: exposures differ by %.1f stops (EXIF), from %s (least light) to %s. drgs reconstruct evens them out "
+            "by EXIF, but for what is clipped or in noise%s; lock exposure and white balance",
             subject, known[least] - known[most], least, most,
             f", and for {unknown} pictures that do not say theirs" if unknown else "",
         )  # fmt: skip
@@ -277,7 +277,7 @@ def _tell_exposures(pictures: Sequence[Picture], looks: Sequence[Look], subject:
     dark, bright = int(light.argmin()), int(light.argmax())
     if light[bright] - light[dark] > _BRIGHTNESS[any(one.masked for one in looks)]:
         logger.warning(
-            "%s: pictures differ by %.1f stops in brightness, from %s (darkest) to %s, and not all say their exposures: "
-            "if the light and what they show do not explain it, materials will show it; lock exposure and white balance",
+            "%s: pictures differ by %.1f stops in brightness, from %s (darkest) to %s, and not all say their "
+            "exposures: if light and object do not explain it, materials will show it; lock exposure and white balance",
             subject, light[bright] - light[dark], pictures[dark].path.name, pictures[bright].path.name,
         )  # fmt: skip
