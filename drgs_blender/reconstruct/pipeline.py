@@ -133,11 +133,8 @@ def reconstruct(
     if idle := settings.without_effect():
         log.warning("%s: no effect with variant %s, materials %s", first_of(idle), settings.variant, settings.materials)
     region = find_region(capture)
-    if len(capture.training) < FEW_VIEWS:
-        log.warning(
-            "%s: has only %d views to learn from: between them the shape is a guess, and light and materials can "
-            "hardly be separated. Take 30 or more", capture.source, len(capture.training),
-        )  # fmt: skip
+    if (count := len(capture.training)) < FEW_VIEWS:
+        log.warning("%s: only %d views, too few for shape, materials and light. Take 30", capture.source, count)
     voxels = _voxels(settings, [view.camera for view in capture.training], region)
     settings = replace(settings, mesh_resolution=voxels)  # for the asset, and a run that goes on with other memory
     work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)
