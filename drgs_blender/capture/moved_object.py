@@ -131,10 +131,9 @@ def moved_at(colmap: Any, model: Any, database: Path, files: Sequence[str]) -> s
         pairs, found = data.read_all_matches()
     matches = []
     for pair, features in zip(pairs, found):
-        a, b = colmap.pair_id_to_image_pair(pair)
-        if a in order and b in order and len(features):
-            turned = order[a] > order[b]
-            matches.append((*sorted((order[a], order[b])), np.asarray(features, int)[:, ::-1] if turned else
-                            np.asarray(features, int)))  # fmt: skip
+        a, b = (order.get(number, -1) for number in colmap.pair_id_to_image_pair(pair))
+        if min(a, b) >= 0 and len(features):
+            alike = np.asarray(features, int)
+            matches.append((a, b, alike) if a < b else (b, a, alike[:, ::-1]))
     moment = find_move(rows, matches, points, np.array(centres), np.array(inside), float(np.median(pixels)))
     return None if moment is None else files[moment]
