@@ -311,10 +311,20 @@ def _tell_left_out(found: Registration, photos: list[Photo], by_file: dict[str, 
             "others", source, len(found.unsound), len(photos),
             ", ".join(f"{out[file]} ({why})" for file, why in found.unsound.items()),
         )  # fmt: skip
+    if found.moved is not None:
+        files = [photo.file for photo in photos if photo.file in found.matrices]
+        moment = files.index(found.moved)
+        last, first = (by_file[file].path.name for file in files[moment - 1 : moment + 1])
+        logger.warning(
+            "%s: the object or a part of it moved between %s and %s: it is there twice. Use the pictures of one place "
+            "alone (%d pictures before it, %d after), or photograph it again", source, last, first, moment,
+            len(files) - moment,
+        )  # fmt: skip
     for group in found.apart:
         logger.warning(
             "%s: %d pictures fit together but share nothing with the others, as of another object: %s. Give them "
-            "a folder of their own, or add pictures between", source, len(group), first_of(group),
+            "a folder of their own, or add pictures between", source, len(group),
+            first_of([by_file[file].path.name for file in group]),
         )  # fmt: skip
 
 

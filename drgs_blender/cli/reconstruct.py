@@ -167,6 +167,7 @@ def run(args: argparse.Namespace) -> int:
     check_writable(args.out, (args.capture,))
 
     reconstruct = reconstruction()
+    from ..capture.inspection import tell_of_views
     from ..capture.masks.stage import check_mode
     from ..capture.normal_model import load_model
     from ..reconstruct.readers import read_capture
@@ -177,6 +178,8 @@ def run(args: argparse.Namespace) -> int:
         load_model(reading.normals)
     source = _with_cameras(args, reading.masks)
     capture = read_capture(source, reading.resolution, reading.test_every, reading.axes, reading.up)
+    if source == args.capture:  # else `drgs capture` has looked at them
+        tell_of_views(capture)
     if source == args.capture or reading.masks == "none":  # else `drgs capture` has made them
         _mask(args, capture, reading.masks)
     if reading.normals != NONE:

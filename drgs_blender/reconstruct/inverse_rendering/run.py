@@ -201,8 +201,6 @@ class Job:
             raise AssetError("mesh", "has no faces", "Decoupling needs the surface")
         if not capture.training:
             raise UsageError(str(capture.source), "has no training view", "Leave fewer views out for the test")
-        if len(capture.training) < 4:
-            log.warning("only %d views: light and materials can hardly be separated", len(capture.training))
         self._mesh, self._settings, self._capture = mesh, settings, capture
         self.schedule, self.score = Schedule(settings, now), Score()
         tree = TriangleBVH()

@@ -12,6 +12,7 @@ from ...core.color import linear_to_srgb, to_unit
 from ...core.errors import AssetError
 from ...core.frame import Camera
 from ..capture.capture import View
+from .exposures import exposed
 from .layout import Layout, Photograph, load_picture
 from .lens import Lens, resample, undistorted
 
@@ -34,7 +35,11 @@ _BORDER, _MOST, _NEAR, _SPECK = 0.02, 0.7, 0.06, 0.002
 
 
 def load_photograph(
-    photograph: Photograph, layout: Layout, resolution: int | None, known: dict[Lens, tuple[Lens, Array]]
+    photograph: Photograph,
+    layout: Layout,
+    resolution: int | None,
+    known: dict[Lens, tuple[Lens, Array]],
+    gain: float = 1.0,
 ) -> View | None:
     """Read one photograph; None where it is black or of one colour all over.
 
@@ -46,6 +51,8 @@ def load_photograph(
         Pixels of the longer side at most; None keeps the size.
     known : dict of Lens to tuple of (Lens, array)
         Results of `undistorted` for lenses with distortion, filled as they occur.
+    gain : float
+        Of `exposures.find_gains`.
 
     Raises
     ------
@@ -55,7 +62,11 @@ def load_photograph(
     subject = str(photograph.image)
     stored, notes = load_picture(photograph.image)
     layout.notes += [(photograph.image, note) for note in notes]
+    if gain != 1.0 and stored.dtype.kind == "f":
+        stored = np.concatenate([stored[..., :3] * np.float32(gain), stored[..., 3:]], axis=2)
     pixels, above = _shown(stored), _above_white(stored)
+    if gain != 1.0 and stored.dtype.kind != "f":
+        pixels = np.concatenate([exposed(pixels[..., :3], gain), pixels[..., 3:]], axis=2)
     height, width = pixels.shape[:2]
     lens = _fitting(photograph.lens, width, height, subject)
     mask = _mask(photograph, layout, pixels)
