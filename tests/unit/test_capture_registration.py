@@ -445,7 +445,7 @@ def test_folders_of_others_are_not_written_to(tmp_path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letter.txt").write_text("")
-    for folder in (tmp_path / "photos", tmp_path / "photos" / "inside", tmp_path / "other"):
+    for folder in (tmp_path / "photos", tmp_path / "photos" / "images", tmp_path / "other"):
         with pytest.raises(UsageError):
             make_capture(tmp_path / "photos", folder, Settings(), tell, never)
     assert (tmp_path / "other" / "letter.txt").exists()
