@@ -287,6 +287,8 @@ def _find_cameras(args: argparse.Namespace, reading: Reading, masks: str) -> Pat
         made = make_capture(args.capture, folder, settings, _telling(args, bar), cancelled)
     for line in made.lines:
         note(line)
+    if not args.quiet and not sys.stdout.isatty():
+        print(f"DRGS_CAPTURE {folder}", flush=True)  # for programs that read the lines
     return folder
 
 
