@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path, PurePath
+from typing import TYPE_CHECKING
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
@@ -132,6 +134,9 @@ def settings_file(text: str, named: str, folder: Path) -> Path | None:
 
 class ReconstructFields:
     """Properties of the operator, and how the file browser shows them."""
+
+    if TYPE_CHECKING:  # of Blender's Operator
+        layout: bpy.types.UILayout
 
     #: Of the choices.
     defaults = {"masks": "auto-without-cameras", "poses": "auto", "brackets": "auto"}  # noqa: RUF012 - never changed
@@ -292,7 +297,7 @@ class ReconstructFields:
         body.prop(self, "config")
 
 
-def _show(layout: bpy.types.UILayout, fields: bpy.types.Operator, names: list[str], active: bool = True) -> None:
+def _show(layout: bpy.types.UILayout, fields: bpy.types.Operator, names: Sequence[str], active: bool = True) -> None:
     """Fields below each other; those that are not `active` are greyed."""
     column = layout.column()
     column.active = active
