@@ -155,7 +155,7 @@ class DRGS_OT_reconstruct_show(DrgsOperator, bpy.types.Operator):
 
     bl_idname = "drgs.reconstruct_show"
     bl_label = "Show Picture"
-    bl_options = {"INTERNAL"}  # noqa: RUF012 - read by Blender
+    bl_options = {"REGISTER", "UNDO", "INTERNAL"}  # noqa: RUF012 - read by Blender
 
     filepath: StringProperty(name="File", description="The picture", options={"SKIP_SAVE"})
 
