@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import shutil
 from functools import partial
 from pathlib import Path
@@ -13,13 +12,11 @@ import numpy as np
 from PIL import Image as Pillow
 
 from ..core.asset.archive import replace_by, replace_file
-from ..core.errors import UsageError, WriteError, first_of
+from ..core.errors import UsageError, WriteError
 from ..reconstruct.readers.layout import decode_mask
-from .pictures import CLIPPED, Picture, write_picture
+from .pictures import FOLDERS, MASKS, Picture, write_picture
 from .registration import Registration
 from .report import draw_cameras, write_report
-
-logger = logging.getLogger(__name__)
 
 #: Files of a finished capture; the last is written last.
 REPORT, DRAWING, POINTS, CAMERAS = "capture.json", "capture.png", "sparse_points.ply", "transforms.json"
@@ -28,20 +25,23 @@ WORK = "registration"
 
 
 def open_folder(folder: Path, source: Path) -> None:
-    """Make the folder of a capture.
+    """Make the folder of a capture; it may be a new one beside the photographs.
 
     Raises
     ------
     UsageError
-        It is the input or inside it, or has files that are not a capture's of ours.
+        It is the input, or one of its folders of pictures or inside that, or has files that are not a capture's of
+        ours.
     WriteError
         It cannot be made.
     """
-    if folder.resolve() == source.resolve() or source.resolve() in folder.resolve().parents:
-        raise UsageError(f"--out {folder}", "is the input, or inside it", "Choose another folder")
+    inner, outer = folder.resolve(), source.resolve()
+    taken = [outer / name for name in (*(name for name in FOLDERS if name != "."), MASKS)]
+    if inner == outer or any(inner == one or one in inner.parents for one in taken):
+        raise UsageError(str(folder), "is where the pictures or masks are", "Choose another folder for the capture")
     try:
         if folder.exists() and any(folder.iterdir()) and not _is_ours(folder):
-            raise UsageError(f"--out {folder}", "holds other files", "Choose a new or empty folder")
+            raise UsageError(str(folder), "holds other files", "Choose a new or empty folder for the capture")
         (folder / WORK).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise WriteError(str(folder), f"cannot be made ({error.strerror or error})", "Choose another folder") from error
@@ -52,10 +52,12 @@ def _is_ours(folder: Path) -> bool:
 
 
 def complete(folder: Path, digest: str) -> bool:
-    """Whether `folder` has a finished capture of these inputs and settings."""
+    """Whether `folder` has a finished capture of these inputs and settings, with all its pictures."""
     try:
         report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
-        return bool(report["digest"] == digest and (folder / CAMERAS).is_file())
+        frames = json.loads((folder / CAMERAS).read_text(encoding="utf-8"))["frames"]
+        files = [frame[key] for frame in frames for key in ("file_path", "mask_path") if key in frame]
+        return bool(report["digest"] == digest and all((folder / file).is_file() for file in files))
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -94,9 +96,9 @@ def write_capture(
         A file cannot be written.
     """
     images, masks = folder / "images", folder / "masks"
+    (folder / CAMERAS).unlink(missing_ok=True)  # first: what is left after a kill is no capture
     for old in (images, masks):
         shutil.rmtree(old, ignore_errors=True)
-    (folder / CAMERAS).unlink(missing_ok=True)
     images.mkdir()
     frames, notes = [], {}
     for file, matrix in sorted(found.matrices.items()):
@@ -123,12 +125,6 @@ def write_capture(
             notes[picture.path.name] = "; ".join(picture.notes)
         if picture.exif.exposure is not None:
             frame["exposure_value"] = picture.exif.exposure
-    clipped = [name for name, note in notes.items() if CLIPPED in note]
-    if clipped:
-        logger.warning(
-            "%s: %d pictures have pixels brighter than white, which are clipped: %s. Scale them down if that is the "
-            "object; %s has how many", folder, len(clipped), first_of(clipped), REPORT,
-        )  # fmt: skip
     (folder / POINTS).unlink(missing_ok=True)
     if len(found.points):
         _write_points(folder / POINTS, found)

@@ -63,11 +63,19 @@ def read_exif(image: Pillow.Image) -> Metadata:
     """The metadata of an open picture; damaged ones count as none."""
     try:
         base = image.getexif()
-        details = base.get_ifd(ExifTags.IFD.Exif)
     except Exception:  # damaged metadata raise almost anything; the pixels are sound
         return Metadata()
+    return metadata_of(base, image.size)
+
+
+def metadata_of(base: Pillow.Exif, size: tuple[int, int]) -> Metadata:
+    """The metadata in EXIF of a picture of so many pixels, width and height; damaged ones count as none."""
+    try:
+        details = base.get_ifd(ExifTags.IFD.Exif)
+    except Exception:
+        return Metadata()
     orientation = base.get(ExifTags.Base.Orientation, 1)
-    focal = _focal(details, *image.size)
+    focal = _focal(details, *size)
     names = [base.get(ExifTags.Base.Make), base.get(ExifTags.Base.Model), details.get(ExifTags.Base.LensModel)]
     words = [str(name).strip("\0 ") for name in names if name]
     millimetres = _number(details.get(ExifTags.Base.FocalLength))

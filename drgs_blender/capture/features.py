@@ -42,12 +42,15 @@ class Photo:
         Focal length in parts of the longer side, known from EXIF.
     size : tuple of int
         Width and height of the file, pixels.
+    given : str
+        Name of the user's file, for messages.
     """
 
     file: str
     lens: tuple[Any, ...]
     focal: float | None
     size: tuple[int, int]
+    given: str = ""
 
 
 def extract(database: Path, pictures: Path, masks: Path | None, photos: Sequence[Photo], tell: Tell,

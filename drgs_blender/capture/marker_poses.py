@@ -21,9 +21,12 @@ logger = logging.getLogger(__name__)
 
 #: Markers that a picture must show.
 FEWEST_MARKERS = 2
+#: Pictures of a lens from which its focal length is found.
+_FOR_FOCAL = 3
 #: Pictures of a lens from which its first and second radial coefficient and its principal point are found.
 _FOR_K1, _FOR_K2, _FOR_CENTRE = 8, 15, 20
-#: Error above which a marker is taken for misread: pixels of a picture of 1600; times the median, where that is more.
+#: Error above which a marker is taken for misread: pixels of a picture of 1600; times the median of all pictures, where
+#: that is more.
 _STRAY, _TIMES = 3.0, 4.0
 #: The same from the plane of the others, before the lens and its distortion are known.
 _OFF_PLANE = 16.0
@@ -45,7 +48,8 @@ def poses_from_markers(
 
     Lenses are calibrated with the poses in one bundle adjustment over all corners (Zhang 2000, OpenCV's
     ``calibrateCamera``), beginning at the focal length of EXIF where there is one; corners that do not fit are left out
-    and the adjustment is repeated.
+    and the adjustment is repeated. One or two pictures of a size say no focal length: where EXIF does not either, it is
+    that of the same camera turned upright or level, else they are left out (`Registration.unsound`).
 
     Parameters
     ----------
@@ -68,8 +72,16 @@ def poses_from_markers(
             if sight is not None:
                 groups[photo.lens].append((photo, sight))
     result = Registration({}, {}, {}, {}, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "marker sheet")
-    for group in groups.values():
-        _calibrate([sight for _, sight in group], group[0][0], result)
+    errors: list[Array] = []
+    lenses: dict[tuple[object, ...], Lens] = {}
+    for kind, group in sorted(groups.items(), key=lambda item: -len(item[1])):
+        turned = lenses.get((*kind[1::-1], *kind[2:]))
+        photo, sights = group[0][0], [sight for _, sight in group]
+        if len(group) < _FOR_FOCAL and turned is None and photo.focal is None:
+            why = f"nothing says its focal length: {len(group)} of its size show the sheet, and EXIF does not have it"
+            result.unsound |= {sight.file: why for sight in sights}
+        else:
+            lenses[kind] = _calibrate(sights, photo, turned if len(group) < _FOR_FOCAL else None, errors, result)
     return result
 
 
@@ -84,12 +96,21 @@ def _plane(sight: _Sight, size: int) -> _Sight | None:
     return _Sight(sight.file, sight.points[good], sight.pixels[good]) if good.sum() >= 4 * FEWEST_MARKERS else None
 
 
-def _calibrate(sights: list[_Sight], photo: Photo, result: Registration) -> None:
-    """Lens and poses of pictures with one lens, into `result`."""
+def _calibrate(
+    sights: list[_Sight], photo: Photo, turned: Lens | None, known: list[Array], result: Registration
+) -> Lens:
+    """Lens and poses of pictures with one lens, into `result`; with `turned` that lens, of the camera held otherwise.
+
+    `known` has the errors of other lenses' corners in parts of the longer side; those of this one are added.
+    """
     cv2 = libraries.load("opencv")
     width, height = photo.size
-    focal = (photo.focal or 1.0) * max(width, height)
+    longer = max(width, height)
+    focal = (photo.focal or 1.0) * longer if turned is None else turned.fx * longer / max(turned.width, turned.height)
     camera = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    given = np.zeros(5)
+    if turned is not None:
+        given[:2] = turned.coefficients[:2]
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
     if len(sights) < _FOR_CENTRE:
         flags |= cv2.CALIB_FIX_PRINCIPAL_POINT
@@ -97,20 +118,22 @@ def _calibrate(sights: list[_Sight], photo: Photo, result: Registration) -> None
         flags |= cv2.CALIB_FIX_K2
     if len(sights) < _FOR_K1:
         flags |= cv2.CALIB_FIX_K1
-        if photo.focal is not None or len(sights) < 3:
+        if photo.focal is not None or turned is not None:
             flags |= cv2.CALIB_FIX_FOCAL_LENGTH
-    limit = _STRAY * max(width, height) / 1600
+    limit = _STRAY * longer / 1600
     for attempt in range(3):
         _, camera, distortion, turns, shifts = cv2.calibrateCamera(
             [sight.points.astype(np.float32) for sight in sights],
             [sight.pixels.astype(np.float32) for sight in sights],
-            (width, height), camera.copy(), np.zeros(5), flags=flags,
+            (width, height), camera.copy(), given.copy(), flags=flags,
         )  # fmt: skip
         errors = [
             np.linalg.norm(cv2.projectPoints(s.points, r, t, camera, distortion)[0].reshape(-1, 2) - s.pixels, axis=1)
             for s, r, t in zip(sights, turns, shifts)
         ]
-        allowed = max(limit, _TIMES * float(np.median(np.concatenate(errors))))
+        allowed = max(
+            limit, _TIMES * longer * float(np.median(np.concatenate([*known, *(e / longer for e in errors)])))
+        )
         if attempt == 2 or max(error.max() for error in errors) <= allowed:
             break
         kept = []
@@ -121,6 +144,7 @@ def _calibrate(sights: list[_Sight], photo: Photo, result: Registration) -> None
         if not kept:
             break
         sights = kept
+    known += [error / longer for error in errors]
     coefficients = np.ravel(distortion)[:2]
     lens = Lens(
         width, height, float(camera[0, 0]), float(camera[1, 1]), float(camera[0, 2]), float(camera[1, 2]), "OPENCV",
@@ -136,3 +160,4 @@ def _calibrate(sights: list[_Sight], photo: Photo, result: Registration) -> None
         result.lenses[sight.file] = lens
         result.errors[sight.file] = float(error.mean())
         result.observations[sight.file] = len(sight.points)
+    return lens

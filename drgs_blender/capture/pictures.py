@@ -20,24 +20,27 @@ from ..core.asset.archive import replace_by
 from ..core.color import linear_to_srgb, to_unit
 from ..core.errors import AssetError, first_of
 from ..core.file_types import VIDEOS
+from ..formats.exr import write_exr_picture
 from ..reconstruct.readers.layout import PICTURES, decode_mask, find_mask, load_picture
 from . import libraries
+from .camera_raw import RAW, decode_raw, read_raw_metadata
 from .exif import Metadata, read_exif, read_exr_metadata
 
 logger = logging.getLogger(__name__)
 
 #: Extensions, lower case.
 PHOTOGRAPHS = frozenset(end.lower() for end in PICTURES)
-RAW = frozenset((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"))
 LINEAR = frozenset((".exr",))
 _TIFF = frozenset((".tif", ".tiff"))
 #: Of other programs' photographs: named, not read.
 UNREAD = frozenset((".heic", ".heif", ".avif", ".hdr", ".jxl"))
 #: Where the photographs of a folder are, the first that has some.
-_FOLDERS = ("images", "photos", "input", ".")
+FOLDERS = ("images", "photos", "input", ".")
+#: Where their masks are.
+MASKS = "masks"
 _QUALITY = 97
-#: What the report says of pixels that are written as white.
-CLIPPED = "brighter than white and clipped"
+#: Part of the pixels that may be brighter than white and are written as white.
+_SPECKS = 1e-5
 #: EXIF orientation -> (quarter turns counter-clockwise, mirrored left to right afterwards); EXIF 2.3 figure 19.
 _TURNS = {1: (0, 0), 2: (0, 1), 3: (2, 0), 4: (2, 1), 5: (3, 1), 6: (3, 0), 7: (1, 1), 8: (1, 0)}
 
@@ -106,10 +109,10 @@ def has_pictures(source: Path) -> bool:
 
 
 def _photographs(source: Path) -> list[Path]:
-    """The photographs of a folder, of the first of `_FOLDERS` that has some, in the order of their names."""
+    """The photographs of a folder, of the first of `FOLDERS` that has some, in the order of their names."""
     if not source.is_dir():
         return []
-    for folder in (source / name for name in _FOLDERS):
+    for folder in (source / name for name in FOLDERS):
         if folder.is_dir():
             files = [p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")]
             found = [p for p in files if p.suffix.lower() in PHOTOGRAPHS | RAW | LINEAR]
@@ -146,12 +149,12 @@ def find_pictures(source: Path) -> list[Picture]:
             source, len(raw), " where no developed picture is beside them" if beside else "", first_of(raw),
         )  # fmt: skip
         paths = [path for path in paths if path.suffix.lower() not in RAW]
-    root = paths[0].parent.parent if paths and paths[0].parent.name in _FOLDERS else source
+    root = paths[0].parent.parent if paths and paths[0].parent.name in FOLDERS else source
     pictures, broken, names = [], [], set()
     for path in paths:
         name = path.stem if path.stem not in names else path.name.replace(".", "_")
         names.add(name)
-        mask = find_mask(root / "masks", path) or find_mask(source / "masks", path)
+        mask = find_mask(root / MASKS, path) or find_mask(source / MASKS, path)
         try:
             pictures.append(_described(Picture(path, name, mask)))
         except AssetError as error:
@@ -182,6 +185,7 @@ def _described(picture: Picture) -> Picture:
     if suffix in RAW:
         height, width = decode(picture).shape[:2]
         picture.size = width, height
+        picture.exif = read_raw_metadata(picture.path, picture.size)
         return picture
     try:
         with Pillow.open(picture.path) as image:
@@ -224,8 +228,7 @@ def decode(picture: Picture) -> Array:
         The file cannot be read.
     """
     if picture.path.suffix.lower() in RAW:
-        with libraries.load("rawpy").imread(str(picture.path)) as raw:
-            return np.asarray(raw.postprocess(use_camera_wb=True, no_auto_bright=True))
+        return decode_raw(picture.path)
     pixels = _stored(picture)
     if pixels.shape[2] == 4 and not (picture.alpha and to_unit(pixels[..., 3].min()) < 1):
         pixels = np.ascontiguousarray(pixels[..., :3])
@@ -290,7 +293,7 @@ def write_picture(picture: Picture, folder: Path) -> Path:
     """Write a photograph into `folder`, upright; the file's path.
 
     A file that is upright already is copied as it is, and so is one merged from brackets. Others stay JPEG, or become
-    PNG, of more than 8 bits TIFF. An alpha that does not count is left out.
+    PNG, of more than 8 bits TIFF, or EXR where they are brighter than white. An alpha that does not count is left out.
     """
     suffix = picture.path.suffix.lower()
     plain = (suffix in PHOTOGRAPHS and picture.exif.orientation == 1) or bool(picture.merged)
@@ -310,9 +313,11 @@ def write_picture(picture: Picture, folder: Path) -> Path:
         replace_by(target, lambda path: Pillow.fromarray(pixels).save(path, "PNG"))
         return target
     if pixels.dtype.kind == "f":
-        above = float((pixels[..., :3].max(axis=2) > 1).mean())
-        if above > 1e-3:
-            picture.notes.append(f"{above:.1%} of its pixels are {CLIPPED}")
+        if float((pixels[..., :3].max(axis=2) > 1).mean()) > _SPECKS:
+            target = folder / f"{picture.name}.exr"
+            alpha = np.clip(pixels[..., 3:], 0, 1)
+            write_exr_picture(target, np.dstack([pixels[..., :3] * alpha, alpha]) if alpha.size else pixels)
+            return target
         colour = linear_to_srgb(np.clip(pixels[..., :3], 0, 1))
         pixels = np.asarray(np.dstack([colour, np.clip(pixels[..., 3:], 0, 1)]) * 65535 + 0.5, np.uint16)
     target = folder / f"{picture.name}.tif"

@@ -118,7 +118,7 @@ def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, can
     if capture_folder.complete(folder, digest):
         shutil.rmtree(work, ignore_errors=True)
         return Made(folder, 0, 0, {}, "", 0.0, kept=True, lines=[f"{folder}: is made of the same pictures already"])
-    _keep_work(work, digest)
+    _keep_work(work, work_key(given, settings))
     if film is not None:
         given = _frames(film, work, settings.frames, _part(tell, 0.0, 0.1), cancelled)
     unread, bracket_lines = {}, []
@@ -177,8 +177,13 @@ def _part(tell: Tell, start: float, end: float) -> Tell:
     return lambda phase, part: tell(phase, start + (end - start) * part)
 
 
+def work_key(given: list[Picture], settings: Settings) -> str:
+    """Fingerprint of what features and matches depend on."""
+    return pictures.digest(given, settings.frames, settings.size, settings.brackets)
+
+
 def _keep_work(work: Path, digest: str) -> None:
-    """Empty the folder of work unless it is that of the same inputs and settings."""
+    """Empty the folder of work unless it is that of the same pictures, prepared in the same way."""
     mark = work / "inputs"
     if not mark.is_file() or mark.read_text(encoding="utf-8") != digest:
         shutil.rmtree(work, ignore_errors=True)
@@ -209,11 +214,10 @@ def _cameras(ready: Prepared, photos: list[Photo], ups: dict[str, gravity.Vector
         logger.info("%s: %d of %d pictures show the %s marker sheet", source, len(marked.matrices), len(photos), paper)
     if settings.poses == "markers" and (marked is None or len(marked.matrices) < FEWEST):
         count = 0 if marked is None else len(marked.matrices)
-        needed = "" if libraries.is_there("opencv") else "OpenCV is not installed: pip install opencv-python-headless. "
         raise AssetError(
             str(source),
             f"shows a marker sheet in {count} pictures, of {FEWEST} that are needed",
-            f"{needed}Print one (drgs markers), keep it flat, and let each picture show several markers",
+            "Print one (drgs markers), keep it flat, and let each picture show several markers",
         )
     if marked is not None and sheet is not None:
         enough = len(marked.matrices) >= max(FEWEST, _MARKED * len(photos))
@@ -307,10 +311,20 @@ def _tell_left_out(found: Registration, photos: list[Photo], by_file: dict[str, 
             "others", source, len(found.unsound), len(photos),
             ", ".join(f"{out[file]} ({why})" for file, why in found.unsound.items()),
         )  # fmt: skip
+    if found.moved is not None:
+        files = [photo.file for photo in photos if photo.file in found.matrices]
+        moment = files.index(found.moved)
+        last, first = (by_file[file].path.name for file in files[moment - 1 : moment + 1])
+        logger.warning(
+            "%s: the object or a part of it moved between %s and %s: it is there twice. Use the pictures of one place "
+            "alone (%d pictures before it, %d after), or photograph it again", source, last, first, moment,
+            len(files) - moment,
+        )  # fmt: skip
     for group in found.apart:
         logger.warning(
             "%s: %d pictures fit together but share nothing with the others, as of another object: %s. Give them "
-            "a folder of their own, or add pictures between", source, len(group), first_of(group),
+            "a folder of their own, or add pictures between", source, len(group),
+            first_of([by_file[file].path.name for file in group]),
         )  # fmt: skip
 
 
@@ -326,8 +340,9 @@ def _lines(made: Made) -> list[str]:
 
 
 def check_settings(settings: Settings) -> None:
-    """Raise UsageError for unknown settings."""
+    """Raise UsageError for unknown settings, and DeviceError where a library that they need is absent."""
     if settings.poses not in POSES:
         raise UsageError("poses", f"is {settings.poses!r}", f"Choose from {', '.join(POSES)}")
     brackets.check_setting(settings.brackets)
+    libraries.load("opencv" if settings.poses == "markers" else "pycolmap")
     mask_stage.check_mode(settings.masks)

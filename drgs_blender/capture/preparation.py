@@ -15,7 +15,7 @@ from ..core.asset.archive import replace_by
 from ..core.errors import AssetError, Cancelled, DeviceError, first_of
 from ..reconstruct.readers.layout import decode_mask
 from .features import Photo, Tell
-from .inspection import SHARPNESS_SIZE, Look, look
+from .inspection import Look, look
 from .marker_sheet import detect
 from .pictures import Picture, decode, mask_of_alpha, reduced, shown
 
@@ -88,8 +88,8 @@ def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bo
             continue
         height, width = small.shape[:2]
         result.pictures.append(picture)
-        result.photos.append(Photo(file, picture.lens, picture.exif.focal, (width, height)))
-        result.looks.append(_look(small, mask))
+        result.photos.append(Photo(file, picture.lens, picture.exif.focal, (width, height), picture.path.name))
+        result.looks.append(look(small, mask))
         if mask is not None:
             result.masks = masks
         else:
@@ -98,7 +98,7 @@ def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bo
             try:
                 result.markers[file] = detect(np.asarray(Pillow.fromarray(small).convert("L")))
             except DeviceError as error:
-                logger.info("markers are not looked for: %s", error)
+                logger.warning("marker sheets are not looked for: %s", error)
                 seek_markers = False
     _tell_unmasked(result, unmasked)
     return result
@@ -134,11 +134,3 @@ def _small(picture: Picture, copy: Path, mask_copy: Path, size: int) -> tuple[Ar
         return small, None
     with Pillow.open(mask_copy) as image:
         return small, np.asarray(image.convert("L")) > 127
-
-
-def _look(small: Array, mask: Array | None) -> Look:
-    tiny = reduced(small, SHARPNESS_SIZE)
-    if mask is not None:
-        size = tiny.shape[1], tiny.shape[0]
-        mask = np.asarray(Pillow.fromarray(mask.astype(np.uint8)).resize(size, Pillow.Resampling.NEAREST)) > 0
-    return look(tiny, mask)

@@ -15,7 +15,7 @@ from ..core.arrays import Array
 from ..core.errors import AssetError, Cancelled
 from ..reconstruct.readers.layout import OPENCV_TO_BLENDER, invert
 from ..reconstruct.readers.lens import Lens
-from . import libraries, soundness
+from . import libraries, moved_object, soundness
 from .features import Photo, Tell
 
 logger = logging.getLogger(__name__)
@@ -53,6 +53,8 @@ class Registration:
         Files of further models that share nothing with this one.
     unsound : dict of str to str
         File that was registered and is left out -> why its camera cannot be trusted.
+    moved : str, optional
+        The first file in whose picture a part of the scene stands elsewhere than in those before it.
     """
 
     matrices: dict[str, Array]
@@ -64,6 +66,7 @@ class Registration:
     method: str
     apart: list[list[str]] = field(default_factory=list)
     unsound: dict[str, str] = field(default_factory=dict)
+    moved: str | None = None
 
 
 def _default(options: Any) -> None:
@@ -157,6 +160,7 @@ def register(database: Path, pictures: Path, work: Path, photos: Sequence[Photo]
     found.unsound = {name: why for name, why in unsound.items() if name not in found.matrices}
     if len(found.matrices) < max(FEWEST, PART * len(photos)):
         _refuse(list(found.matrices), photos, subject)
+    found.moved = moved_object.moved_at(colmap, best, database, [photo.file for photo in photos])
     return found
 
 
@@ -260,7 +264,7 @@ def _read(model: Any, method: str, apart: list[list[str]]) -> Registration:
 
 def _refuse(registered: list[str], photos: Sequence[Photo], subject: str) -> None:
     """Raise AssetError with the pictures that are not registered."""
-    missing = [photo.file for photo in photos if photo.file not in registered]
+    missing = [photo.given or photo.file for photo in photos if photo.file not in registered]
     listed = ", ".join(missing[:40]) + (", ..." if len(missing) > 40 else "")
     raise AssetError(
         subject,

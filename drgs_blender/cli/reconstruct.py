@@ -164,6 +164,7 @@ def run(args: argparse.Namespace) -> int:
     check_writable(args.out, (args.capture,))
 
     reconstruct = reconstruction()
+    from ..capture.inspection import tell_of_views
     from ..capture.masks.default_mode import resolve_mode
     from ..capture.masks.stage import check_mode
     from ..capture.normal_model import load_model
@@ -179,8 +180,9 @@ def run(args: argparse.Namespace) -> int:
         load_model(reading.normals)
     source = args.capture if calibrated else _find_cameras(args, reading, masks)
     capture = read_capture(source, reading.resolution, reading.test_every, reading.axes, reading.up)
-    if calibrated:
+    if calibrated:  # else `drgs capture` has looked at them
         tell_unused(reading, args.capture, calibrated)
+        tell_of_views(capture)
     if calibrated or masks == "none":  # else `drgs capture` has made them
         _mask(args, capture, masks)
     if reading.normals != NONE:
@@ -201,7 +203,8 @@ def run(args: argparse.Namespace) -> int:
             raise
         finally:
             _remove_if_empty(work)  # where there is nothing to go on from
-    asset.provenance["settings"] = as_tables(settings, reading)
+    # Beside those that `reconstruct` kept, of which some follow from the photographs and this machine.
+    asset.provenance["settings"]["capture"] = as_tables(settings, reading)["capture"]
     write_and_report(args.out, asset)
     clear(work)
     report = asset.provenance["report"]

@@ -56,6 +56,8 @@ SURFEL_TIME_FRACTION, MESH_SURFEL_TIME_FRACTION = 0.45, 0.15
 MATERIAL_TIME_FRACTION = 0.35
 #: Voxels where none are asked for and each face gets a surfel, or time decides.
 FEW_VOXELS = 256
+#: Fewer views than this leave the shape open between them.
+FEW_VIEWS = 5
 #: Fewer steps of materials than this separate them poorly from the light.
 FEW_STEPS = 300
 #: Phase -> the settings that decide its result.
@@ -131,6 +133,8 @@ def reconstruct(
     if idle := settings.without_effect():
         log.warning("%s: no effect with variant %s, materials %s", first_of(idle), settings.variant, settings.materials)
     region = find_region(capture)
+    if (count := len(capture.training)) < FEW_VIEWS:
+        log.warning("%s: only %d views, too few for shape, materials and light. Take 30", capture.source, count)
     voxels = _voxels(settings, [view.camera for view in capture.training], region)
     settings = replace(settings, mesh_resolution=voxels)  # for the asset, and a run that goes on with other memory
     work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)

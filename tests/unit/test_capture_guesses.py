@@ -18,6 +18,7 @@ from drgs_blender.capture.pictures import Picture, decode, find_pictures, write_
 from drgs_blender.capture.preparation import prepare
 from drgs_blender.capture.world_alignment import GUESSED, LOWEST, PLANE, Alignment, align_to_ground
 from drgs_blender.core.color import srgb_to_linear
+from drgs_blender.core.errors import DeviceError, UsageError
 from drgs_blender.formats.exr import write_exr_picture
 from drgs_blender.formats.images import load_image
 from drgs_blender.reconstruct.readers import read_capture
@@ -215,10 +216,11 @@ def test_what_is_guessed_is_told_then_and_again_by_reconstruct(tmp_path, caplog)
     assert "up (" not in caplog.text and "ground (lowest points)" in caplog.text
 
 
-def test_what_is_clipped_is_told(tmp_path, caplog):
-    written_capture(tmp_path, align_to_ground(registration(ring(6), scene(True))), bright=2)
-    (told,) = [text for text in caplog.messages if "clipped" in text]
-    assert "2 pictures have pixels brighter than white" in told and "00.jpg.exr, 01.jpg.exr" in told
+def test_what_is_brighter_than_white_stays_so(tmp_path):
+    folder = written_capture(tmp_path, align_to_ground(registration(ring(6), scene(True))), bright=2)
+    views = read_capture(folder, 64).views
+    assert [view.above_white is not None for view in views] == [True] * 2 + [False] * (len(views) - 2)
+    assert views[0].above_white.max() > 0.5 and views[0].colour.max() > 0.999
 
 
 def test_what_is_known_is_not_doubted(tmp_path, caplog):
@@ -243,3 +245,47 @@ def test_deep_tiff_with_alpha_is_read_back(tmp_path):
     picture = Picture(tmp_path / "a.exr", "a", size=(96, 64))
     write_with_alpha(picture.path, 0, MASK)
     assert load_image(write_picture(picture, tmp_path)).shape == (64, 96, 4)
+
+
+def test_a_capture_may_lie_beside_its_photographs(tmp_path):
+    capture_folder.open_folder(tmp_path / "a.capture", tmp_path)
+    for taken in (tmp_path, tmp_path / "images", tmp_path / "masks" / "new"):
+        with pytest.raises(UsageError, match="is where the pictures or masks are"):
+            capture_folder.open_folder(taken, tmp_path)
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "file").touch()
+    with pytest.raises(UsageError, match="holds other files"):
+        capture_folder.open_folder(other, tmp_path)
+
+
+def test_a_capture_without_one_of_its_pictures_is_made_again(tmp_path):
+    alignment = align_to_ground(registration(ring(6), scene(True)))
+    folder = written_capture(tmp_path, alignment)
+    report = json.loads((folder / "capture.json").read_text())
+    (folder / "capture.json").write_text(json.dumps(report | {"digest": "same"}))
+    assert capture_folder.complete(folder, "same") and not capture_folder.complete(folder, "other")
+    next((folder / "images").iterdir()).unlink()
+    assert not capture_folder.complete(folder, "same")
+
+
+@pytest.mark.parametrize(
+    ("library", "settings"),
+    [("pycolmap", {}), ("opencv", {"poses": "markers"}), ("opencv", {"masks": "auto"}), ("torch", {"masks": "auto"})],
+)
+def test_missing_libraries_are_told_before_anything_is_done(tmp_path, monkeypatch, library, settings):
+    row = pipeline.libraries.LIBRARIES[library]
+    monkeypatch.setitem(pipeline.libraries.LIBRARIES, library, row._replace(module="no_such_module"))
+    texture(0).save(tmp_path / "a.jpg")
+    with pytest.raises(DeviceError, match=f"needs {library}"):
+        pipeline.make_capture(tmp_path, tmp_path / "out", pipeline.Settings(**settings), print, lambda: False)
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_masks_or_scale_keep_the_work_that_was_done(tmp_path):
+    """What is registered depends on the pictures and how they are prepared alone."""
+    for k in range(3):
+        texture(k).save(tmp_path / f"{k}.jpg")
+    given = pipeline.pictures.find_pictures(tmp_path)
+    keys = {pipeline.work_key(given, pipeline.Settings(**more)) for more in ({}, {"distance": 2.0}, {"masks": "auto"})}
+    assert len(keys) == 1 and pipeline.work_key(given, pipeline.Settings(size=800)) not in keys

@@ -405,6 +405,20 @@ def test_masks_of_a_capture_are_made_only_where_it_has_none(captures, caplog):
     assert (level[:, 2, 3] > 0.2).all()
 
 
+def test_given_masks_that_cut_the_object_are_named_and_drawn(captures, caplog):
+    given = captures.make()
+    for view, true in zip(given.views, captures.masks, strict=True):
+        view.mask = true.astype(np.float32)
+    captures.mask(given, "given")
+    assert not caplog.messages and not captures.sheet.exists()
+    rows = np.flatnonzero(given.views[2].mask.any(axis=1))
+    given.views[2].mask[: rows.mean().astype(int)] = 0
+    captures.mask(given, "given")
+    (told,) = caplog.messages
+    assert f"1 of 6 masks do not fit the others, or their cameras do not: {given.views[2].name} (" in told
+    assert captures.sheet.exists()
+
+
 def test_masks_and_a_background_of_one_colour_are_left_out_when_asked(captures):
     from drgs_blender.reconstruct.meshing.visual_hull import have_silhouettes
 

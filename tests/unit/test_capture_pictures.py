@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import io
+from pathlib import Path
+
 import numpy as np
 import pytest
+from capture_cases import balls
 from PIL import ExifTags, Image, ImageFilter, ImageOps
+from scipy.ndimage import convolve, uniform_filter
 
 from drgs_blender.capture import pictures
-from drgs_blender.capture.exif import read_exif
-from drgs_blender.capture.inspection import FEWEST, inspect, look
+from drgs_blender.capture.exif import Metadata, read_exif
+from drgs_blender.capture.inspection import FEWEST, inspect, look, tell_of_views
 from drgs_blender.capture.pictures import Picture, decode, find_pictures, has_pictures, shown, write_picture
+from drgs_blender.core.color import linear_to_srgb, srgb_to_linear
 from drgs_blender.core.errors import AssetError
 from drgs_blender.formats.exr import write_exr_picture
 
@@ -68,8 +74,11 @@ def test_linear_and_deep_pictures_are_read_and_keep_their_depth(tmp_path):
     out.mkdir()
     written = Picture(write_picture(picture, out), "a")
     pixels = decode(written)
+    np.testing.assert_array_equal(pixels, linear)  # as one value is brighter than white
+    linear[0, 0] = 1.0
+    write_exr_picture(tmp_path / "a.exr", linear)
+    pixels = decode(Picture(write_picture(picture, out), "a"))
     assert pixels.dtype == np.uint16 and pixels[4, 4, 0] == pytest.approx(0.4614 * 65535, rel=1e-3)
-    assert "brighter than white" in picture.notes[0]
 
 
 def test_masks_of_another_shape_are_refused_by_name(tmp_path):
@@ -115,10 +124,6 @@ def test_folders_with_pictures_are_known(tmp_path):
 
 def looks(images, exposures=None):
     """(pictures, looks) of images in memory."""
-    from pathlib import Path
-
-    from drgs_blender.capture.exif import Metadata
-
     exposures = exposures or [None] * len(images)
     made = [Picture(Path(f"{k}.jpg"), str(k), exif=Metadata(exposure=e), size=im.size)
             for k, (im, e) in enumerate(zip(images, exposures))]  # fmt: skip
@@ -159,4 +164,91 @@ def test_too_few_pictures_are_refused():
 def test_different_exposures_and_sizes_are_told(caplog):
     images = [texture(k, *((96, 64) if k % 2 else (64, 96))) for k in range(6)]
     inspect(*looks(images, [10.0, 10.0, 10.0, 12.0, 10.0, 10.0]), "photos")
-    assert "2.0 stops" in caplog.text and "64 x 96" in caplog.text
+    assert "2.0 stops" in caplog.text and "3 of 64 x 96: 0.jpg, 2.jpg, 4.jpg" in caplog.text
+
+
+def exposed(image: Image.Image, stops: float) -> Image.Image:
+    linear = srgb_to_linear(np.asarray(image) / 255) * 2.0**stops
+    return Image.fromarray((linear_to_srgb(linear.clip(0, 1)) * 255 + 0.5).astype(np.uint8))
+
+
+@pytest.mark.parametrize("spread", [2.5, 4.0])
+def test_brightness_says_how_far_exposures_without_exif_are_apart(caplog, spread):
+    stops = np.linspace(0, -spread, 8)[[3, 0, 5, 1, 7, 2, 6, 4]]
+    images = [exposed(Image.eval(texture(k), lambda v: v // 2), s) for k, s in enumerate(stops)]
+    inspect(*looks(images), "photos")
+    (line,) = [r.getMessage() for r in caplog.records if "brightness" in r.getMessage()]
+    assert float(line.partition("differ by ")[2].split()[0]) == pytest.approx(spread, abs=0.3)
+    assert "from 4.jpg (darkest) to 1.jpg" in line
+
+
+def test_exposures_count_where_one_picture_does_not_say_its_own(caplog):
+    images = [texture(k) for k in range(20)]
+    inspect(*looks(images, [None, *(10.0 + 2 * (k % 2) for k in range(18)), 12.5]), "photos")
+    (line,) = [r.getMessage() for r in caplog.records if "exposures differ" in r.getMessage()]
+    assert "2.5 stops (EXIF), from 19.jpg (least light) to 1.jpg" in line and "for 1 pictures that do not say" in line
+
+
+def test_unknown_focal_lengths_are_told_once_with_names(caplog):
+    pictures, seen = looks([texture(k) for k in range(20)])
+    for picture in pictures[2:]:
+        picture.exif = Metadata(focal=1.2)
+    inspect(pictures, seen, "photos")
+    (line,) = [r.getMessage() for r in caplog.records if "lens was" in r.getMessage()]
+    assert line.startswith("photos: 2 of 20 pictures") and "0.jpg, 1.jpg" in line
+
+
+@pytest.mark.parametrize("along", ["rows", "columns", "diagonal"])
+def test_pictures_of_a_camera_that_moved_are_blurred(along):
+    """Along the edges they stay sharp: the variance of the Laplacian has a tenth of the others' left."""
+    path = 15
+    kernel = {"rows": np.ones((1, path)), "columns": np.ones((path, 1)), "diagonal": np.eye(path)}[along]
+    images = [texture(k, 480, 320) for k in range(8)]
+    moved = np.stack([convolve(c, kernel / path) for c in np.moveaxis(np.asarray(images[3], float), 2, 0)], axis=2)
+    images[3] = Image.fromarray(moved.astype(np.uint8))
+    assert set(inspect(*looks(images), "photos")[1]) == {"3.jpg"}
+
+
+def turntable(degrees: float, side: int, seed: int = 0, width: int = 480, height: int = 360) -> Image.Image:
+    """A textured cylinder, `side` pixels wide and half as high again, before a plain backdrop with noise of its own."""
+    random = np.random.default_rng(5)
+    cover = 0.5 + 0.5 * (random.random((16, 64)) - 0.5)
+    grey = np.linspace(0.5, 0.6, width)[None].repeat(height, 0)
+    angle = np.arcsin((np.arange(side) + 0.5) / side * 2 - 1) + np.radians(degrees)
+    column = np.floor(angle / (2 * np.pi) * 64).astype(int) % 64
+    rows = np.arange(3 * side // 2) * 16 // (3 * side // 2)
+    top, left = (height - len(rows)) // 2, (width - side) // 2
+    grey[top : top + len(rows), left : left + side] = cover[rows][:, column]
+    grey = grey + 0.01 * np.random.default_rng(seed).standard_normal(grey.shape)
+    return Image.fromarray((grey.clip(0, 1) * 255).astype(np.uint8)).convert("RGB")
+
+
+@pytest.mark.parametrize("part", [0.01, 0.02, 0.04])
+def test_small_objects_on_a_turntable_are_not_taken_for_duplicates(part):
+    side = round((part * 480 * 360 / 1.5) ** 0.5)
+    assert not inspect(*looks([turntable(10 * k, side, k) for k in range(12)]), "photos")[1]
+
+
+@pytest.mark.parametrize(("quality", "part"), [(95, 1.0), (60, 1.0), (90, 0.5)])
+def test_a_picture_that_was_compressed_again_or_made_smaller_is_a_duplicate(quality, part):
+    images = [turntable(10 * k, 48, k, 960, 720) for k in range(8)]
+    again = io.BytesIO()
+    small = images[4].resize((round(960 * part), round(720 * part)), Image.Resampling.LANCZOS)
+    small.save(again, "JPEG", quality=quality)
+    images.insert(1, Image.open(again).convert("RGB"))
+    left_out = inspect(*looks(images), "photos")[1]
+    assert left_out.keys() == ({"1.jpg"} if part < 1 else {"5.jpg"})
+
+
+def test_views_with_cameras_are_told_and_kept(caplog):
+    capture = balls(8, 64, masks=False)
+    views = capture.training
+    for k, view in enumerate(views):
+        view.colour = np.asarray(texture(k, 64, 64), np.float32) / 255
+    views[1].colour = uniform_filter(views[1].colour, (5, 1, 1))  # it moved
+    views[3].colour = views[2].colour.copy()
+    tell_of_views(capture)
+    blurred, twice = [record.getMessage() for record in caplog.records]
+    assert "1 photographs are blurred" in blurred and f"{views[1].name} (" in blurred
+    assert "1 photographs show the same" in twice and f"{views[3].name} ({views[2].name})" in twice
+    assert len(capture.training) == len(views)

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from drgs_blender.cli.main import main
+from drgs_blender.core.color import linear_to_srgb, srgb_to_linear
 from drgs_blender.core.errors import AssetError, UsageError
 from drgs_blender.reconstruct.readers import BYTES_A_PIXEL, read_capture
 from drgs_blender.reconstruct.readers.lens import MODELS, Lens, distort, lens_of, resample, undistorted
@@ -161,6 +162,46 @@ def before_clutter(scene):
         pixels = np.where(pixels[..., 3:] > 0, pixels[..., :3], behind).astype(np.uint8)
         Image.fromarray(pixels).save(scene.folder / "train" / f"r_{k}.png")
     return path
+
+
+@pytest.mark.parametrize("unknown", [False, True])
+def test_photographs_of_different_exposures_come_out_alike(tmp_path, caplog, unknown):
+    file = captures.write_nerf(captures.make(tmp_path, 9))
+    before = read_capture(tmp_path).views
+    text = json.loads(file.read_text())
+    stops = [0.0, 1.5, -1.0, 0.0, 0.0, 2.0, -2.0, 0.0, -0.5]  # of light; the median is 0
+    for frame, more in zip(text["frames"], stops, strict=True):
+        path = tmp_path / f"{frame['file_path']}.png"
+        pixels = np.asarray(Image.open(path)) / np.float32(255)
+        pixels[..., :3] = linear_to_srgb(srgb_to_linear(pixels[..., :3]) * 2.0**more).clip(0, 1)
+        Image.fromarray((pixels * 255 + 0.5).astype(np.uint8)).save(path)
+        if not (unknown and more == 0):
+            frame["exposure_value"] = 10.0 - more
+    file.write_text(json.dumps(text))
+    caplog.clear()
+    after = read_capture(tmp_path).views
+    (line,) = [record.getMessage() for record in caplog.records if "exposures" in record.getMessage()]
+    assert "differ by 4.0 stops (EXIF), from r_6.png (least light) to r_5.png" in line
+    assert ("4 photographs that do not say theirs" in line) == unknown
+    for one, other, more in zip(before, after, stops, strict=True):
+        stored = linear_to_srgb(srgb_to_linear(one.colour) * 2.0**more)
+        gain = 2.0**-0.5 if unknown and more else 1.0  # to the median of those that are known
+        wanted = linear_to_srgb(srgb_to_linear(one.colour) * gain).clip(0, 1)
+        inside = (one.mask > 0.99)[..., None]
+        assert np.abs(other.colour - wanted)[inside & (stored < 0.975)].max() < 0.03
+        assert other.colour[inside & (stored > 1)].min(initial=1.0) == 1.0  # known to be clipped, as before
+
+
+def test_exposures_that_exif_rounds_are_left_alone(tmp_path, caplog):
+    file = captures.write_nerf(captures.make(tmp_path, 4))
+    before = [view.colour for view in read_capture(tmp_path).views]
+    text = json.loads(file.read_text())
+    for k, frame in enumerate(text["frames"]):
+        frame["exposure_value"] = (10.0, 10.09, True, "bright")[k]
+    file.write_text(json.dumps(text))
+    caplog.clear()
+    assert all(np.array_equal(a, view.colour) for a, view in zip(before, read_capture(tmp_path).views, strict=True))
+    assert "exposures" not in caplog.text
 
 
 def test_real_surroundings_are_not_taken_for_a_backdrop(tmp_path, caplog):

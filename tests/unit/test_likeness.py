@@ -34,7 +34,9 @@ def pixels(mesh: Mesh, colour: np.ndarray) -> Pixels:
     face = np.tile(face, VIEWS)
     third, none = np.full((len(face), 3), 1 / 3, np.float32), np.zeros((len(face), 3), np.float32)
     place = np.arange(len(face), dtype=np.int32)
-    return Pixels(view, place, face, third, none, none, none, colour[view, face].astype(np.float32), none > 0, none)
+    return Pixels(
+        view, place, face, third, none, none, none, colour[view, face].astype(np.float32), none > 0, none > 0, none
+    )
 
 
 def painted(mesh: Mesh) -> np.ndarray:

@@ -254,6 +254,21 @@ def test_what_cannot_be_reconstructed_is_refused_by_name(case):
         reconstruct(capture, Settings(schedule=Schedule(iterations=2)))
 
 
+def test_few_views_are_told_before_anything_is_learned(caplog, monkeypatch):
+    def stop(*_):
+        raise Cancelled
+
+    monkeypatch.setattr("drgs_blender.reconstruct.pipeline.find_region", lambda _: None)
+    monkeypatch.setattr("drgs_blender.reconstruct.pipeline._voxels", stop)
+    for count in (4, 5):
+        caplog.clear()
+        capture = balls(count, 24, test_every=1000)
+        capture.views[0].test = False
+        with pytest.raises(Cancelled):
+            reconstruct(capture, Settings(schedule=Schedule(iterations=2)))
+        assert ("only 4 views" in caplog.text) == (count == 4)
+
+
 def test_more_voxels_than_memory_are_refused_before_anything_is_learned(capture, monkeypatch):
     monkeypatch.setattr("drgs_blender.reconstruct.memory_budget.total_memory", lambda: 1024.0)
     told = []

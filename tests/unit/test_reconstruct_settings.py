@@ -199,7 +199,7 @@ def test_masks_are_a_setting_that_the_asset_keeps(tmp_path, capsys, monkeypatch)
     photographs.mkdir()
     write(balls(8, 32), photographs)
     asset = object_asset(light(1))
-    asset.provenance["report"] = {"steps": {}}
+    asset.provenance |= {"report": {"steps": {}}, "settings": {}}
     monkeypatch.setattr("drgs_blender.reconstruct.pipeline.reconstruct", lambda *_: asset)
     monkeypatch.setattr("drgs_blender.capture.masks.of_capture.mask_capture", lambda _, mode, *__: modes.append(mode))
     words = ["reconstruct", str(photographs), "--out", str(tmp_path / "a.drgs")]
@@ -218,6 +218,22 @@ def test_masks_are_a_setting_that_the_asset_keeps(tmp_path, capsys, monkeypatch)
     monkeypatch.setattr("drgs_blender.capture.pipeline.make_capture", capture)
     monkeypatch.setattr("drgs_blender.capture.pictures.has_pictures", lambda _: True)
     assert main([*words, "--set", "capture.masks=auto"]) == 64 and modes[4:] == ["auto"]
+
+
+def test_repeated_photographs_with_cameras_are_told_before_the_long_work(tmp_path, capsys, monkeypatch):
+    photographs = tmp_path / "balls"
+    photographs.mkdir()
+    write(balls(8, 32), photographs)
+    (photographs / "005.png").write_bytes((photographs / "003.png").read_bytes())
+
+    def reconstruct(capture, *_):
+        assert len(capture.views) == 8 and "show the same as another one" in (said := capsys.readouterr().err)
+        assert "005 (003)" in said
+        raise UsageError("reconstruct", "is not tried")
+
+    monkeypatch.setattr("drgs_blender.reconstruct.pipeline.reconstruct", reconstruct)
+    assert main(["reconstruct", str(photographs), "--out", str(tmp_path / "a.drgs")]) == 64
+    assert "is not tried" in capsys.readouterr().err
 
 
 def test_settings_of_python_are_checked_too():

@@ -13,7 +13,7 @@ from .mask_view import MaskView
 from .object_box import ObjectBox
 
 #: Voxels along the longest side, part of views that may have a voxel outside, where nothing else is asked.
-_VOXELS, _TOLERANCE = 88, 0.1
+VOXELS, _TOLERANCE = 88, 0.1
 #: Margin of a box around the hull, in parts of its largest side.
 _MARGIN = 0.12
 #: Views that must see a voxel; number of views from which on one may always have it outside.
@@ -37,7 +37,7 @@ class Hull:
     """
 
     def __init__(self, cv2: Any, views: Sequence[MaskView], masks: Sequence[Array], box: ObjectBox,
-                 voxels: int = _VOXELS, tolerance: float = _TOLERANCE):  # fmt: skip
+                 voxels: int = VOXELS, tolerance: float = _TOLERANCE):  # fmt: skip
         self._cv2, self._tolerance = cv2, tolerance
         self.cell = float((box.high - box.low).max()) / voxels
         counts = np.maximum(np.ceil((box.high - box.low) / self.cell).astype(int), 1)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.errors import DeviceError
+from ...core.errors import first_of
 from ...reconstruct.capture.capture import Capture, View
 from ...reconstruct.meshing.visual_hull import have_silhouettes
 from ...reconstruct.readers.lens import Lens
@@ -18,20 +18,26 @@ from ..capture_folder import known_ground
 from ..features import Tell
 from ..registration import Registration
 from ..world_alignment import GUESSED, LOWEST, PLANE, align_to_ground
+from .contact_sheet import draw_contact_sheet
 from .making import make_masks
 from .mask_view import MaskView
 from .segmentation_model import SegmentationModel, load_model, masks_by_model
-from .settling import REMEDY
-from .stage import GROUND_IS_GUESSED, MODEL_UNUSED, MODES, NO_GROUND, ONLY_SOME
+from .settling import REMEDY, resized, whole
+from .stage import GROUND_IS_GUESSED, MODEL_UNUSED, MODES, NO_GROUND, ONLY_SOME, check_given
 
 logger = logging.getLogger(__name__)
+
+#: Masks that are checked against each other: no fewer, and of more evenly chosen ones.
+_FEWEST, _CHECKED = 6, 120
+#: Voxels of their hull, along its longest side: enough to find masks that cut the object.
+_COARSE = 44
 
 
 def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled: Callable[[], bool]) -> None:
     """Give the views masks where none has one ("auto", or a model), or take theirs away ("none"), in place.
 
-    Masks are learned from training views alone; views left out get those of what is learned, as they see it. A model
-    makes those of all views.
+    Those that are given ("given") are held against each other; with a warning they stay as they are. Masks are learned
+    from training views alone; views left out get those of what is learned, as they see it. A model makes those of all.
 
     Parameters
     ----------
@@ -39,11 +45,13 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
     mode : str
         One of `stage.MODES`, or a segmentation model.
     sheet : Path
-        Contact sheet to write where masks are made.
+        Contact sheet to write where masks are made, or given ones do not fit.
     tell, cancelled : callable
 
     Raises
     ------
+    DeviceError
+        Masks are to be made, and a library is absent, see `stage.check_mode`.
     Cancelled
         `cancelled` said so.
     """
@@ -55,6 +63,7 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
         return
     subject = str(capture.source)
     if mode == "given":
+        _check_given(capture, sheet, subject)
         return
     if have_silhouettes(capture):
         if mode not in MODES:
@@ -63,11 +72,7 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
     if masked := sum(view.mask is not None for view in capture.training):
         logger.warning(ONLY_SOME, subject, masked, len(capture.training))
         return
-    try:
-        cv2: Any = libraries.load("opencv")
-    except DeviceError as error:
-        logger.warning("%s: masks are not made: %s", subject, error)
-        return
+    cv2: Any = libraries.load("opencv")
     if mode not in MODES:
         _by_model(load_model(mode), capture, cv2, sheet, tell, cancelled)
         return
@@ -90,6 +95,26 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
     for view in capture.testing:
         if view.mask is None:
             view.mask = made.seen_by(cv2, _mask_view(view, found.matrices[view.name])).astype(np.float32) / 255
+
+
+def _check_given(capture: Capture, sheet: Path, subject: str) -> None:
+    """Name masks that do not fit the others, and draw all; nothing where too few are there, or OpenCV is not."""
+    views = [view for view in capture.training if view.mask is not None]
+    if len(views) < _FEWEST or not libraries.is_there("opencv"):
+        return
+    views = views[:: -(-len(views) // _CHECKED)]
+    cv2: Any = libraries.load("opencv")
+    small = [whole(_mask_view(view, np.asarray(view.camera.matrix_world, np.float64))) for view in views]
+    drawn = [np.asarray(view.mask, np.float32) * 255 for view in views]
+    masks = [resized(mask.astype(np.uint8), one) for mask, one in zip(drawn, small, strict=True)]
+    fits = check_given(cv2, small, masks, _COARSE)
+    doubtful = [str(fit) for fit in fits if fit.wrong]
+    if doubtful:
+        draw_contact_sheet(sheet, small, masks, fits)
+        logger.warning(
+            "%s: %d of %d masks do not fit the others, or their cameras do not: %s. Look at %s; draw them again, leave "
+            "these photographs out, or give --masks none", subject, len(doubtful), len(fits), first_of(doubtful), sheet,
+        )  # fmt: skip
 
 
 def _by_model(model: SegmentationModel, capture: Capture, cv2: Any, sheet: Path, tell: Tell,

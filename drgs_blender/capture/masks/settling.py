@@ -14,7 +14,7 @@ from ...core.arrays import Array
 from ...core.errors import first_of
 from ..world_alignment import look_at
 from .contact_sheet import draw_contact_sheet
-from .hull import Hull
+from .hull import VOXELS, Hull
 from .hull_check import Fit, check_masks
 from .mask_view import MaskView
 from .object_box import ObjectBox
@@ -78,7 +78,7 @@ def settle(cv2: Any, views: Sequence[MaskView], masks: list[Array], hull: Hull, 
     return True, fits
 
 
-def hull_of_masks(cv2: Any, views: Sequence[MaskView], masks: list[Array]) -> Hull | None:
+def hull_of_masks(cv2: Any, views: Sequence[MaskView], masks: list[Array], voxels: int = VOXELS) -> Hull | None:
     """The visual hull of masks, wherever it is; None where they have no part of the space in common.
 
     Parameters
@@ -87,14 +87,16 @@ def hull_of_masks(cv2: Any, views: Sequence[MaskView], masks: list[Array]) -> Hu
         OpenCV.
     views : sequence of MaskView
     masks : list of (h, w) bool arrays
+    voxels : int
+        Along the longest side.
     """
     box = _box_of_masks(views)
     for _ in range(2):  # around what the cameras look at, then around the hull
-        hull = Hull(cv2, views, masks, box)
+        hull = Hull(cv2, views, masks, box, voxels)
         if not hull.solid().any():
             return None
         box = hull.box(box, grounded=False)
-    return Hull(cv2, views, masks, box)
+    return Hull(cv2, views, masks, box, voxels)
 
 
 def _box_of_masks(views: Sequence[MaskView]) -> ObjectBox:

@@ -21,6 +21,7 @@ from ..pictures import Picture
 from ..registration import Registration
 from ..world_alignment import GUESSED, LOWEST
 from .contact_sheet import draw_contact_sheet
+from .hull import VOXELS
 from .hull_check import Fit, check_masks
 from .mask_view import MaskView
 from .segmentation_model import load_model, masks_by_model, model_file
@@ -53,12 +54,16 @@ class Masked:
 
 
 def check_mode(mode: str) -> None:
-    """Raise an error where `mode` is neither one of `MODES` nor a segmentation model that can be loaded."""
-    if mode in MODES:
+    """Raise an error where `mode` is neither one of `MODES` nor a model that can be loaded, or a library is absent."""
+    if mode in ("given", "none"):
         return
-    model_file(mode, MODES)
-    libraries.load("opencv")  # without which masks are not made, with a warning
-    load_model(mode)
+    if mode not in MODES:
+        model_file(mode, MODES)
+    libraries.load("opencv")
+    if mode == "auto":
+        libraries.load("torch")
+    else:
+        load_model(mode)
 
 
 def mode_on_ground(mode: str, given: Path | None, ground: str, subject: str) -> str:
@@ -113,6 +118,8 @@ def make_or_check(mode: str, found: Registration, by_file: dict[str, Picture], c
     ------
     AssetError
         A given mask does not fit the others, or a model makes no masks.
+    DeviceError
+        Masks are to be made, and a library is absent, see `check_mode`.
     Cancelled
         `cancelled` said so.
     """
@@ -122,7 +129,9 @@ def make_or_check(mode: str, found: Registration, by_file: dict[str, Picture], c
     try:
         cv2: Any = libraries.load("opencv")
     except DeviceError as error:
-        logger.warning("%s: masks are not %s: %s", subject, "made" if given is None else "checked", error)
+        if given is None:
+            raise
+        logger.warning("%s: masks are not checked: %s", subject, error)
         return Masked()
     files = sorted(found.matrices)
     views = [_view(file, by_file[file], found, copies) for file in files]
@@ -165,11 +174,6 @@ def _learned(cv2: Any, views: list[MaskView], pictures: list[Picture], sheet: Pa
 
     None, with a warning, where no object is found or they do not fit together.
     """
-    try:
-        libraries.load("torch")
-    except DeviceError as error:
-        logger.warning("%s: masks are not made: %s", subject, error)
-        return None, []
     from .making import make_masks  # with torch
 
     made, fits = make_masks(cv2, views, found.points, sheet, subject, tell, cancelled)
@@ -215,7 +219,7 @@ def _check_given(cv2: Any, views: list[MaskView], files: list[str], given: Path,
     return Masked(fits, [f"masks: {len(fits)} given ones fit each other", *_doubts(doubtful, subject, sheet)])
 
 
-def check_given(cv2: Any, views: list[MaskView], masks: list[Array]) -> list[Fit]:
+def check_given(cv2: Any, views: list[MaskView], masks: list[Array], voxels: int = VOXELS) -> list[Fit]:
     """Figures of masks against each other; none where they have no hull.
 
     Parameters
@@ -224,6 +228,8 @@ def check_given(cv2: Any, views: list[MaskView], masks: list[Array]) -> list[Fit
         OpenCV.
     views : list of MaskView
     masks : list of (h, w) bool arrays
+    voxels : int
+        Of the hull, along its longest side.
     """
-    hull = hull_of_masks(cv2, views, masks)
+    hull = hull_of_masks(cv2, views, masks, voxels)
     return [] if hull is None else check_masks(cv2, views, masks, hull)

@@ -27,6 +27,8 @@ class View:
         Left out of training.
     normals : (height, width, 3) float32 array, optional
         Unit, world space, 0 where not known: what a model says of the pixels (`capture.normals`).
+    above_white : (height, width, 3) float32 array, optional
+        How much brighter than white linear Rec.709 values are; None: of a picture that clips, or nowhere.
     """
 
     name: str
@@ -35,6 +37,7 @@ class View:
     mask: Array | None = None
     test: bool = False
     normals: Array | None = None
+    above_white: Array | None = None
 
 
 @dataclass(slots=True)

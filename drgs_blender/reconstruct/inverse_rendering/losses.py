@@ -1,11 +1,11 @@
-"""Losses of inverse rendering: pixels against photographs. Radiance is linear Rec.709; photographs lie in [0, 1]."""
+"""Losses of inverse rendering: pixels against photographs. Radiance is linear Rec.709."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-#: Values from here on are taken for clipped: the light may have been any stronger.
+#: Values from here on are taken for clipped, but of pictures that have brighter ones.
 CLIPPED = 0.98
 #: Knee and exponent that weigh differences nearly as sRGB encoding does.
 _KNEE, _EXPONENT = 0.03, 0.6
@@ -14,14 +14,14 @@ _KNEE, _EXPONENT = 0.03, 0.6
 _POLISHED, _SURELY = 0.95, 6
 
 
-def log_loss(predicted: Tensor, photographed: Tensor) -> Tensor:
-    """Mean absolute difference of log(1 + x), (n, 3) each; a clipped photograph sets no upper bound.
+def log_loss(predicted: Tensor, photographed: Tensor, clipped: Tensor) -> Tensor:
+    """Mean absolute difference of log(1 + x), (n, 3) each; where it is `clipped` a photograph sets no upper bound.
 
     Its expectation over noisy estimates is least for a scene with little noise, not for the true one: light is made
     even and surfaces rough.
     """
     difference = torch.log1p(photographed) - torch.log1p(predicted)
-    return torch.where(photographed >= CLIPPED, difference.clamp(min=0), difference.abs()).mean()
+    return torch.where(clipped, difference.clamp(min=0), difference.abs()).mean()
 
 
 def dullness(albedo: Tensor, metallic: Tensor) -> Tensor:
@@ -59,8 +59,9 @@ def _surely_metal(metallic: Tensor) -> Tensor:
 
 
 def unbiased_loss(
-    predicted: Tensor, photographed: Tensor, weight_by_prediction: bool = False, weights: Tensor | None = None
-) -> Tensor:
+    predicted: Tensor, photographed: Tensor, clipped: Tensor, weight_by_prediction: bool = False,
+    weights: Tensor | None = None,
+) -> Tensor:  # fmt: skip
     """Weighted squared error of two independent estimates (n, 2, 3) of each pixel.
 
     The product of both differences has the squared error of their mean value for expectation, without their variance,
@@ -68,7 +69,9 @@ def unbiased_loss(
 
     Parameters
     ----------
-    predicted, photographed : tensor
+    predicted : (n, 2, 3) tensor
+    photographed : (n, 3) tensor
+    clipped : (n, 3) bool tensor
     weight_by_prediction : bool
         Weigh by what is shown, not by what was photographed. Where the mesh is a little off, one place mirrors what the
         photographs show beside it, bright or dark; weights that are least for bright photographs make a mean of these
@@ -87,5 +90,5 @@ def unbiased_loss(
         product = weighed[:, 0] * weighed[:, 1]
     if weights is not None:
         product = product * weights
-    above = (photographed >= CLIPPED) & (difference.detach().mean(1) > 0)
+    above = clipped & (difference.detach().mean(1) > 0)
     return torch.where(above, torch.zeros_like(product), product).mean()

@@ -53,6 +53,8 @@ class Pixels:
         Unit: to the viewer.
     colour : (n, 3) float32 array
         Linear Rec.709 as photographed.
+    clipped : (n, 3) bool array
+        The light may have been any stronger.
     next_to_clipped : (n, 3) bool array
         Not clipped, but a pixel of the object `_BESIDE` away or nearer is, in this channel.
     detail_normal : (n, 3) float32 array
@@ -67,6 +69,7 @@ class Pixels:
     flat: Array
     towards: Array
     colour: Array
+    clipped: Array
     next_to_clipped: Array
     detail_normal: Array
 
@@ -151,6 +154,9 @@ def pixels_of(index: int, view: View, mesh: Mesh, tree: TriangleBVH, normals: No
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
     towards = -direction / np.linalg.norm(direction, axis=1, keepdims=True)
     colour = srgb_to_linear(view.colour)
+    clipped = colour >= CLIPPED if view.above_white is None else np.zeros(colour.shape, bool)
+    if view.above_white is not None:
+        colour = colour + view.above_white
     given = None if normals is None else np.asarray(normals(view), np.float32)
     part = Pixels(
         np.full(len(row), index, np.int32),
@@ -161,7 +167,8 @@ def pixels_of(index: int, view: View, mesh: Mesh, tree: TriangleBVH, normals: No
         flat,
         towards,
         colour.reshape(-1, 3)[row],
-        _beside(seen[..., None] & (colour >= CLIPPED))[row],
+        clipped.reshape(-1, 3)[row],
+        _beside(seen[..., None] & clipped)[row],
         np.zeros_like(flat) if given is None else unit(given.reshape(-1, 3)[row], (0, 0, 0)),
     )
     # A face seen from behind is an error of the mesh, or of its orientation: nothing can be learned there.

@@ -201,13 +201,13 @@ class Job:
             raise AssetError("mesh", "has no faces", "Decoupling needs the surface")
         if not capture.training:
             raise UsageError(str(capture.source), "has no training view", "Leave fewer views out for the test")
-        if len(capture.training) < 4:
-            log.warning("only %d views: light and materials can hardly be separated", len(capture.training))
         self._mesh, self._settings, self._capture = mesh, settings, capture
         self.schedule, self.score = Schedule(settings, now), Score()
         tree = TriangleBVH()
         tree.build(mesh.vertices, mesh.faces)
         self._pixels = foreground_pixels(capture.training, mesh, tree, settings.most_pixels, settings.seed, normals)
+        self._gain = settings.brightness / max(float(self._pixels.colour.mean()), 1e-6)
+        self._pixels.colour *= np.float32(self._gain)
         cache, self._weight = radiance_cache(self._pixels, mesh)
         counts = (settings.cosine, settings.ggx, settings.light)
         if not settings.shadows:
@@ -311,15 +311,15 @@ class Job:
         if self._exposure is not None:
             factor = torch.exp(self._exposure - self._exposure.mean())
             predicted = predicted * factor[torch.from_numpy(pixels.view).long()][:, None, None]
-        photographed = torch.from_numpy(pixels.colour)
+        photographed, clipped = torch.from_numpy(pixels.colour), torch.from_numpy(pixels.clipped)
         if s.unbiased:
             weight_by_prediction = self.schedule.weighs_by_prediction()
             beside = torch.from_numpy(pixels.next_to_clipped)
             counts = torch.where(beside, s.clipped_neighbour_weight, 1.0) if weight_by_prediction else None
-            loss = unbiased_loss(predicted, photographed, weight_by_prediction, counts)
+            loss = unbiased_loss(predicted, photographed, clipped, weight_by_prediction, counts)
         else:
-            loss = log_loss(predicted.mean(1), photographed)
-        self.score.note(float(loss.detach()), predicted.detach().mean(1), photographed)
+            loss = log_loss(predicted.mean(1), photographed, clipped)
+        self.score.note(float(loss.detach()), predicted.detach().mean(1) / self._gain, photographed / self._gain)
         return loss
 
     def result(self) -> Decoupled:
@@ -342,7 +342,7 @@ class Job:
         }
         if self._exposure is not None:
             report["exposures"] = torch.exp(self._exposure - self._exposure.mean()).tolist()
-        environment = self.lighting.learned.radiance().numpy().copy()
+        environment = self.lighting.learned.radiance().numpy() / np.float32(self._gain)
         return Decoupled(values[:, :3], values[:, 3], values[:, 4], environment, normals, report)
 
     def _learned(self) -> dict[str, Tensor]:

@@ -66,7 +66,7 @@ def cropped_views(views: list[View], points: Array) -> list[View]:
     for view, camera in zip(views, cameras, strict=True):
         x, y = corner_of(camera, view.camera)
         part = slice(y, y + camera.height), slice(x, x + camera.width)
-        layers = {name: getattr(view, name) for name in ("colour", "mask", "normals")}
+        layers = {name: getattr(view, name) for name in ("colour", "mask", "normals", "above_white")}
         parts = {name: layer[part] for name, layer in layers.items() if layer is not None}
         found.append(replace(view, camera=camera, **parts))
     return found

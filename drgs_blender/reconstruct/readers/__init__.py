@@ -17,6 +17,7 @@ from ..capture.capture import Capture
 from ..memory_budget import check_fits
 from . import colmap, llff, nero, tensoir, transforms
 from .camera_overlap import check_overlap
+from .exposures import find_gains
 from .layout import Layout
 from .lens import Lens
 from .photograph_loading import cut_out, find_background, load_photograph
@@ -86,7 +87,8 @@ def read_capture(
     Capture
         Lenses straightened, Z up. Pictures with alpha are laid on white. Where there are neither alpha nor masks but
         every picture has a border of one colour, what differs from it is the mask. Photographs that cannot be used
-        are left out with a warning, see `usable.usable`.
+        are left out with a warning, see `usable_photographs.usable`; exposures that differ are evened out with one, see
+        `exposures.find_gains`.
 
     Raises
     ------
@@ -103,7 +105,9 @@ def read_capture(
     _check_memory(layout, resolution, path)
     _tell_guesses(layout, path, up)
     known: dict[Lens, tuple[Lens, np.ndarray]] = {}
-    views = usable([(p, load_photograph(p, layout, resolution, known)) for p in photographs], str(path))
+    gains = find_gains(photographs, str(path))
+    developed = [(p, load_photograph(p, layout, resolution, known, g)) for p, g in zip(photographs, gains, strict=True)]
+    views = usable(developed, str(path))
     _tell_notes(layout, path)
     if all(view.mask is None for view in views) and cut_out(views):
         logger.warning(

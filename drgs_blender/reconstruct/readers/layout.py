@@ -59,6 +59,8 @@ class Photograph:
         File.
     test : bool
         A test view of the capture: not used in training.
+    exposure : float, optional
+        Exposure value, stops; larger lets in less light. None: not known, or of no account.
     """
 
     name: str
@@ -67,6 +69,7 @@ class Photograph:
     lens: Lens
     mask: Path | None = None
     test: bool = False
+    exposure: float | None = None
 
 
 @dataclass(slots=True)

@@ -12,6 +12,7 @@ from ...core.color import linear_to_srgb, to_unit
 from ...core.errors import AssetError
 from ...core.frame import Camera
 from ..capture.capture import View
+from .exposures import exposed
 from .layout import Layout, Photograph, load_picture
 from .lens import Lens, resample, undistorted
 
@@ -22,6 +23,8 @@ logger = logging.getLogger(__name__)
 WHITE = (1.0, 1.0, 1.0)
 #: Pixels darker than this everywhere, or that differ no more than this, are no photograph.
 _BLACK, _ALIKE = 0.02, 0.002
+#: Linear values above this are taken for damage.
+_BRIGHTEST = 1e4
 #: Pixels of the shorter side of the least picture that shows anything, also at half size.
 _LEAST = 4
 #: How much the surroundings may vary, and how much of the pixels must be surroundings, to be called one colour.
@@ -32,7 +35,11 @@ _BORDER, _MOST, _NEAR, _SPECK = 0.02, 0.7, 0.06, 0.002
 
 
 def load_photograph(
-    photograph: Photograph, layout: Layout, resolution: int | None, known: dict[Lens, tuple[Lens, Array]]
+    photograph: Photograph,
+    layout: Layout,
+    resolution: int | None,
+    known: dict[Lens, tuple[Lens, Array]],
+    gain: float = 1.0,
 ) -> View | None:
     """Read one photograph; None where it is black or of one colour all over.
 
@@ -44,6 +51,8 @@ def load_photograph(
         Pixels of the longer side at most; None keeps the size.
     known : dict of Lens to tuple of (Lens, array)
         Results of `undistorted` for lenses with distortion, filled as they occur.
+    gain : float
+        Of `exposures.find_gains`.
 
     Raises
     ------
@@ -53,17 +62,22 @@ def load_photograph(
     subject = str(photograph.image)
     stored, notes = load_picture(photograph.image)
     layout.notes += [(photograph.image, note) for note in notes]
-    pixels = _shown(stored)
+    if gain != 1.0 and stored.dtype.kind == "f":
+        stored = np.concatenate([stored[..., :3] * np.float32(gain), stored[..., 3:]], axis=2)
+    pixels, above = _shown(stored), _above_white(stored)
+    if gain != 1.0 and stored.dtype.kind != "f":
+        pixels = np.concatenate([exposed(pixels[..., :3], gain), pixels[..., 3:]], axis=2)
     height, width = pixels.shape[:2]
     lens = _fitting(photograph.lens, width, height, subject)
     mask = _mask(photograph, layout, pixels)
     if mask is not None and pixels.shape[2] == 4 and photograph.mask is None:
         # Premultiplied: colours of pixels that are not there must not bleed into those that are.
         pixels = pixels[..., :3] * mask[..., None]
+        above = None if above is None else above * mask[..., None]
         premultiplied = True
     else:
         pixels, premultiplied = pixels[..., :3], False
-    layers = pixels if mask is None else np.dstack([pixels, mask])
+    layers = np.dstack([layer for layer in (pixels, mask, above) if layer is not None])
     if lens.distorts:
         if lens not in known:
             known[lens] = undistorted(lens)
@@ -89,7 +103,8 @@ def load_photograph(
     camera = Camera(photograph.matrix, width, height, lens.fx, lens.fy, lens.cx, lens.cy)
     colour = np.ascontiguousarray(np.clip(colour, 0, 1), np.float32)
     mask = None if mask is None else np.ascontiguousarray(mask, np.float32)
-    return View(photograph.name, camera, colour, mask, photograph.test)
+    above = None if above is None else np.ascontiguousarray(layers[..., -3:], np.float32)
+    return View(photograph.name, camera, colour, mask, photograph.test, above_white=above)
 
 
 def _fitting(lens: Lens, width: int, height: int, subject: str) -> Lens:
@@ -109,6 +124,14 @@ def _shown(pixels: Array) -> Array:
         return to_unit(pixels)
     pixels = np.clip(pixels, 0, 1)
     return np.concatenate([linear_to_srgb(pixels[..., :3]), pixels[..., 3:]], axis=2)
+
+
+def _above_white(pixels: Array) -> Array | None:
+    """(h, w, 3) float32: how much brighter than white linear colours are; None where none is, or they are no floats."""
+    if pixels.dtype.kind != "f":
+        return None
+    above = np.clip(pixels[..., :3] - 1, 0, _BRIGHTEST).astype(np.float32)
+    return above if above.any() else None
 
 
 def _mask(photograph: Photograph, layout: Layout, pixels: Array) -> Array | None:

@@ -124,7 +124,7 @@ def _read_file(path: Path, test: bool, prefix: bool) -> tuple[list[Photograph], 
         matrix = rigid(frame.get("transform_matrix"), subject)
         tidy = Path(name).with_suffix("") if Path(name).suffix in PICTURES else Path(name)
         label = tidy.as_posix().removeprefix("./") if prefix else tidy.name
-        photographs.append(Photograph(label, image, matrix, lens, mask, test or name in left_out))
+        photographs.append(Photograph(label, image, matrix, lens, mask, test or name in left_out, _exposure(frame)))
         if not _OWN & frame.keys():
             alike.append(photographs[-1])
     complain_of_missing(str(path), missing, len(frames))
@@ -162,6 +162,13 @@ def _mask(path: Path, frame: dict[str, Any], image: Path, name: str) -> Path | N
         problem = f"names the mask {frame['mask_path']} for {name}, which is not there"
         raise AssetError(str(path), problem, "Put it back, or take mask_path out")
     return mask
+
+
+def _exposure(frame: dict[str, Any]) -> float | None:
+    """The exposure value that `drgs capture` has from EXIF."""
+    value = frame.get("exposure_value")
+    known = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return float(value) if known else None  # type: ignore[arg-type]
 
 
 def _lens(values: dict[str, Any], image: Path, subject: str) -> Lens:
