@@ -145,10 +145,19 @@ def check_installed(python: str, last: str) -> None:
 
 def lacks_reconstruction() -> bool:
     """Whether the engine in use is the one that was set up here, without what reconstruction needs. Starts nothing."""
+    return _lacks(engine_environment.RECONSTRUCT)
+
+
+def lacks_capture() -> bool:
+    """Whether it is the one that was set up here, without what finds cameras of photographs. Starts nothing."""
+    return _lacks(engine_environment.CAPTURE)
+
+
+def _lacks(group: engine_environment.Group) -> bool:
     named = preferences.read("engine_python", "") or os.environ.get(VARIABLE)
     folder = engine_folder()
     ready = not named and engine_environment.state(folder) == "ready"
-    return ready and engine_environment.needs_network(folder, group=engine_environment.RECONSTRUCT)
+    return ready and engine_environment.needs_network(folder, group=group)
 
 
 def problem() -> str:

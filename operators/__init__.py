@@ -21,6 +21,7 @@ from . import (
     import_parts,
     light,
     mark_assets,
+    marker_sheet,
     material,
     physics,
     point_caches,
@@ -38,6 +39,7 @@ MODULES = (
     import_parts,
     reconstruct,
     capture_cameras,
+    marker_sheet,
     export,
     convert,
     splats,
@@ -68,6 +70,7 @@ def _file_import(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
     menu.layout.operator("drgs.import_parts", text="DR-GS asset from splats and mesh")
     menu.layout.operator("drgs.reconstruct", text="DR-GS asset from photographs")
     menu.layout.operator("drgs.import_cameras", text="Cameras of photographs")
+    menu.layout.operator("drgs.print_markers", text="Marker sheet to take photographs on (PDF)")
 
 
 def _file_export(menu: bpy.types.Menu, context: bpy.types.Context) -> None:

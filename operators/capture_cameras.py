@@ -17,7 +17,7 @@ from ..drgs_blender.core.errors import AssetError, UsageError, first_of
 from ..drgs_blender.core.file_integrity import crashes_blender
 from ..drgs_blender.core.file_types import READ
 from .base import DrgsOperator
-from .reconstruct import CAMERA_ITEMS
+from .reconstruct_fields import CAMERA_ITEMS, NO_CAPTURE
 
 #: Endings of files in captures: cameras of the layouts that are read, and photographs.
 _IN_CAPTURES = (".json", ".npy", ".bin", ".txt", ".pkl", ".exr", *READ["picture"].extensions)
@@ -29,8 +29,6 @@ _CAPTURE, _PHOTOGRAPH = "drgs_capture", "drgs_photograph"
 _SENSOR = 36.0
 #: Size of the cameras in the viewport, in parts of their median distance from the world's origin.
 _DISPLAY = 0.06
-#: What `drgs inspect` says of folders that are none.
-_NONE = "is no capture"
 #: Difference of fx and fy beyond which pixels are told not to be square.
 _SQUARE = 0.005
 
@@ -163,13 +161,13 @@ def _inspect(path: Path, axes: str) -> tuple[Path, dict[str, Any]]:
             failures.append(error)
             continue
         if found.get("kind") != "capture":
-            problem = f"{_NONE}, but {found.get('format', found.get('kind'))}"
+            problem = f"{NO_CAPTURE}, but {found.get('format', found.get('kind'))}"
             failures.append(UsageError(str(place), problem, "Choose the folder of the photographs"))
         elif path.suffix.lower() in READ["picture"].extensions and path.parent != place and not _has(found, path):
             failures.append(UsageError(str(path), f"is no photograph of the capture {place}", "Choose one of them"))
         else:
             return place, found
-    raise next((one for one in failures if _NONE not in str(one)), failures[0])
+    raise next((one for one in failures if NO_CAPTURE not in str(one)), failures[0])
 
 
 def _has(found: dict[str, Any], photograph: Path) -> bool:

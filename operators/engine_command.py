@@ -19,6 +19,8 @@ from ..drgs_blender.ipc.child_process import clean_environment
 from .base import DrgsOperator
 
 _INTERVAL = 0.25
+#: Of the lines of ``drgs`` that are warnings or, where it fails, its error.
+_PREFIX = "drgs: "
 #: Seconds between two lines in the terminal of a Blender without a window.
 _REPORT_EVERY = 10.0
 
@@ -32,6 +34,10 @@ class CommandOperator(DrgsOperator):
     _subject, _failure, _program, _python = "", "", "", ""
     _expected = output_check.ExpectedFiles()
     _folder: Path | None = None
+    #: All output of the program, as it was last read.
+    _output = ""
+    #: What the program has warned of so far, in the order of its lines.
+    _warned: tuple[str, ...] = ()
 
     def done(self, context: bpy.types.Context) -> set[str]:
         """Called after the program has succeeded; returns what execute returns."""
@@ -94,7 +100,7 @@ class CommandOperator(DrgsOperator):
         failure : predicate of the message where the program fails: "could not be ..."
         files : files that it writes
         """
-        self._subject, self._failure = subject, failure
+        self._subject, self._failure, self._warned = subject, failure, ()
         self._expected = output_check.ExpectedFiles(files)
         assets.announce(self._expected.paths)
         try:
@@ -117,7 +123,9 @@ class CommandOperator(DrgsOperator):
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         if self.process.poll() is None:
-            self.follow(context, self._read_output())
+            output = self._read_output()
+            self._tell_warnings(output)
+            self.follow(context, output)
             return {"PASS_THROUGH"}
         self._release(context)
         return self.guard(self._finish, context)
@@ -164,7 +172,9 @@ class CommandOperator(DrgsOperator):
                 self.process.wait(_REPORT_EVERY)
                 return
             except subprocess.TimeoutExpired:
-                state = self.state(self._read_output())
+                output = self._read_output()
+                self._tell_warnings(output)
+                state = self.state(output)
             if state != shown:
                 print_line(shown := state)
 
@@ -177,18 +187,36 @@ class CommandOperator(DrgsOperator):
             self.process.stdin.close()
             with contextlib.suppress(OSError):  # Windows lets go of it late
                 self._log.unlink()
+        self._output = output
         return output
+
+    def _tell_warnings(self, output: str, ended: bool = False) -> None:
+        """Report the program's warnings that are new, each once.
+
+        Its error is such a line, too, the last one: while it works, a line is told when another one has followed.
+        """
+        lines = output.splitlines()
+        for line in lines if ended else lines[:-1]:
+            text = line.removeprefix(_PREFIX)
+            if text != line and text not in self._warned:
+                self._warned += (text,)
+                self.warn(text)
 
     def _finish(self, context: bpy.types.Context) -> set[str]:
         """Report the output of the ended program, then go on, or raise its error."""
-        lines = [line for line in self._read_output(last=True).strip().splitlines() if not line.startswith("DRGS_")]
+        output = self._read_output(last=True).strip()
+        lines = [line for line in output.splitlines() if not line.startswith("DRGS_")]
         try:
             if self.process.returncode:
                 engine_link.check_installed(self._python, lines[-1] if lines else "")
-                errors = [line for line in lines if line.startswith("drgs: ")] or lines
-                reason = errors[-1].removeprefix("drgs: ") if errors else f"exit code {self.process.returncode}"
+                errors = [line for line in lines if line.startswith(_PREFIX)] or lines
+                reason = errors[-1].removeprefix(_PREFIX) if errors else f"exit code {self.process.returncode}"
+                self._tell_warnings("\n".join(errors[:-1]), ended=True)
                 raise AssetError(self._subject, f"{self._failure}: {reason.rstrip('.')}", "")
+            self._tell_warnings(output, ended=True)
             for line in lines:
+                if line.startswith(_PREFIX):
+                    continue
                 messages.note("INFO", line)
                 if bpy.app.background:
                     print_line(line)

@@ -18,6 +18,12 @@ from ..drgs_blender.ipc.locate import VARIABLE, locate_engine
 from .base import DrgsOperator
 from .engine_command import print_line
 
+#: Parts that are added later -> what they are for.
+_PURPOSES = {
+    engine_environment.RECONSTRUCT: "PyTorch, which From Photographs needs",
+    engine_environment.CAPTURE: "COLMAP, OpenCV and PyAV, which find the cameras of photographs and videos",
+}
+
 
 class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
     """Make an environment for the DR-GS engine, apart from Blender's own Python. Asks first; can be cancelled"""
@@ -90,8 +96,8 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
             "ready": "Tries the engine and repairs it. The folder is",
         }[state]
         groups = [g for g in self._groups() if self._missing(g)]
-        if state == "ready" and groups == [engine_environment.RECONSTRUCT]:
-            text = "Adds PyTorch, which From Photographs needs. The folder is"
+        if state == "ready" and groups and all(group in _PURPOSES for group in groups):
+            text = f"Adds {', and '.join(_PURPOSES[group] for group in groups)}. The folder is"
         column = layout.column(align=True)
         for line in textwrap.wrap(text, 70) + path_lines(folder, 70):
             column.label(text=line)
@@ -198,6 +204,17 @@ class DRGS_OT_engine_choose(DrgsOperator, bpy.types.Operator):
         if not preferences.write("engine_python", path):
             raise UsageError("Preferences", "the extension is not enabled", "Enable it in Preferences > Add-ons")
         return bpy.ops.drgs.engine_test()
+
+
+def without_capture(subject: str, problem: str) -> UsageError:
+    """The error of what needs *Photographs without Cameras* where that is not there; opens Set Up Engine with it."""
+    if not bpy.app.background:
+        bpy.ops.drgs.engine_setup("INVOKE_DEFAULT", capture=True)
+    return UsageError(
+        subject,
+        f"{problem}, and the engine was set up without what finds them",
+        "Press Set Up Engine with Photographs without Cameras",
+    )
 
 
 def path_lines(path: PurePath, width: int) -> list[str]:

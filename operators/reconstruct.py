@@ -2,181 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
+from bpy.props import StringProperty
 
 from ..addon import assets, engine_link, reconstruction
-from ..drgs_blender.core.errors import UsageError
-from ..drgs_blender.core.file_types import CAMERAS
+from ..drgs_blender.core.errors import AssetError, UsageError
 from .base import DrgsOperator
 from .engine_command import CommandOperator
+from .engine_setup import without_capture
 from .import_asset import import_assets
+from .reconstruct_fields import NO_CAPTURE, ReconstructFields, is_video, options_of, settings_file
 
 
-def _title(cameras: str) -> str:
-    """As "OpenCV, Inverse"."""
-    return cameras.replace("opencv", "OpenCV").replace("opengl", "OpenGL").replace("-inverse", ", Inverse")
-
-
-#: Choices of what the cameras' matrices are.
-CAMERA_ITEMS = (
-    ("opengl", "Automatic", "What the layout of the files has by convention: COLMAP, NeRF, nerfstudio"),
-    *((name, _title(name), meaning.capitalize()) for name, meaning in CAMERAS.items() if name != "opengl"),
-)
-
-
-#: Fields of the dialog -> (the setting of each, from which value on it is given, its least value). 0 says nothing; nor
-#: does every first photograph to hold out, which would leave none.
-_NUMBERS = {
-    "minutes": ("minutes", 1e-6, 0.001),
-    "resolution": ("capture.resolution", 1, 8),
-    "test_every": ("capture.test_every", 2, 2),
-    "surfels": ("schedule.surfels", 1, 10),
-    "voxels": ("mesh_resolution", 1, 16),
-    "iterations": ("schedule.iterations", 1, 1),
-    "material_iterations": ("decoupling.iterations", 1, 1),
-}
-
-
-def options_of(fields: bpy.types.OperatorProperties) -> list[str]:
-    """Options of ``drgs reconstruct`` for the fields of the dialog."""
-    arguments = ["--variant", fields.variant, "--axes", fields.axes]
-    for name, (setting, given_from, least) in _NUMBERS.items():
-        if (value := getattr(fields, name)) >= given_from:
-            value = max(value, least)
-            arguments += ["--set", f"{setting}={value:.6g}" if isinstance(value, float) else f"{setting}={value}"]
-    return arguments if fields.use_materials else [*arguments, "--no-materials"]
-
-
-def _settings_file(text: str, named: str, folder: Path) -> Path | None:
-    """The file of settings that the dialog gives, a text written to `folder`; None where it gives none."""
-    if text and named:
-        raise UsageError("Settings", f'are given as the text "{text}" and as the file {named}', "Leave one of them out")
-    if named:
-        return Path(bpy.path.abspath(named)).absolute()
-    if not text:
-        return None
-    block = bpy.data.texts.get(text)
-    if block is None:
-        raise UsageError(f'Text "{text}"', "is not in this .blend", "Choose one, or press New Settings")
-    file = folder / f"{bpy.path.clean_name(text)}.toml"
-    file.write_text(block.as_string(), encoding="utf-8")
-    return file
-
-
-class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
+class DRGS_OT_reconstruct(ReconstructFields, CommandOperator, bpy.types.Operator):
     """Make a DR-GS object of photographs, with cameras (COLMAP, NeRF, nerfstudio) or without. Blender goes on"""
 
     bl_idname = "drgs.reconstruct"
     bl_label = "Reconstruct from Photographs"
     bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
-
-    filepath: StringProperty(
-        description="Folder of the photographs, with their cameras or without; or a video",
-        subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
-    )
-    filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-    out: StringProperty(
-        name="Save As",
-        description="The file to write; empty is beside the .blend, numbered where an object is made of that",
-        subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
-    )
-    minutes: FloatProperty(
-        name="Time Budget (min)",
-        description="About how long it may take; 0 lets the steps decide",
-        default=10.0,
-        min=0.0,
-        max=1e4,
-    )
-    resolution: IntProperty(
-        name="Resolution", description="Longer side of the photographs, reduced; 0 is as they are", default=400, min=0
-    )
-    variant: EnumProperty(
-        name="Surfels",
-        description="Which surfels the asset gets",
-        items=(
-            ("p", "Free", "Stay where they were learned, bound to the mesh"),
-            ("m", "On the Mesh", "New ones hang on the mesh's faces"),
-        ),
-        default="p",
-    )
-    use_materials: BoolProperty(
-        name="Materials", description="Separate the materials from the light of the photographs", default=True
-    )
-    test_every: IntProperty(
-        name="Hold Out Every Nth Photo",
-        description="Keep every nth photograph for measuring the quality; 0 uses the test photographs that the "
-        "capture names",
-        default=0,
-        min=0,
-    )
-    axes: EnumProperty(
-        name="Camera Convention",
-        description="Axes of the cameras' matrices. Where another one fits better, a message names it (--axes)",
-        items=CAMERA_ITEMS,
-        default="opengl",
-        options={"SKIP_SAVE"},
-    )
-    use_environment: BoolProperty(
-        name="Set World", description="Light the scene with the light of the photographs", default=False
-    )
-    surfels: IntProperty(
-        name="Surfels, at Most", description="0: as many as the photographs show", default=0, min=0, max=5_000_000
-    )
-    voxels: IntProperty(
-        name="Voxels",
-        description="Of the mesh's longest side, from 16 to 1024; 0: 512 at most",
-        default=0,
-        min=0,
-        max=1024,
-    )
-    iterations: IntProperty(
-        name="Surfel Steps", description="How long surfels are learned; 0 is 3,000", default=0, min=0, max=10_000_000
-    )
-    material_iterations: IntProperty(
-        name="Material Steps",
-        description="How long materials and light are learned; 0 is 2,500",
-        default=0,
-        min=0,
-        max=10_000_000,
-    )
-    settings: StringProperty(
-        name="Settings",
-        description="Text with all settings (TOML), as New Settings writes it; it comes in place of the fields above. "
-        "Set World and the scene's device are not among them",
-        options={"SKIP_SAVE"},
-    )
-    config: StringProperty(
-        name="Settings File",
-        description="TOML file of settings, or an asset whose settings to use again, in place of a text",
-        options={"SKIP_SAVE"},
-    )
-
-    def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.use_property_split, layout.use_property_decorate = True, False
-        fields = layout.column()
-        fields.active = not (self.settings or self.config)
-        for name in ("minutes", "resolution", "variant", "use_materials", "test_every", "axes"):
-            fields.prop(self, name)
-        layout.prop(self, "use_environment")
-        layout.prop(self, "out")
-        header, body = layout.panel("DRGS_PT_reconstruct_advanced", default_closed=True)
-        header.label(text="Advanced")
-        if body is None:
-            return
-        fields = body.column()
-        fields.active = not (self.settings or self.config)
-        for name in ("surfels", "voxels", "iterations", "material_iterations"):
-            fields.prop(self, name)
-        row = body.row(align=True)
-        row.prop_search(self, "settings", bpy.data, "texts")
-        row.operator("drgs.reconstruct_settings", text="", icon="ADD")
-        body.prop(self, "config")
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -185,7 +31,7 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if engine_link.lacks_reconstruction():
-            bpy.ops.drgs.engine_setup("INVOKE_DEFAULT", reconstruct=True)
+            bpy.ops.drgs.engine_setup("INVOKE_DEFAULT", reconstruct=True, capture=engine_link.lacks_capture())
             return {"CANCELLED"}
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
@@ -204,19 +50,21 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
                 "is not there",
                 "Choose the folder of the photographs, its transforms.json, or a video",
             )
-        folder = capture if capture.is_dir() else capture.parent
+        if engine_link.lacks_capture() and _has_no_cameras(capture, self.axes):
+            raise without_capture(str(capture), "has no cameras")
+        name = capture.stem if is_video(capture) else (capture if capture.is_dir() else capture.parent).name
         if not self.out and not bpy.data.filepath:
             raise UsageError(
-                f'Capture "{folder.name}"', "has no place for its asset", "Save the .blend, or name the asset's file"
+                f'Capture "{name}"', "has no place for its asset", "Save the .blend, or name the asset's file"
             )
-        out = Path(bpy.path.abspath(self.out or f"//{bpy.path.clean_name(folder.name)}"))
+        out = Path(bpy.path.abspath(self.out or f"//{bpy.path.clean_name(name)}"))
         out = assets.chosen(out.absolute().with_suffix(".drgs"), bool(self.out))
         arguments = ["reconstruct", str(capture), "--out", str(out), "--device", context.scene.drgs.device.lower()]
         with self.folder("drgs-reconstruct-") as work:
-            file = _settings_file(self.settings, self.config, work)
-            arguments += options_of(self) if file is None else ["--config", str(file)]
-        reconstruction.job = reconstruction.Reconstruction(out)
-        subject = f'Capture "{folder.name}"'
+            file = settings_file(self.settings, self.config, work)
+            arguments += options_of(self, str(capture)) if file is None else ["--config", str(file)]
+        reconstruction.job = reconstruction.Reconstruction(out, capture)
+        subject = f'Capture "{name}"'
         return self.start(context, arguments, subject, f"Making {out.name}", "could not be reconstructed", [out])
 
     def stopped(self, event: bpy.types.Event) -> bool:
@@ -232,13 +80,35 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
         _redraw(context)
 
     def done(self, context: bpy.types.Context) -> set[str]:
-        import_assets(context, [_job().out], self.use_environment)
+        job = _job()
+        job.follow(self._output)
+        import_assets(context, [job.out], self.use_environment)
+        reconstruction.made = reconstruction.Made(job, self._warned)
+        for file in reconstruction.made.pictures.values():
+            load_picture(file)
+        if self.use_cameras:
+            free = context.scene.camera is None
+            with contextlib.suppress(RuntimeError):  # it has told itself what is wrong
+                bpy.ops.drgs.import_cameras(
+                    filepath=str(job.capture), axes=self.axes, use_camera=free, use_resolution=free
+                )
         return {"FINISHED"}
 
     def clear(self) -> None:
         CommandOperator.clear(self)
         reconstruction.job = None
         _redraw(bpy.context)
+
+
+def _has_no_cameras(capture: Path, axes: str) -> bool:
+    """Whether cameras are to be found first."""
+    if is_video(capture):
+        return True
+    try:
+        engine_link.output_of(["inspect", str(capture), "--json", "--axes", axes])
+    except UsageError as error:
+        return f"{NO_CAPTURE}." in str(error)  # what else is wrong the program says
+    return False
 
 
 class DRGS_OT_reconstruct_cancel(DrgsOperator, bpy.types.Operator):
@@ -280,6 +150,43 @@ class DRGS_OT_reconstruct_settings(DrgsOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
+class DRGS_OT_reconstruct_show(DrgsOperator, bpy.types.Operator):
+    """Show this picture of the reconstruction in an Image Editor, in a window of its own where there is none"""
+
+    bl_idname = "drgs.reconstruct_show"
+    bl_label = "Show Picture"
+    bl_options = {"REGISTER", "UNDO", "INTERNAL"}  # noqa: RUF012 - read by Blender
+
+    filepath: StringProperty(name="File", description="The picture", options={"SKIP_SAVE"})
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        image = load_picture(Path(self.chosen("Picture")))
+        windows = context.window_manager.windows
+        area = next((a for w in windows for a in w.screen.areas if a.ui_type == "IMAGE_EDITOR"), None)
+        if area is None:
+            bpy.ops.wm.window_new()
+            area = windows[-1].screen.areas[0]
+            area.ui_type = "IMAGE_EDITOR"
+        area.spaces.active.image = image
+        return {"FINISHED"}
+
+
+def load_picture(file: Path) -> bpy.types.Image:
+    """The image of a file, as the file is now.
+
+    Raises
+    ------
+    AssetError
+        It is no picture, or not there.
+    """
+    try:
+        image = bpy.data.images.load(str(file), check_existing=True)
+    except RuntimeError as error:
+        raise AssetError(str(file), "cannot be read", "Reconstruct again, which writes it anew") from error
+    image.reload()
+    return image
+
+
 def _job() -> reconstruction.Reconstruction:
     assert reconstruction.job is not None, "none is under way"
     return reconstruction.job
@@ -293,4 +200,9 @@ def _redraw(context: bpy.types.Context) -> None:
                 area.tag_redraw()
 
 
-CLASSES = (DRGS_OT_reconstruct, DRGS_OT_reconstruct_settings, DRGS_OT_reconstruct_cancel)
+CLASSES = (
+    DRGS_OT_reconstruct,
+    DRGS_OT_reconstruct_settings,
+    DRGS_OT_reconstruct_cancel,
+    DRGS_OT_reconstruct_show,
+)

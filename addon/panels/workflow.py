@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import bpy
 
 from .. import reconstruction, workflow, world_setup
@@ -18,12 +20,27 @@ def _import(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         row.operator("drgs.mark_assets", text="", icon="ASSET_MANAGER")
     job = reconstruction.job
     if job is None:
-        layout.operator("drgs.reconstruct", text="From Photographs", icon="CAMERA_DATA")
+        row = layout.row(align=True)
+        row.operator("drgs.reconstruct", text="From Photographs", icon="CAMERA_DATA")
+        row.operator("drgs.print_markers", text="", icon="FILE_BLANK")
+        _made(layout, context)
         return
     if icon := job.icon():
         layout.template_icon(icon, scale=8.0)
     layout.progress(text=bar_text(layout, context, job.text, job.part), factor=job.part)
     layout.operator("drgs.reconstruct_cancel", icon="CANCEL")
+
+
+def _made(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """How the last reconstruction went, while its object is the one that the workflow is about."""
+    made, obj = reconstruction.made, workflow.target(context)
+    if made is None or obj is None or Path(bpy.path.abspath(obj.drgs.asset.filepath)) != made.out:
+        return
+    row = layout.row(align=True)
+    for title, file in made.pictures.items():
+        row.operator("drgs.reconstruct_show", text=f"Show {title}", icon="IMAGE_DATA").filepath = str(file)
+    for text in made.doubts:
+        wrapped(layout, context, text, "ERROR")
 
 
 def _bind(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

@@ -19,6 +19,7 @@ from ..core.arrays import Array
 from ..core.asset.archive import replace_by
 from ..core.color import linear_to_srgb, to_unit
 from ..core.errors import AssetError, first_of
+from ..core.file_types import VIDEOS
 from ..formats.exr import write_exr_picture
 from ..reconstruct.readers.layout import PICTURES, decode_mask, find_mask, load_picture
 from . import libraries
@@ -31,7 +32,6 @@ logger = logging.getLogger(__name__)
 PHOTOGRAPHS = frozenset(end.lower() for end in PICTURES)
 LINEAR = frozenset((".exr",))
 _TIFF = frozenset((".tif", ".tiff"))
-VIDEOS = frozenset((".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts"))
 #: Of other programs' photographs: named, not read.
 UNREAD = frozenset((".heic", ".heif", ".avif", ".hdr", ".jxl"))
 #: Where the photographs of a folder are, the first that has some.

@@ -8,11 +8,13 @@ that was stopped goes on when the same command is given again.
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
+from .frame_lines import emit
 from .interrupt import interruptible
 from .progress import WORK_SECONDS, FractionBar
-from .sampling import above_zero, int_range
+from .uncalibrated import FIELDS, MASKS_HELP, add_options, capture_settings, said_of_masks, tell_unused
 
 EXAMPLES = """examples:
   drgs capture photographs --out statue
@@ -26,75 +28,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs capture``."""
     parser.add_argument("input", type=Path, metavar="INPUT", help="folder of photographs, or a video")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder to write")
-    parser.add_argument(
-        "--video-frames",
-        type=int_range(10, 400),
-        default=90,
-        metavar="N",
-        help="frames of a video that are used, about; default 90",
-    )
-    parser.add_argument(
-        "--poses",
-        choices=("auto", "markers", "features"),
-        default="auto",
-        help="find cameras by a marker sheet (drgs markers) or by features of the pictures; default auto: by the sheet "
-        "where most pictures show it",
-    )
-    parser.add_argument(
-        "--marker-length",
-        type=above_zero("no length"),
-        metavar="MM",
-        help="side of the sheet's black squares as measured; default: as printed in true size",
-    )
-    parser.add_argument(
-        "--camera-distance",
-        type=above_zero("no length"),
-        metavar="M",
-        help="metres from the cameras to the object, typically, where no sheet gives the scale",
-    )
-    parser.add_argument(
-        "--feature-resolution",
-        type=int_range(320, 8192),
-        default=1600,
-        metavar="N",
-        help="pixels of the longer side at which features and markers are sought; default 1600",
-    )
-    parser.add_argument(
-        "--brackets",
-        type=_brackets,
-        default="auto",
-        metavar="N",
-        help="merge exposure brackets to linear EXR pictures: auto: those that EXIF shows (default); a number: so many "
-        "files that follow each other are one; none",
-    )
-    parser.add_argument(
-        "--masks",
-        default="given",
-        metavar="HOW",
-        help="given: use and check masks that are there (default); auto: make them where there are none, of an object "
-        "on a ground that shows texture, in about two minutes; FILE.onnx, or a name: make them by this segmentation "
-        "model; none: neither make nor use any",
-    )
-
-
-def _brackets(text: str) -> str:
-    """Parser of the setting of brackets."""
-    return text if text in ("auto", "none") else str(int_range(2, 9)(text))
+    parser.add_argument("--masks", metavar="HOW", help=MASKS_HELP)
+    add_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Make one capture."""
-    from ..capture.pipeline import Settings, make_capture
+    from ..capture.masks.default_mode import resolve_mode
+    from ..capture.pipeline import make_capture
+    from ..reconstruct.settings import Reading
 
-    settings = Settings(
-        args.video_frames,
-        args.feature_resolution,
-        args.poses,
-        args.marker_length,
-        args.camera_distance,
-        args.masks,
-        args.brackets,
-    )
+    given = {name: value for name in (*FIELDS, "masks") if (value := getattr(args, name)) is not None}
+    reading = Reading(**given)
+    masks = resolve_mode(reading.masks, args.input, calibrated=False)
+    if masks != reading.masks and not args.quiet:
+        emit(f"{args.input}: {said_of_masks(masks)}\n", sys.stderr)
+    tell_unused(reading, args.input, calibrated=False)
+    settings = capture_settings(reading, masks)
     with interruptible() as cancelled, FractionBar(args, "capturing", every=WORK_SECONDS) as bar:
         made = make_capture(args.input, args.out, settings, bar, cancelled)
     if not args.quiet:

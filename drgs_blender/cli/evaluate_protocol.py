@@ -218,6 +218,7 @@ def _settings(args: argparse.Namespace, protocol: Protocol) -> tuple[Settings, R
 
 def _made_otherwise(file: Path, settings: Settings, reading: Reading) -> str:
     """How the settings of an asset differ, "" where they do not."""
+    from ..capture.masks.default_mode import AUTO_WITHOUT_CAMERAS
     from ..core.asset.container import inspect_asset
     from ..reconstruct.settings import Reading, Settings
     from ..reconstruct.settings_file import flat
@@ -228,6 +229,9 @@ def _made_otherwise(file: Path, settings: Settings, reading: Reading) -> str:
         return "was made with settings that it does not keep"
     wanted, usual = flat(as_tables(settings, reading)), flat(as_tables(Settings(), Reading()))
     made = usual | flat(kept)  # settings that are newer than the asset had their defaults
+    for values in (wanted, made):
+        if values["capture.masks"] == AUTO_WITHOUT_CAMERAS:
+            values["capture.masks"] = "given"  # the sets have cameras
     other = [name for name in made if name not in wanted or made[name] != wanted[name]]
     return f"was made with other settings ({first_of(other)})" if other else ""
 

@@ -29,6 +29,7 @@ from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_and_report
 from .progress import WORK_SECONDS, FractionBar
 from .sampling import above_zero, int_range
+from .uncalibrated import FIELDS, MASKS_HELP, add_options, capture_settings, said_of_masks, tell_unused
 
 if TYPE_CHECKING:
     from ..core.asset import Asset
@@ -61,6 +62,7 @@ OPTIONS = {
     "up": "capture.up",
     "masks": "capture.masks",
     "normals": "capture.normals",
+    **{name: f"capture.{name}" for name in FIELDS},
 }
 
 #: Seconds between two lines of progress on stdout.
@@ -115,13 +117,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action=argparse.BooleanOptionalAction,
         help="separate materials from lighting (default); without, the albedo is the photographed colour",
     )
-    parser.add_argument(
-        "--masks",
-        metavar="HOW",
-        help="given: use masks that are there (default); auto: make them where there are none, of an object on a "
-        "ground that shows texture; FILE.onnx, or a name: make them by this segmentation model; none: use none, the "
-        "surroundings are learned, too",
-    )
+    parser.add_argument("--masks", metavar="HOW", help=MASKS_HELP)
     parser.add_argument(
         "--normals",
         metavar="FILE",
@@ -138,6 +134,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="convention of the camera matrices; default opengl: that of the layout",
     )
     parser.add_argument("--up", choices=tuple(UP_AXES), help="up axis of the capture's world; default: found")
+    add_options(parser)
     group = parser.add_argument_group("all settings")
     group.add_argument(
         "--config", type=Path, metavar="FILE", help="TOML file of settings, or an asset whose settings to use again"
@@ -168,20 +165,26 @@ def run(args: argparse.Namespace) -> int:
 
     reconstruct = reconstruction()
     from ..capture.inspection import tell_of_views
+    from ..capture.masks.default_mode import resolve_mode
     from ..capture.masks.stage import check_mode
     from ..capture.normal_model import load_model
-    from ..reconstruct.readers import read_capture
+    from ..capture.pictures import has_pictures
+    from ..reconstruct.readers import has_cameras, read_capture
     from ..reconstruct.settings_table import NONE, as_tables
 
-    check_mode(reading.masks)
+    # The readers say what is wrong with what has neither cameras nor pictures.
+    calibrated = has_cameras(args.capture) or not has_pictures(args.capture)
+    masks = resolve_mode(reading.masks, args.capture, calibrated)
+    check_mode(masks)
     if reading.normals != NONE:
         load_model(reading.normals)
-    source = _with_cameras(args, reading.masks)
+    source = args.capture if calibrated else _find_cameras(args, reading, masks)
     capture = read_capture(source, reading.resolution, reading.test_every, reading.axes, reading.up)
-    if source == args.capture:  # else `drgs capture` has looked at them
+    if calibrated:  # else `drgs capture` has looked at them
+        tell_unused(reading, args.capture, calibrated)
         tell_of_views(capture)
-    if source == args.capture or reading.masks == "none":  # else `drgs capture` has made them
-        _mask(args, capture, reading.masks)
+    if calibrated or masks == "none":  # else `drgs capture` has made them
+        _mask(args, capture, masks)
     if reading.normals != NONE:
         _give_normals(args, capture, reading.normals)
     logger.info("%d views to learn from, %d left out", len(capture.training), len(capture.testing))
@@ -189,7 +192,7 @@ def run(args: argparse.Namespace) -> int:
 
     def note(text: str) -> None:
         if not args.quiet and any(work.glob("*.state")):
-            emit(f"drgs: {text}\n", sys.stderr)
+            emit(f"{text}\n", sys.stderr)
 
     note(f"an earlier run was stopped: going on with {work}, where it is of these photographs and settings")
     with interruptible() as cancelled, FractionBar(args, "reconstructing") as bar:
@@ -269,25 +272,26 @@ def resolved_settings(config: Path | None, options: dict[str, Any], sets: list[s
     return settings, reading
 
 
-def _with_cameras(args: argparse.Namespace, masks: str) -> Path:
-    """The capture, or one made of photographs without cameras, beside the output."""
-    from ..reconstruct.readers import has_cameras
-
-    if has_cameras(args.capture):
-        return args.capture
-    from ..capture.pictures import has_pictures
-
-    if not has_pictures(args.capture):
-        return args.capture  # the readers say what is wrong with it
-    from ..capture.pipeline import Settings, make_capture
+def _find_cameras(args: argparse.Namespace, reading: Reading, masks: str) -> Path:
+    """A capture with cameras, made of photographs without, beside the output."""
+    from ..capture.pipeline import make_capture
 
     folder = args.out.with_name(f"{args.out.stem}.capture")
-    if not args.quiet:
-        emit(f"drgs: {args.capture} has no cameras: they are found first, in {folder}\n", sys.stderr)
+
+    def note(text: str) -> None:
+        if not args.quiet:  # without "drgs:", by which programs know warnings and errors
+            emit(f"{text}\n", sys.stderr)
+
+    chosen = f"; {said_of_masks(masks)}" if masks != reading.masks else ""
+    note(f"{args.capture} has no cameras: they are found first, in {folder}{chosen}")
+    tell_unused(reading, args.capture, calibrated=False)
+    settings = capture_settings(reading, masks)
     with interruptible() as cancelled, FractionBar(args, "capturing", every=WORK_SECONDS) as bar:
-        made = make_capture(args.capture, folder, Settings(masks=masks), _telling(args, bar), cancelled)
-    for line in made.lines if not args.quiet else ():
-        emit(f"drgs: {line}\n", sys.stderr)
+        made = make_capture(args.capture, folder, settings, _telling(args, bar), cancelled)
+    for line in made.lines:
+        note(line)
+    if not args.quiet and not sys.stdout.isatty():
+        print(f"DRGS_CAPTURE {folder}", flush=True)  # for programs that read the lines
     return folder
 
 

@@ -81,6 +81,9 @@ WRITTEN: dict[str, WriteType] = {
     "OpenEXR": WriteType((".exr",), "environment", "z", True),
 }
 
+#: Videos of which `drgs capture` takes frames.
+VIDEOS = frozenset((".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts"))
+
 #: What the matrices in files of cameras may be, and their axes; `reconstruct.readers` turns them.
 CAMERAS: dict[str, str] = {
     "opengl": "camera to world, y up, z backward",

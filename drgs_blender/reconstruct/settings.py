@@ -13,7 +13,7 @@ from .ranges import Range, check
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """How photographs are read, see `readers.read_capture`, `masks.of_capture` and `normal_model`.
+    """How photographs are read, see `readers.read_capture`, `masks.of_capture`, `normal_model` and `capture.pipeline`.
 
     Attributes
     ----------
@@ -27,19 +27,39 @@ class Reading:
         Up axis of the capture's world; None: found.
     masks : str
         "given" uses masks that are there; "auto" makes them where there are none, of an object on a ground that shows
-        texture; an ONNX file, or its name, makes them by this segmentation model; "none" uses none, and the
-        surroundings are learned, too.
+        texture; "auto-without-cameras" is "auto" where the photographs have no cameras, else "given"; an ONNX file, or
+        its name, makes them by this segmentation model; "none" uses none, and the surroundings are learned, too.
     normals : str
         "none", or an ONNX file, a model of normals that the first part of learning follows
         (`schedule.normal_prior`). Nothing is downloaded.
+    video_frames : int
+        Without cameras: frames of a video that are used, about.
+    poses : {"auto", "markers", "features"}
+        Without cameras: found by a marker sheet or by features of the pictures; "auto": by the sheet, where most
+        pictures show it.
+    marker_length : float, optional
+        Without cameras: side of the sheet's black squares as measured, mm; None: as printed in true size.
+    camera_distance : float, optional
+        Without cameras: metres from them to the object, typically, where no sheet gives the scale; None: 1, a guess.
+    feature_resolution : int
+        Without cameras: pixels of the longer side at which features and markers are sought.
+    brackets : {"auto", "none", "2", "3", "4", "5", "6", "7", "8", "9"}
+        Without cameras: exposure brackets that are merged; "auto": those that EXIF shows; a number: so many files that
+        follow each other are one; "none" merges nothing.
     """
 
     resolution: Annotated[int | None, Range(8, 1 << 16)] = None
     test_every: Annotated[int | None, Range(2, 1_000_000)] = None
     axes: Literal["opengl", "opencv", "opengl-inverse", "opencv-inverse"] = "opengl"
     up: Literal["z", "y", "-z", "-y"] | None = None
-    masks: str = "given"
+    masks: str = "auto-without-cameras"
     normals: str = "none"
+    video_frames: Annotated[int, Range(10, 400)] = 90
+    poses: Literal["auto", "markers", "features"] = "auto"
+    marker_length: Annotated[float | None, Range(0.001, 1e6)] = None
+    camera_distance: Annotated[float | None, Range(0.001, 1e6)] = None
+    feature_resolution: Annotated[int, Range(320, 8192)] = 1600
+    brackets: Literal["auto", "none", "2", "3", "4", "5", "6", "7", "8", "9"] = "auto"
 
 
 @dataclass(frozen=True, slots=True)

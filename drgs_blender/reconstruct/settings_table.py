@@ -126,6 +126,8 @@ def with_values(
             raise UsageError(f"{where}{name}", problem, "`drgs reconstruct --print-settings` shows all")
         if row.allowed.optional and value == NONE:
             value = None
+        if type(value) is int:  # a number among texts, which one writes without quotes
+            value = next((text for text in row.allowed.choices if text.isdigit() and int(text) == value), value)
         if text := row.allowed.problem(value):
             raise UsageError(f"{where}{name}", text, row.about.rstrip("."))
         if row.allowed.type is float and isinstance(value, int):

@@ -9,6 +9,7 @@ import sys
 import time
 import zipfile
 from pathlib import Path, PurePosixPath
+from types import SimpleNamespace
 
 import bpy
 import pytest
@@ -321,6 +322,39 @@ def test_too_little_room_is_told_before_anything_is_fetched(tmp_path, monkeypatc
 def test_the_extension_brings_what_the_engine_needs():
     assert any(r.startswith("numba") for r in environment.requirements())
     assert (environment.SOURCE / "drgs_blender" / "cli" / "doctor.py").is_file()
+
+
+class Labels:
+    """A layout that keeps the texts of its labels."""
+
+    def __init__(self):
+        self.texts = []
+
+    def column(self, **_):
+        return self
+
+    def label(self, text="", **_):
+        self.texts.append(text)
+
+    def prop(self, *_):
+        pass
+
+
+def test_what_finds_cameras_is_a_part_of_its_own_and_the_set_up_says_what_it_adds(monkeypatch, tmp_path):
+    link, operator = part("addon.engine_link"), part("operators.engine_setup")
+    monkeypatch.delenv("DRGS_ENGINE")
+    monkeypatch.setattr(environment, "state", lambda folder: "ready")
+    lacking = {environment.CAPTURE}
+    monkeypatch.setattr(environment, "needs_network", lambda folder, source=None, group=None: group in lacking)
+    assert link.lacks_capture() and not link.lacks_reconstruction()
+    cls = operator.DRGS_OT_engine_setup
+    fields = SimpleNamespace(reconstruct=True, capture=True, gpu=False, afresh=False, layout=Labels())
+    for name in ("_groups", "_extras", "_missing"):
+        setattr(fields, name, getattr(cls, name).__get__(fields))
+    cls.draw(fields, bpy.context)
+    assert " ".join(fields.layout.texts).startswith("Adds COLMAP, OpenCV and PyAV, which find the cameras of")
+    monkeypatch.setenv("DRGS_ENGINE", str(tmp_path))  # an environment of the user's own says itself what it lacks
+    assert not link.lacks_capture()
 
 
 def test_offline_nothing_begins(scene, monkeypatch):

@@ -247,7 +247,7 @@ def test_every_operator_that_changes_the_scene_can_be_undone():
     engine = {"drgs.engine_test", "drgs.engine_stop", "drgs.engine_setup", "drgs.engine_setup_cancel"}
     engine |= {"drgs.engine_choose", "drgs.clear_messages", "drgs.render_preset_add"}
     engine |= {"drgs.copy_messages", "drgs.report"}
-    engine |= {"drgs.submit", "drgs.submit_cancel", "drgs.copy_submit"}  # files and the clipboard
+    engine |= {"drgs.submit", "drgs.submit_cancel", "drgs.copy_submit", "drgs.print_markers"}  # files and the clipboard
     engine |= {"drgs.show_particles", "drgs.hide_particles", "drgs.cancel_physics"}  # nothing that a file keeps
     engine |= {"drgs.reconstruct_cancel", "drgs.bakes_cancel"}
     classes = [c for m in part("operators").MODULES for c in m.CLASSES if issubclass(c, bpy.types.Operator)]

@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from drgs_blender.capture import pipeline
+from drgs_blender.capture import libraries, pipeline
+from drgs_blender.capture.masks.default_mode import resolve_mode
+from drgs_blender.cli import uncalibrated
 from drgs_blender.cli.main import main
-from drgs_blender.core.errors import EXIT_BAD_ASSET, EXIT_USAGE, AssetError
+from drgs_blender.core.errors import EXIT_BAD_ASSET, EXIT_NO_DEVICE, EXIT_USAGE, AssetError, DeviceError
 from drgs_blender.reconstruct.readers import has_cameras, read_capture
+from drgs_blender.reconstruct.settings import Reading
 
 
 @pytest.fixture
@@ -44,9 +47,98 @@ def test_cameras_are_found_for_a_reconstruction_that_has_none(photographs, tmp_p
 
     monkeypatch.setattr(pipeline, "make_capture", refuse)
     words = ["reconstruct", str(photographs), "--out", str(tmp_path / "a.drgs")]
-    assert main(words) == main([*words, "--masks", "auto"]) == EXIT_BAD_ASSET
-    assert asked == [(photographs, tmp_path / "a.capture", masks) for masks in ("given", "auto")]
-    assert "has no cameras: they are found first, in" in capsys.readouterr().err
+    assert main(words) == main([*words, "--masks", "given"]) == EXIT_BAD_ASSET
+    assert asked == [(photographs, tmp_path / "a.capture", masks) for masks in ("auto", "given")]
+    first, second = (line for line in capsys.readouterr().err.splitlines() if "has no cameras" in line)
+    # Programs take what begins with "drgs:" for a warning or an error.
+    assert first == f"{second}; masks are made where none are given (--masks auto)" and not first.startswith("drgs:")
+
+
+SETTINGS = {
+    "video_frames": ("frames", 120),
+    "feature_resolution": ("size", 2000),
+    "poses": ("poses", "markers"),
+    "marker_length": ("marker_length", 29.4),
+    "camera_distance": ("distance", 2.5),
+    "brackets": ("brackets", "3"),
+}
+
+
+@pytest.mark.parametrize("how", ["reconstruct", "capture", "set", "config"])
+def test_all_options_of_a_capture_reach_it_whoever_makes_it(photographs, tmp_path, monkeypatch, how):
+    pytest.importorskip("torch")
+    asked = []
+
+    def refuse(source, folder, settings, *_):
+        asked.append(settings)
+        raise AssetError(str(source), "cannot be calibrated")
+
+    monkeypatch.setattr(pipeline, "make_capture", refuse)
+    words = ["capture" if how == "capture" else "reconstruct", str(photographs), "--out", str(tmp_path / "a.drgs")]
+    values = {name: value for name, (_, value) in SETTINGS.items()}
+    if how == "config":
+        (tmp_path / "s.toml").write_text("[capture]\n" + "".join(f"{k} = {v!r}\n" for k, v in values.items()))
+        words += ["--config", str(tmp_path / "s.toml")]
+    for name, value in values.items() if how != "config" else ():
+        option = ["--set", f"capture.{name}={value}"] if how == "set" else [f"--{name.replace('_', '-')}", str(value)]
+        words += option
+    assert main(words) == EXIT_BAD_ASSET
+    wanted = {field: value for field, value in SETTINGS.values()}
+    assert asked == [pipeline.Settings(masks="auto", **wanted)]
+    asked.clear()
+    assert main([*words[:4], "--masks", "none"]) == EXIT_BAD_ASSET
+    assert asked == [pipeline.Settings(masks="none")]  # all others have one default
+
+
+def test_what_only_photographs_without_cameras_need_is_told_of_others(photographs, caplog):
+    scene = captures.make(photographs.parent / "c")
+    captures.write_nerfstudio(scene)
+    reading = Reading(video_frames=50, marker_length=29.0)
+    uncalibrated.tell_unused(reading, scene.folder, calibrated=True)
+    assert caplog.messages == [
+        f"{scene.folder}: capture.video_frames, capture.marker_length: no effect, it has cameras"
+    ]
+    caplog.clear()
+    uncalibrated.tell_unused(reading, photographs, calibrated=False)
+    assert caplog.messages == [f"{photographs}: capture.video_frames: no effect, it is no video"]
+    caplog.clear()
+    (video := photographs.parent / "walk.mp4").touch()
+    uncalibrated.tell_unused(reading, video, calibrated=False)
+    uncalibrated.tell_unused(Reading(), scene.folder, calibrated=True)
+    assert not caplog.messages
+
+
+def test_masks_are_made_without_cameras_or_refused_before_long_work(photographs, tmp_path, monkeypatch, capsys):
+    """Where a library lacks, given masks and alpha count, and what has neither is told what to do."""
+    default = Reading().masks
+    assert resolve_mode(default, photographs, calibrated=True) == "given"
+    assert resolve_mode("none", photographs, calibrated=False) == "none"
+    load = libraries.load
+
+    def lacking(name):
+        if name == "torch":
+            raise DeviceError("masks", "needs torch, which cannot be loaded (it is not there)", "Install it: pip")
+        return load(name)
+
+    monkeypatch.setattr(libraries, "load", lacking)
+    words = ["capture", str(photographs), "--out", str(tmp_path / "out")]
+    assert main(words) == EXIT_NO_DEVICE
+    said = capsys.readouterr().err
+    assert "has no masks, and making them needs torch" in said and "Install it: pip, or give --masks none" in said
+    assert not (tmp_path / "out").exists()
+    with Image.open(photographs / "1.png") as image:
+        image.putalpha(255)
+        image.save(photographs / "1.png")
+    with pytest.raises(DeviceError):  # opaque all over
+        resolve_mode(default, photographs, calibrated=False)
+    pixels = np.asarray(Image.open(photographs / "1.png")).copy()
+    pixels[:5, :, 3] = 0
+    Image.fromarray(pixels).save(photographs / "1.png")
+    assert resolve_mode(default, photographs, calibrated=False) == "given"
+    (photographs / "1.png").unlink()
+    (photographs / "masks").mkdir()
+    Image.new("L", (32, 24), 255).save(photographs / "masks" / "2.png")
+    assert resolve_mode(default, photographs, calibrated=False) == "given"
 
 
 def test_what_has_cameras_or_no_pictures_is_left_to_the_readers(tmp_path, photographs):

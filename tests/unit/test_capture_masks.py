@@ -280,13 +280,30 @@ def test_replaced_masks_are_drawn_as_they_are_used(cv2, tmp_path, monkeypatch):
     views, true = scene()
     masks = [half(mask) if k == 4 else mask for k, mask in enumerate(true)]
     box = ObjectBox(MIDDLE - 0.16, MIDDLE + 0.16, np.zeros((0, 3)))
-    found = making.Found(dict.fromkeys(range(10)), views, masks, Hull(cv2, views, masks, box, 48), None, None, box)
+    windows = {k: (0, 0, *view.shape[::-1]) for k, view in enumerate(views)}
+    found = making.Found(windows, views, masks, Hull(cv2, views, masks, box, 48), None, None, box)
     monkeypatch.setattr(making, "find_masks", lambda *_: found)
     drawn = []
     monkeypatch.setattr(settling, "draw_contact_sheet", lambda path, views, masks, fits: drawn.append(list(masks)))
     made, fits = making.make_masks(cv2, views, np.zeros((0, 3)), tmp_path, "set", lambda *_: None, lambda: False)
     assert made is found and fits[4].wrong and iou(made.masks[4], true[4]) > 0.75
     assert len(drawn) == 1 and np.array_equal(drawn[0][4], made.masks[4])
+
+
+def test_masks_of_the_surroundings_are_not_used(cv2, tmp_path, monkeypatch, caplog):
+    """As where the cameras went round a quarter of the object alone: behind it a room is as good an object."""
+    from drgs_blender.capture.masks import making
+
+    views, true = scene()
+    for masks in ([~mask for mask in true], true):
+        windows = {k: (0, 0, *view.shape[::-1]) for k, view in enumerate(views)}
+        found = making.Found(windows, views, masks, None, None, None, None)
+        monkeypatch.setattr(making, "find_masks", lambda *_, found=found: found)
+        monkeypatch.setattr(making, "settle", lambda *_: (True, []))
+        made, _ = making.make_masks(cv2, views, np.zeros((0, 3)), tmp_path, "set", lambda *_: None, lambda: False)
+        assert made is (found if masks is true else None)
+    (said,) = caplog.messages
+    assert "set: what would be the object is at 100% of the pictures' edges" in said and "no masks are made" in said
 
 
 def test_a_view_that_was_not_learned_from_sees_the_object(cv2):

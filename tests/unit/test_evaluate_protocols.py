@@ -656,3 +656,17 @@ def test_the_own_light_is_that_of_the_asset(maker, sets):
     PROTOCOLS["glossysynthetic"].measure(bench, sets["glossysynthetic"], "bell", None)
     expected = [light(77), light(10), light(11), light(12)]  # corridor, golf, neon
     assert len(shown) == 4 and all(np.allclose(one, other, rtol=2e-3) for one, other in zip(shown, expected))
+
+
+def test_an_asset_from_before_masks_had_a_default_of_their_own_is_used_again(monkeypatch, tmp_path):
+    """Of sets with cameras the new default is what "given" was."""
+    from drgs_blender.cli import evaluate_protocol
+    from drgs_blender.core.asset import container
+    from drgs_blender.reconstruct.settings import Reading, Settings
+    from drgs_blender.reconstruct.settings_table import as_tables
+
+    kept = as_tables(Settings(), Reading(masks="given"))
+    monkeypatch.setattr(container, "inspect_asset", lambda *_, **__: {"provenance": {"settings": kept}})
+    assert not evaluate_protocol._made_otherwise(tmp_path, Settings(), Reading())
+    kept["capture"]["masks"] = "none"
+    assert "capture.masks" in evaluate_protocol._made_otherwise(tmp_path, Settings(), Reading())

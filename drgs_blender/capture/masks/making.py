@@ -33,6 +33,8 @@ PART = 640
 #: Surfels that an object has at least; views that show it (three
 #: make a hull, which a fourth is held against).
 _FEWEST_SURFELS, _FEWEST_VIEWS = 30, 4
+#: Pixels of a side at which masks are looked at, and the part of the pictures' edges that an object may be at.
+_EDGE, _AT_EDGES = 64, 0.4
 #: Parts of a mask smaller than this part of the largest are dropped, holes smaller than this part of it are filled.
 _SMALL, _PINHOLE = 0.01, 1e-3
 
@@ -123,11 +125,23 @@ def make_masks(cv2: Any, views: Sequence[MaskView], points: Array, sheet: Path, 
     """
     try:
         found = find_masks(cv2, views, points, tell, cancelled)
+        _check_edges(found, views)
     except NoMasks as why:
         logger.warning("%s: %s: no masks are made. %s", subject, why, REMEDY)
         return None, []
     fit, fits = settle(cv2, found.parts, found.masks, found.hull, sheet, subject)
     return found if fit else None, fits
+
+
+def _check_edges(found: Found, views: Sequence[MaskView]) -> None:
+    """Raise NoMasks where the masks hold the surroundings: an object is seldom at so much of the pictures' edges."""
+    size = (_EDGE, _EDGE)
+    edges = []
+    for index, view in enumerate(views):
+        mask = found.whole(index, view.shape, size) > 127
+        edges.append(np.concatenate([mask[0], mask[-1], mask[1:-1, 0], mask[1:-1, -1]]).mean())
+    if (share := float(np.median(edges))) > _AT_EDGES:
+        raise NoMasks(f"what would be the object is at {share:.0%} of the pictures' edges, as surroundings are")
 
 
 def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
