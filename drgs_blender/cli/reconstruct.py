@@ -183,7 +183,7 @@ def run(args: argparse.Namespace) -> int:
     if calibrated:  # else `drgs capture` has looked at them
         tell_unused(reading, args.capture, calibrated)
         tell_of_views(capture)
-    if calibrated or masks == "none":  # else `drgs capture` has made them
+    if calibrated or masks == "none" or _masks_after_cameras(reading, masks):  # else `drgs capture` has made them
         _mask(args, capture, masks)
     if reading.normals != NONE:
         _give_normals(args, capture, reading.normals)
@@ -285,7 +285,7 @@ def _find_cameras(args: argparse.Namespace, reading: Reading, masks: str) -> Pat
     chosen = f"; {said_of_masks(masks)}" if masks != reading.masks else ""
     note(f"{args.capture} has no cameras: they are found first, in {folder}{chosen}")
     tell_unused(reading, args.capture, calibrated=False)
-    settings = capture_settings(reading, masks)
+    settings = capture_settings(reading, "given" if _masks_after_cameras(reading, masks) else masks)
     with interruptible() as cancelled, FractionBar(args, "capturing", every=WORK_SECONDS) as bar:
         made = make_capture(args.capture, folder, settings, _telling(args, bar), cancelled)
     for line in made.lines:
@@ -293,6 +293,11 @@ def _find_cameras(args: argparse.Namespace, reading: Reading, masks: str) -> Pat
     if not args.quiet and not sys.stdout.isatty():
         print(f"DRGS_CAPTURE {folder}", flush=True)  # for programs that read the lines
     return folder
+
+
+def _masks_after_cameras(reading: Reading, masks: str) -> bool:
+    """Whether masks are made when the views that are left out are known, as these may not be learned from."""
+    return masks == "auto" and reading.test_every is not None
 
 
 def _telling(args: argparse.Namespace, bar: FractionBar) -> Callable[[str, float], None]:

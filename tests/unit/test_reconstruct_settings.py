@@ -218,6 +218,8 @@ def test_masks_are_a_setting_that_the_asset_keeps(tmp_path, capsys, monkeypatch)
     monkeypatch.setattr("drgs_blender.capture.pipeline.make_capture", capture)
     monkeypatch.setattr("drgs_blender.capture.pictures.has_pictures", lambda _: True)
     assert main([*words, "--set", "capture.masks=auto"]) == 64 and modes[4:] == ["auto"]
+    # With views left out they are made later, of the others.
+    assert main([*words, "--masks", "auto", "--test-every", "4"]) == 64 and modes[5:] == ["given"]
 
 
 def test_repeated_photographs_with_cameras_are_told_before_the_long_work(tmp_path, capsys, monkeypatch):
