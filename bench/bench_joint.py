@@ -53,13 +53,14 @@ COLUMNS = (
 
 def ways(capture: Capture, folder: Path, truth: Truth, name: str, options: argparse.Namespace) -> None:
     """Measure and write the ways of stage (ii)."""
-    gaussians, rows = learned(capture, name), {}
+    rows: dict[str, Any] = {}
     for way in options.ways:
         label, joint = WAYS[way]
         settings = Settings()
         settings = replace(settings, decoupling=replace(settings.decoupling, iterations=options.steps, joint=joint))
+        surfels = learned(capture, name)  # joint learning moves them
         begun = processor_seconds()
-        with same_surfels(gaussians):
+        with same_surfels(surfels):
             asset = pipeline.reconstruct(capture, settings)
         spent, path = processor_seconds() - begun, FOLDER / f"{name}-{way}.drgs"
         write_asset(path, asset)

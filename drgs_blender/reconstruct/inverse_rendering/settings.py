@@ -79,7 +79,8 @@ class Settings:
         Weight of the squared differences of these offsets along edges, as `smoothness` more on finer meshes.
     joint : float
         Last part of the steps in which the surfels are learned, too, with materials of their own (the paper's way), on
-        the CPU; 0: they stay as they are, and materials are learned on the mesh; 1: from the first step on.
+        the CPU; 0: they stay as they are, and materials are learned on the mesh; 1: from the first step on. At .5
+        thin objects gain a little; of solid ones normals mostly do, relit pictures on the mean nothing.
     exposure : bool
         Also learn the brightness of every photograph.
     most_pixels : int
