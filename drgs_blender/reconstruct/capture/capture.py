@@ -27,6 +27,9 @@ class View:
         Left out of training.
     normals : (height, width, 3) float32 array, optional
         Unit, world space, 0 where not known: what a model says of the pixels (`capture.normals`).
+    turn : (3, 3) float64 array, optional
+        Rotation of world directions to those in which the light stands still (`turntable`); None: it does so in the
+        world.
     """
 
     name: str
@@ -35,6 +38,7 @@ class View:
     mask: Array | None = None
     test: bool = False
     normals: Array | None = None
+    turn: Array | None = None
 
 
 @dataclass(slots=True)
@@ -63,6 +67,11 @@ class Capture:
         """Name in reports: the folder, and the file where one was chosen."""
         path = self.source.resolve()
         return f"{path.parent.name}/{path.name}" if path.is_file() else path.name
+
+    @property
+    def turned(self) -> bool:
+        """Whether the object was turned, and the light stood still with the camera."""
+        return any(view.turn is not None for view in self.views)
 
     @property
     def training(self) -> list[View]:

@@ -30,6 +30,7 @@ from ...render.lights.environment import (
     envmap_pdf,
     first_cell,
     map_at,
+    turned_map,
 )
 from ...render.lights.product_sampling import block_of, in_cells_order, product_row
 from ...render.sampling import (
@@ -76,12 +77,23 @@ class Samples(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Pixels of one step: origin, flat, towards (n, 3) float32 as in `Pixels`, key (n,) uint32 of random numbers."""
+    """Pixels of one step.
+
+    Attributes
+    ----------
+    origin, flat, towards : (n, 3) float32 array
+        As in `Pixels`.
+    key : (n,) uint32 array
+        Of random numbers.
+    turn : (n or 0, 3, 3) float32 array
+        `View.turn` of their views; no rows where the light stands still in the world.
+    """
 
     origin: Array
     flat: Array
     towards: Array
     key: Array
+    turn: Array
 
 
 class Lobes(NamedTuple):
@@ -266,14 +278,16 @@ def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples): 
     samples : Samples
         Row `i` is written.
     """
-    origin, flat, towards, key = points
+    origin, flat, towards, key, turn = points
     normals, a2s = lobes
     counts, sequence = plan
     intersect, scene, faces, cache, seen, lift = occluder
     radiance, height, width = sky
     values, by_a2, by_normal = sums
     texel, share, weights = samples
-    learn_normals = by_normal.shape[0] > 0
+    learn_normals, turned = by_normal.shape[0] > 0, turn.shape[0] > 0
+    if turned:
+        envmap = turned_map(turn[i], envmap)
     nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
     gx, gy, gz = flat[i, 0], flat[i, 1], flat[i, 2]
     vx, vy, vz = towards[i, 0], towards[i, 1], towards[i, 2]
@@ -329,9 +343,12 @@ def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples): 
                     if not seen:
                         continue
                     a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-                    red = _cached(cache, a, b, c, hu, hv, -dx, -dy, -dz, 0)
-                    green = _cached(cache, a, b, c, hu, hv, -dx, -dy, -dz, 1)
-                    blue = _cached(cache, a, b, c, hu, hv, -dx, -dy, -dz, 2)
+                    ex, ey, ez = -dx, -dy, -dz
+                    if turned:  # the cache has seen this light from this side alone
+                        ex, ey, ez = vx, vy, vz
+                    red = _cached(cache, a, b, c, hu, hv, ex, ey, ez, 0)
+                    green = _cached(cache, a, b, c, hu, hv, ex, ey, ez, 1)
+                    blue = _cached(cache, a, b, c, hu, hv, ex, ey, ez, 2)
                 else:
                     four, parts = _bilinear(u, v, height, width)
                     red, green, blue = (
