@@ -34,7 +34,7 @@ SAME = 0.5
 
 @dataclass(slots=True)
 class Surroundings:
-    """Detail (h, w) of what is around the object in a small picture, 0 elsewhere, and where that is, (h, w) of 0 or 1."""
+    """Detail (h, w) of what is around the object in a small picture, 0 elsewhere; (h, w) 1 where that is, else 0."""
 
     detail: Array
     known: Array
