@@ -30,7 +30,6 @@ from ...render.lights.environment import (
     envmap_pdf,
     first_cell,
     map_at,
-    turned_map,
 )
 from ...render.lights.product_sampling import block_of, in_cells_order, product_row
 from ...render.sampling import (
@@ -229,7 +228,14 @@ def _cached(cache, a, b, c, u, v, dx, dy, dz, k):  # type: ignore[no-untyped-def
 
 
 @njit
-def _direction(strategy, numbers, normal, frame, view, alpha, bound, row, envmap):  # type: ignore[no-untyped-def]
+def _turned(to_light, x, y, z):  # type: ignore[no-untyped-def]
+    """A direction where the light stands still, from one of the world; the rotation row by row."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = to_light
+    return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z
+
+
+@njit
+def _direction(strategy, numbers, normal, frame, view, alpha, bound, row, envmap, to_light):  # type: ignore[no-untyped-def]
     """Direction of a strategy (0 cosine, 1 GGX, 2 light) from three random uint32."""
     n0, n1, n2 = numbers
     nx, ny, nz = normal
@@ -240,8 +246,9 @@ def _direction(strategy, numbers, normal, frame, view, alpha, bound, row, envmap
         while number > cell_end(place, envmap):
             place += 1
         _, column, upper, lower, _ = cell_at(place, envmap)
-        dx, dy, dz, _, _ = direction_in_cell(column, upper, lower, n1, n2, envmap)
-        return dx, dy, dz
+        lx, ly, lz, _, _ = direction_in_cell(column, upper, lower, n1, n2, envmap)
+        xx, xy, xz, yx, yy, yz, zx, zy, zz = to_light
+        return xx * lx + yx * ly + zx * lz, xy * lx + yy * ly + zy * lz, xz * lx + yz * ly + zz * lz
     if strategy == 0:
         x, y, z = cosine_hemisphere(unit(n0), unit(n1))
     else:
@@ -286,8 +293,12 @@ def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples): 
     values, by_a2, by_normal = sums
     texel, share, weights = samples
     learn_normals, turned = by_normal.shape[0] > 0, turn.shape[0] > 0
+    to_light = ONE, ZERO, ZERO, ZERO, ONE, ZERO, ZERO, ZERO, ONE
     if turned:
-        envmap = turned_map(turn[i], envmap)
+        to_light = (
+            turn[i, 0, 0], turn[i, 0, 1], turn[i, 0, 2], turn[i, 1, 0], turn[i, 1, 1], turn[i, 1, 2], turn[i, 2, 0],
+            turn[i, 2, 1], turn[i, 2, 2],
+        )  # fmt: skip
     nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
     gx, gy, gz = flat[i, 0], flat[i, 1], flat[i, 2]
     vx, vy, vz = towards[i, 0], towards[i, 1], towards[i, 2]
@@ -297,7 +308,8 @@ def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples): 
     alpha = F(math.sqrt(a2))
     bound, norm = vndf_terms(max(nv, F(1e-4)), a2)
     frame = basis(nx, ny, nz)
-    row = product_row(nx, ny, nz, envmap)
+    lx, ly, lz = _turned(to_light, nx, ny, nz)
+    row = product_row(lx, ly, lz, envmap)
     place = 0
     for half in range(2):
         for strategy in range(3):
@@ -312,7 +324,7 @@ def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples): 
                 n1 = scrambled(sequence[j, 1], mix(U(own + U(2))))
                 n2 = scrambled(sequence[j, 2], mix(U(own + U(3))))
                 dx, dy, dz = _direction(
-                    strategy, (n0, n1, n2), (nx, ny, nz), frame, (vx, vy, vz), alpha, bound, row, envmap
+                    strategy, (n0, n1, n2), (nx, ny, nz), frame, (vx, vy, vz), alpha, bound, row, envmap, to_light
                 )
                 nl = nx * dx + ny * dy + nz * dz
                 if not (nl > F(1e-6) and gx * dx + gy * dy + gz * dz > ZERO):
@@ -325,7 +337,8 @@ def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples): 
                 value, density, l_a2, l_nl, l_nv, l_nh = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
                 if nv > ZERO:
                     value, density, l_a2, l_nl, l_nv, l_nh = _lobe(nl, nv, nh, cx * cx + cy * cy + cz * cz, a2)
-                u, v = map_at(dx, dy, dz, envmap)
+                lx, ly, lz = _turned(to_light, dx, dy, dz)
+                u, v = map_at(lx, ly, lz, envmap)
                 total = F(counts[0]) * nl * INVERSE_PI + F(counts[1]) * density * norm
                 if counts[2] > 0:
                     total += F(counts[2]) * envmap_pdf(u, v, row, envmap)

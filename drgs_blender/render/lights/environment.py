@@ -96,28 +96,6 @@ class EnvMap(NamedTuple):
 ROTATION = ("xx", "xy", "xz", "yx", "yy", "yz", "zx", "zy", "zz")
 
 
-@njit
-def turned_map(turn, envmap):  # type: ignore[no-untyped-def]
-    """The environment map with another rotation.
-
-    Parameters
-    ----------
-    turn : (3, 3) float32 array
-        World direction to environment direction.
-    envmap : EnvMap
-
-    Returns
-    -------
-    EnvMap
-    """
-    return EnvMap(
-        envmap.texels, envmap.height, envmap.width, envmap.cells, envmap.guide, envmap.guide_size, envmap.row_z,
-        envmap.step, envmap.columns, envmap.starts, envmap.slices, envmap.ratio, envmap.first, envmap.block,
-        envmap.blocks, envmap.block_columns, envmap.shift, turn[0, 0], turn[0, 1], turn[0, 2], turn[1, 0], turn[1, 1],
-        turn[1, 2], turn[2, 0], turn[2, 1], turn[2, 2],
-    )  # fmt: skip
-
-
 class EnvironmentLight:
     """A `World` made ready for lookups and sampling by compiled code.
 
