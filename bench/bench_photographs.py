@@ -40,16 +40,16 @@ from drgs_blender.reconstruct.settings import Settings
 
 FOLDER = OUT / "photographs"
 COLUMNS = (
-    "Capture", "Pixels", "Light stands still", "Steps", "Surfels: whole / foreground dB", "SSIM",
-    "Materials: whole / foreground dB", "SSIM", "whole, on white", "Processor s, surfels / materials",
+    "Capture", "Pixels", "Light stands still", "Steps", "Surfels: whole / foreground dB", "SSIM", "on white",
+    "Materials: whole / foreground dB", "SSIM", "on white", "Processor s, surfels / materials",
 )  # fmt: skip
 
 
-def learned(capture: Capture, steps: int, name: str) -> tuple[Gaussians, float]:
+def learned(capture: Capture, schedule: Schedule, name: str) -> tuple[Gaussians, float]:
     """The surfels of stage (i), kept from the first time on, and what they cost in processor seconds."""
     file = FOLDER / f"{name}.npz"
     if not file.exists():
-        training, row = trained(capture, Schedule(iterations=steps), None)
+        training, row = trained(capture, schedule, None)
         surfels, light = training.gaussians.arrays(), training.gaussians.light
         assert light is not None
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -89,6 +89,19 @@ def relit(capture: Capture, path: Path, samples: int) -> tuple[list[Array], floa
     return shown, compare(session.asset(key), capture, None, keep)["novel"]["psnr"]
 
 
+def on_white(gaussians: Gaussians, capture: Capture) -> str:
+    """PSNR of the surfels' own colours in the views left out, whole pictures, on white as `relit` has them."""
+    if capture.background is not None:
+        return "-"
+    shown, true = [], []
+    for view in capture.testing:
+        with torch.no_grad():
+            shown.append(gaussians.render(view.camera, torch.ones(3), turn=view.turn).colour.numpy().clip(0, 1))
+        mask = np.ones((1, 1, 1)) if view.mask is None else view.mask[..., None]
+        true.append(view.colour * mask + (1 - mask))
+    return f"{mean_psnr(shown, true):.2f}"
+
+
 def figures(shown: list[Array], capture: Capture) -> tuple[str, str]:
     """PSNR of whole pictures and of the foreground, and SSIM, means of the views left out."""
     true = [composed(view, capture) for view in capture.testing]
@@ -105,26 +118,32 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--steps", type=int, nargs=2, default=(Schedule().iterations, Settings().decoupling.iterations))
     parser.add_argument("--turntable", choices=TURNTABLE, default="auto")
+    parser.add_argument("--mask", type=float, default=Schedule().mask, help="its weight in stage (i)")
     parser.add_argument("--samples", type=int, default=128)
     parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
     capture = read_capture(options.capture, options.size, 8, turntable=options.turntable)
     still = "with the camera" if capture.turned else "in the world"
-    name = f"{options.capture.name}-{options.size}-{options.steps[0]}-{'turned' if capture.turned else 'still'}"
-    gaussians, spent = learned(capture, options.steps[0], name)
+    schedule = Schedule(iterations=options.steps[0], mask=options.mask)
+    kind = f"{'turned' if capture.turned else 'still'}-mask{options.mask:g}"
+    name = f"{options.capture.name}-{options.size}-{options.steps[0]}-{kind}"
+    gaussians, spent = learned(capture, schedule, name)
     own = [pipeline.drawn(gaussians, view, capture) for view in capture.testing]
     path = FOLDER / f"{name}-{options.steps[1]}.drgs"
     costs = spent, decoupled(capture, gaussians, options.steps[1], path)
-    shown, on_white = relit(capture, path, options.samples)
+    shown, lit_on_white = relit(capture, path, options.samples)
     if options.pictures is not None:
         options.pictures.mkdir(parents=True, exist_ok=True)
         for view, *drawn in zip(capture.testing, own, shown, strict=True):
             pixels = (255 * np.concatenate([composed(view, capture), *drawn], axis=1)).round().astype(np.uint8)
             Image.fromarray(pixels).save(options.pictures / f"{name}-{view.name}.png")
     steps = " / ".join(map(str, options.steps))
+    if options.mask != Schedule().mask:
+        steps += f", mask {options.mask:g}"
     row = [
-        *(options.size, still, steps, *figures(own, capture), *figures(shown, capture), f"{on_white:.2f}"),
+        *(options.size, still, steps, *figures(own, capture), on_white(gaussians, capture)),
+        *(*figures(shown, capture), f"{lit_on_white:.2f}"),
         " / ".join(f"{seconds:.0f}" for seconds in costs),
     ]
     print(options.capture.name, *row, flush=True)
@@ -132,8 +151,8 @@ def main() -> None:
     body = (
         "Means over the views left out, which no stage has seen, over one background (grey where the real one is cut "
         "away): the surfels' own colours; and relit with the light that was recovered, camera sees surfels, "
-        f"{options.samples} samples, also on white as `drgs evaluate` has it, where outlines of dark objects count "
-        "more. Foreground: where masks are above one half. Steps of surfels / of materials.\n\n"
+        f"{options.samples} samples; on white as `drgs evaluate` has it, where outlines of dark objects count more. "
+        "Foreground: where masks are above one half. Steps of surfels / of materials.\n\n"
     )
     cells = [(key.split("|")[0], *cells) for key, cells in sorted(rows.items())]
     write_section("photographs", "Real photographs", body + table(COLUMNS, cells))
