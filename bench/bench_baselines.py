@@ -21,7 +21,7 @@ from report import OUT, store_row, table, write_section
 from drgs_blender.cli.evaluate import session_renderer
 from drgs_blender.core.asset import Environment
 from drgs_blender.core.asset.container import write_asset
-from drgs_blender.core.frame import Camera, RenderSettings, Visibility
+from drgs_blender.core.frame import Camera, RenderSettings, Visibility, World
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.compare import Renderer, compare
@@ -83,8 +83,9 @@ def renderer(session: Session, key: str, method: Method, samples: int) -> Render
     baked = Baked(asset) if method.picture == "baked" else None
     lights: dict[bytes, Prefiltered] = {}
 
-    def draw(camera: Camera, radiance: Array, vertices: Array | None) -> dict[str, Array]:
-        passes = lit(camera, radiance, vertices)
+    def draw(camera: Camera, light: World, vertices: Array | None) -> dict[str, Array]:
+        radiance = np.asarray(light.environment)
+        passes = lit(camera, light, vertices)
         if method.picture == "albedo":
             passes["Combined"] = np.concatenate([passes["Albedo"] * passes["Coverage"], passes["Coverage"]], axis=2)
         elif baked is not None:

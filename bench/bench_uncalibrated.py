@@ -26,7 +26,7 @@ from report import OUT, ROOT, processor_seconds, store_row, table, write_section
 from drgs_blender.capture.world_alignment import similarity
 from drgs_blender.cli.evaluate import compared_passes, writer
 from drgs_blender.cli.find_blender import find_blender
-from drgs_blender.core.frame import ObjectState, RenderSettings
+from drgs_blender.core.frame import ObjectState, RenderSettings, World
 from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.flip import find_flip
 from drgs_blender.evaluate.metrics import on_white, relight_scores, ssim, straight
@@ -111,7 +111,7 @@ def relit(made: Made, folder: Path, sky: Path, samples: int) -> list[str]:
     session = Session()
     key = session.load_asset(made.asset)
     state, settings = ObjectState(made.asset.stem, key, made.placed), RenderSettings(samples, bounces=3)
-    pictures = [compared_passes(session, state, view.camera, truth.radiance, settings) for view in truth.views]
+    pictures = [compared_passes(session, state, view.camera, World(truth.radiance), settings) for view in truth.views]
     linear, alpha = (np.stack(parts) for parts in zip(*map(straight, pictures)))
     masks = [view.mask for view in truth.views]
     assert all(mask is not None for mask in masks)

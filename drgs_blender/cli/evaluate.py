@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core.errors import UsageError
-from ..core.file_types import CAMERAS
+from ..core.file_types import CAMERAS, TURNTABLE
 from ..core.frame import Camera, Frame, ObjectState, RenderSettings, Visibility, World
 from ..formats.axes import UP_AXES
 from . import evaluate_protocol, sampling
@@ -60,6 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--axes", choices=tuple(CAMERAS), default="opengl", help="as given to drgs reconstruct")
     parser.add_argument("--up", choices=tuple(UP_AXES), help="as given to drgs reconstruct")
+    parser.add_argument("--turntable", choices=TURNTABLE, default="auto", help="as given to drgs reconstruct")
     parser.add_argument(
         "--lpips",
         type=Path,
@@ -173,7 +174,7 @@ def score(args: argparse.Namespace) -> int:
     lpips = Lpips(*args.lpips) if args.lpips else None
     session = Session()
     key = session.load_asset(args.asset)
-    capture = read_capture(args.capture, args.resolution, args.test_every, args.axes, args.up)
+    capture = read_capture(args.capture, args.resolution, args.test_every, args.axes, args.up, turntable=args.turntable)
     truth = read_truth(args.capture)
     relit = [read_relit(folder, light, args.resolution, args.axes, args.up) for folder, light in args.relit]
     if relit:
@@ -200,23 +201,21 @@ def session_renderer(
 ) -> Renderer:
     """Renders the loaded asset `key` for `evaluate.compare`, with `settings` on a transparent film."""
 
-    def render(camera: Camera, radiance: np.ndarray, vertices: np.ndarray | None) -> dict[str, np.ndarray]:
+    def render(camera: Camera, light: World, vertices: np.ndarray | None) -> dict[str, np.ndarray]:
         state = ObjectState(Path(key).stem, key, vertices=vertices, visibility=visibility or Visibility())
-        return compared_passes(session, state, camera, radiance, settings)
+        return compared_passes(session, state, camera, light, settings)
 
     return render
 
 
 def compared_passes(
-    session: Session, state: ObjectState, camera: Camera, radiance: np.ndarray, settings: RenderSettings
+    session: Session, state: ObjectState, camera: Camera, light: World, settings: RenderSettings
 ) -> dict[str, np.ndarray]:
-    """Passes of one object under a light (h, w, 3), with `settings` on a transparent film."""
+    """Passes of one object under a light, with `settings` on a transparent film."""
     from ..evaluate.compare import COMPARED_PASSES
 
     settings = replace(settings, film_transparent=True)
-    frame = Frame(
-        noise_index=1, camera=camera, objects=[state], world=World(radiance), settings=settings, passes=COMPARED_PASSES
-    )
+    frame = Frame(noise_index=1, camera=camera, objects=[state], world=light, settings=settings, passes=COMPARED_PASSES)
     return dict(session.render(frame))
 
 

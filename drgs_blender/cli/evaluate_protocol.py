@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core.errors import EXIT_BAD_ASSET, AssetError, DrgsError, UsageError, first_of
-from ..core.frame import Adjustment, Camera, ObjectState, RenderSettings
+from ..core.frame import Adjustment, Camera, ObjectState, RenderSettings, World
 from .interrupt import interruptible
 from .output import check_writable
 from .progress import WORK_SECONDS, FractionBar
@@ -278,7 +278,7 @@ def _loaded(file: Path, settings: RenderSettings) -> tuple[Asset, Renderer, str]
     def render(camera: Camera, radiance: np.ndarray, factors: tuple[float, float, float]) -> dict[str, np.ndarray]:
         adjustment = None if factors == (1.0, 1.0, 1.0) else Adjustment(tint=factors)
         state = ObjectState(file.stem, key, adjustment=adjustment)
-        return compared_passes(session, state, camera, radiance, settings)
+        return compared_passes(session, state, camera, World(radiance), settings)
 
     return session.asset(key), render, digest_asset(key)
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..core.errors import Cancelled, DeviceError, UsageError
-from ..core.file_types import CAMERAS
+from ..core.file_types import CAMERAS, TURNTABLE
 from ..core.phases import is_preparing
 from ..formats.axes import UP_AXES
 from .frame_lines import emit
@@ -60,6 +60,7 @@ OPTIONS = {
     "device": "device",
     "axes": "capture.axes",
     "up": "capture.up",
+    "turntable": "capture.turntable",
     "masks": "capture.masks",
     "normals": "capture.normals",
     **{name: f"capture.{name}" for name in FIELDS},
@@ -134,6 +135,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="convention of the camera matrices; default opengl: that of the layout",
     )
     parser.add_argument("--up", choices=tuple(UP_AXES), help="up axis of the capture's world; default: found")
+    parser.add_argument(
+        "--turntable",
+        choices=TURNTABLE,
+        help="yes: the object was turned, and the light stood still with the camera; no: the light stood still with "
+        "the object; auto: as the surroundings of the object show (default)",
+    )
     add_options(parser)
     group = parser.add_argument_group("all settings")
     group.add_argument(
@@ -179,7 +186,9 @@ def run(args: argparse.Namespace) -> int:
     if reading.normals != NONE:
         load_model(reading.normals)
     source = args.capture if calibrated else _find_cameras(args, reading, masks)
-    capture = read_capture(source, reading.resolution, reading.test_every, reading.axes, reading.up)
+    capture = read_capture(
+        source, reading.resolution, reading.test_every, reading.axes, reading.up, turntable=reading.turntable
+    )
     if calibrated:  # else `drgs capture` has looked at them
         tell_unused(reading, args.capture, calibrated)
         tell_of_views(capture)

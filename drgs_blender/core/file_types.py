@@ -91,6 +91,8 @@ CAMERAS: dict[str, str] = {
     "opengl-inverse": "world to camera, y up, z backward",
     "opencv-inverse": "world to camera, y down, z forward",
 }
+#: Whether photographs show an object that was turned while camera and light stood still.
+TURNTABLE = ("auto", "yes", "no")
 
 
 def extensions(*kinds: Kind) -> tuple[str, ...]:

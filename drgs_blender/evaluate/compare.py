@@ -10,7 +10,7 @@ import numpy as np
 
 from ..core.asset import Asset
 from ..core.errors import UsageError, first_of
-from ..core.frame import Camera
+from ..core.frame import Camera, World
 from ..deform.gmls import bind_points, carry
 from ..deform.sources import MeshSource
 from ..reconstruct.capture.capture import Capture, View
@@ -21,9 +21,9 @@ from .truth import Truth, TruthSet
 Array = np.ndarray
 logger = logging.getLogger(__name__)
 
-#: (camera, radiance of the light (h, w, 3), vertices of the asset's mesh or None at rest) -> pass name -> (h, w, c):
+#: (camera, light, vertices of the asset's mesh or None at rest) -> pass name -> (h, w, c):
 #: the passes `COMPARED_PASSES`, on a transparent film.
-Renderer = Callable[[Camera, Array, Array | None], dict[str, Array]]
+Renderer = Callable[[Camera, World, Array | None], dict[str, Array]]
 COMPARED_PASSES = ("Combined", "Depth", "Normal", "Albedo", "Roughness", "Metallic", "Coverage")
 #: A perceptual distance of two encoded pictures.
 Distance = Callable[[Array, Array], float]
@@ -50,7 +50,8 @@ def compare(
     ----------
     asset : Asset
     capture : Capture
-        Its views left out are rendered under the asset's own light, at the size they have there.
+        Its views left out are rendered under the asset's own light, at the size they have there; where the object was
+        turned (`View.turn`), the light is where it was then.
     truth : Truth or None
         Sets under known lights, at rest and posed, with maps.
     renderer : callable
@@ -86,7 +87,8 @@ def compare(
         if progress is not None:
             progress(done / total, name)
         done += 1
-        return renderer(view.camera, radiance, vertices)
+        turn = np.eye(3) if view.turn is None else view.turn
+        return renderer(view.camera, World(radiance, turn), vertices)
 
     report: dict[str, Any] = {"novel": None, "lights": [], "materials": None, "geometry": None, "posed_geometry": None}
     if novel:

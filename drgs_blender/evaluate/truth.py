@@ -109,7 +109,7 @@ def read_truth(capture: Path) -> Truth | None:
 
 def _read_set(folder: Path, item: dict[str, Any], lights: dict[str, Array]) -> TruthSet:
     name, light = str(item["name"]), str(item["light"])
-    views = read_capture(folder / str(item["cameras"])).views
+    views = read_capture(folder / str(item["cameras"]), turntable="no").views
     maps = [read_frame(folder / name / f"{view.name}.exr")[0] for view in views] if item["maps"] else []
     return TruthSet(name, light, lights[light], bool(item["posed"]), views, maps)
 
@@ -148,7 +148,7 @@ def read_relit(
         The capture or the light cannot be read.
     """
     radiance = read_environment(light).radiance
-    found = read_capture(capture, resolution, axes=axes, up=up, light=light.stem)
+    found = read_capture(capture, resolution, axes=axes, up=up, light=light.stem, turntable="no")
     views = found.testing or found.views
     return TruthSet(light.stem, light.stem, radiance, False, views, _tensoir_maps(capture, views))
 

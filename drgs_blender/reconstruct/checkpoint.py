@@ -34,7 +34,7 @@ def fingerprint(capture: Capture, **settings: Any) -> str:
         digest.update(np.asarray(camera.matrix_world, np.float64).tobytes())
         digest.update(np.array([camera.fx, camera.fy, camera.cx, camera.cy]).tobytes())
         digest.update(np.ascontiguousarray(view.colour).data)
-        for layer in (view.mask, view.normals, view.above_white):
+        for layer in (view.mask, view.normals, view.above_white, view.turn):
             if layer is not None:
                 digest.update(np.ascontiguousarray(layer).data)
     return digest.hexdigest()

@@ -149,6 +149,7 @@ def reconstruct(
     del training  # and the photographs that it keeps in memory
     work.on_progress(Progress("mesh", 0.5, len(free)))
     report: dict[str, Any] = {"views": len(capture.training), "left_out": len(capture.testing), "steps": work.steps}
+    report["turned"] = capture.turned
     mesh, report["mesh"] = mesh_of(free, capture, region, voxels)
     final: Gaussians = free
     binding: Binding | None = None
@@ -364,18 +365,18 @@ def _rows(binding: Binding, keep: Array) -> Binding:
     return Binding(*(getattr(binding, name)[keep] for name in Binding.__dataclass_fields__))
 
 
-def _drawn(gaussians: Gaussians, view: View, capture: Capture) -> Array:
-    """(h, w, 3) sRGB in 0..1."""
+def drawn(gaussians: Gaussians, view: View, capture: Capture) -> Array:
+    """The surfels' own colours in a view, (h, w, 3) sRGB in 0..1, over `background_of` the capture."""
     with torch.no_grad():
         background = torch.tensor(background_of(capture), dtype=torch.float32, device=gaussians.backend.device)
-        rendered = gaussians.render(view.camera, background)
+        rendered = gaussians.render(view.camera, background, turn=view.turn)
     return np.clip(rendered.colour.numpy(force=True), 0, 1)
 
 
 def preview(gaussians: Gaussians, capture: Capture) -> Array:
     """A view, left out if there is one, beside its photograph: (h, 2 w, 3) sRGB."""
     view = (capture.testing or capture.training)[0]
-    return np.concatenate([_drawn(gaussians, view, capture), composed(view, capture)], axis=1)
+    return np.concatenate([drawn(gaussians, view, capture), composed(view, capture)], axis=1)
 
 
 def held_out_metrics(gaussians: Gaussians, capture: Capture) -> dict[str, float]:
@@ -388,9 +389,9 @@ def held_out_metrics(gaussians: Gaussians, capture: Capture) -> dict[str, float]
         return {}
     errors, similar = [], []
     for view in capture.testing:
-        drawn, truth = _drawn(gaussians, view, capture), composed(view, capture)
-        errors.append(max(float(np.square(drawn - truth).mean()), 1e-10))
-        similar.append(structural_similarity(drawn, Photograph.of(truth)))
+        shown, truth = drawn(gaussians, view, capture), composed(view, capture)
+        errors.append(max(float(np.square(shown - truth).mean()), 1e-10))
+        similar.append(structural_similarity(shown, Photograph.of(truth)))
     return {
         "psnr": float(np.mean(-10 * np.log10(errors))),
         "psnr_pooled": -10 * float(np.log10(np.mean(errors))),

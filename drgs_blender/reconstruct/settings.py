@@ -25,6 +25,9 @@ class Reading:
         Convention of the camera matrices; "opengl" is that of the layout.
     up : {"z", "y", "-z", "-y"}, optional
         Up axis of the capture's world; None: found.
+    turntable : {"auto", "yes", "no"}
+        Whether the object was turned and the light stood still with the camera; "auto": where the surroundings are the
+        same in all pictures, with a warning.
     masks : str
         "given" uses masks that are there; "auto" makes them where there are none, of an object on a ground that shows
         texture; "auto-without-cameras" is "auto" where the photographs have no cameras, else "given"; an ONNX file, or
@@ -52,6 +55,7 @@ class Reading:
     test_every: Annotated[int | None, Range(2, 1_000_000)] = None
     axes: Literal["opengl", "opencv", "opengl-inverse", "opencv-inverse"] = "opengl"
     up: Literal["z", "y", "-z", "-y"] | None = None
+    turntable: Literal["auto", "yes", "no"] = "auto"
     masks: str = "auto-without-cameras"
     normals: str = "none"
     video_frames: Annotated[int, Range(10, 400)] = 90

@@ -46,6 +46,8 @@ torch.set_num_threads(1)
 #: Roughness (n,), and views of a floor at z = 0: cosines from steep to grazing.
 ROUGHNESS = np.array([0.15, 0.3, 0.6, 0.9], np.float32)
 ALPHA2 = (ROUGHNESS**4).astype(np.float32)
+#: `Points.turn` of light that stands still in the world.
+STILL = np.empty((0, 3, 3), np.float32)
 
 
 def sky(rows: int = 16) -> np.ndarray:
@@ -67,7 +69,7 @@ def floor_points(count: int = len(ROUGHNESS)) -> tuple[Mesh, Points, np.ndarray]
     up = np.tile(np.float32([0, 0, 1]), (count, 1))
     cosine = np.linspace(0.9, 0.35, count)
     towards = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, cosine], -1).astype(np.float32)
-    return mesh, Points(0 * up, up, towards, np.arange(count, dtype=np.uint32) + 7), up
+    return mesh, Points(0 * up, up, towards, np.arange(count, dtype=np.uint32) + 7, STILL), up
 
 
 def quadrature(
@@ -167,7 +169,8 @@ def test_shading_matches_the_renderer_where_the_mesh_shadows_itself():
     albedo, roughness, metallic = np.full((24, 3), 0.6, np.float32), np.full(24, 0.4), np.full(24, 0.5)
     columns = torch.from_numpy(np.column_stack([albedo, (roughness - 0.03) / 0.97, metallic]).astype(np.float32))
     draw = gatherer(mesh, 4096)
-    sums = draw.run(Points(origin, up, view, np.arange(24, dtype=np.uint32)), up, (roughness**4).astype("f4"), image)[0]
+    points = Points(origin, up, view, np.arange(24, dtype=np.uint32), STILL)
+    sums = draw.run(points, up, (roughness**4).astype("f4"), image)[0]
     materials = Materials(mesh.vertices, "metallic", 0)
     ours = materials.reflect(columns, torch.from_numpy(sums), torch.from_numpy(view[:, 2]), "principled").mean(1)
 
@@ -184,7 +187,7 @@ def test_shading_matches_the_renderer_where_the_mesh_shadows_itself():
     assert ours.numpy() == pytest.approx(theirs, rel=0.03, abs=0.006)
     open_floor = gatherer(plain_mesh(low.astype(np.float32), np.array([[0, 1, 2], [0, 2, 3]])), 4096)
     alone = open_floor.run(
-        Points(origin, up, view, np.arange(24, dtype=np.uint32)), up, (roughness**4).astype("f4"), image
+        Points(origin, up, view, np.arange(24, dtype=np.uint32), STILL), up, (roughness**4).astype("f4"), image
     )[0]
     assert (sums[:, :, 0].mean((1, 2)) < 0.97 * alone[:, :, 0].mean((1, 2))).any()  # the ball does shadow
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("warp", reason="warp-lang is not installed")
@@ -49,14 +50,15 @@ def gatherer(by: LearningBackend, shadows: bool = True, indirect: bool = True, n
     return by.gatherer(mesh, tree, cache if indirect else None, (8, 8, 8), normals)
 
 
-def gathered(found: Gatherer) -> list[Any]:
-    """Sums and gradients at points of the first ball."""
+def gathered(found: Gatherer, turned: bool = False) -> list[Any]:
+    """Sums and gradients at points of the first ball; with `turned`, each in a light of another rotation."""
     rng = np.random.default_rng(1)
+    turn = Rotation.random(POINTS if turned else 0, 3).as_matrix().reshape(-1, 3, 3).astype(np.float32)
     normal = rng.normal(size=(POINTS, 3)).astype(np.float32)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     towards = normal + 0.6 * rng.normal(size=normal.shape).astype(np.float32)
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    points = Points(1.001 * normal, normal, towards, np.arange(POINTS, dtype=np.uint32) + 5)
+    points = Points(1.001 * normal, normal, towards, np.arange(POINTS, dtype=np.uint32) + 5, turn)
     given = [torch.tensor(a) for a in (normal, rng.uniform(0.01, 0.9, POINTS).astype(np.float32), sky())]
     for value in given:
         value.requires_grad_()
@@ -66,10 +68,11 @@ def gathered(found: Gatherer) -> list[Any]:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("settings", [{}, {"shadows": False}, {"indirect": False}])
-def test_what_arrives_and_its_derivatives(there: WarpLearningBackend, settings: dict[str, bool]) -> None:
+def test_what_arrives_and_its_derivatives(there: WarpLearningBackend, settings: dict[str, bool], turned: bool) -> None:
     device = gatherer(there, **settings)
-    here, other = gathered(gatherer(CPU, **settings)), gathered(device)
+    here, other = gathered(gatherer(CPU, **settings), turned), gathered(device, turned)
     assert not device.failed
     sums, same = here[0], (here[0] - other[0]).abs().amax((1, 2, 3)) <= 1e-4 * here[0].abs().amax((1, 2, 3))
     assert sums.abs().max() > 0

@@ -182,8 +182,8 @@ def test_a_published_set_is_scored_under_the_lights_that_are_named(tmp_path):
     mesh = Mesh(np.zeros((3, 3)), np.zeros((1, 3), np.int32), np.zeros((3, 3)), np.zeros(3), np.zeros(3))
     asset = Asset(attach_nothing(), mesh, None)
 
-    def renderer(camera, radiance, vertices):
-        assert vertices is None and (radiance == 1).all()
+    def renderer(camera, light, vertices):
+        assert vertices is None and (light.environment == 1).all() and (light.rotation == np.eye(3)).all()
         pixels = captures.picture(camera.matrix_world)
         alpha = pixels[..., 3:] / np.float32(255)
         shown = srgb_to_linear(pixels[..., :3] // 2 / np.float32(255)) * 1.5 * alpha

@@ -29,6 +29,9 @@ class View:
         Unit, world space, 0 where not known: what a model says of the pixels (`capture.normals`).
     above_white : (height, width, 3) float32 array, optional
         How much brighter than white linear Rec.709 values are; None: of a picture that clips, or nowhere.
+    turn : (3, 3) float64 array, optional
+        Rotation of world directions to those in which the light stands still (`turntable`); None: it does so in the
+        world.
     """
 
     name: str
@@ -38,6 +41,7 @@ class View:
     test: bool = False
     normals: Array | None = None
     above_white: Array | None = None
+    turn: Array | None = None
 
 
 @dataclass(slots=True)
@@ -66,6 +70,11 @@ class Capture:
         """Name in reports: the folder, and the file where one was chosen."""
         path = self.source.resolve()
         return f"{path.parent.name}/{path.name}" if path.is_file() else path.name
+
+    @property
+    def turned(self) -> bool:
+        """Whether the object was turned, and the light stood still with the camera."""
+        return any(view.turn is not None for view in self.views)
 
     @property
     def training(self) -> list[View]:

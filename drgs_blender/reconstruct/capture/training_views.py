@@ -48,6 +48,8 @@ class Target:
         What is behind the surfels, sRGB; None: the one colour of `background_of`.
     normals : (h, w, 3) tensor or None
         See `View.normals`.
+    turn : (3, 3) float32 array or None
+        See `View.turn`.
     share : float
         Pixels of the crop in parts of the whole view's. Means over the crop count as much: a pixel of each view counts
         the same.
@@ -58,6 +60,7 @@ class Target:
     mask: Tensor | None
     background: Tensor | None = None
     normals: Tensor | None = None
+    turn: Array | None = None
     share: float = 1.0
 
     @property
@@ -113,6 +116,7 @@ def full_targets(capture: Capture) -> list[Target]:
             mask = np.ascontiguousarray(mask[y0:y1, x0:x1], np.float32)
         normals = None if view.normals is None else view.normals[y0:y1, x0:x1]
         found.append(_target(camera, colour, mask, normals, keep, share))
+        found[-1].turn = view.turn
     return found
 
 
@@ -124,6 +128,7 @@ def half_target(target: Target) -> Target:
     normals = None if target.normals is None else unit(half_size(target.normals.numpy()), (0, 0, 0))
     keep = photograph.kept is not None
     made = _target(halved(target.camera), half_size(photograph.colour), mask, normals, keep, target.share)
+    made.turn = target.turn
     if target.background is not None:
         made.background = torch.from_numpy(half_size(target.background.numpy()))
     return made

@@ -76,12 +76,23 @@ class Samples(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Pixels of one step: origin, flat, towards (n, 3) float32 as in `Pixels`, key (n,) uint32 of random numbers."""
+    """Pixels of one step.
+
+    Attributes
+    ----------
+    origin, flat, towards : (n, 3) float32 array
+        As in `Pixels`.
+    key : (n,) uint32 array
+        Of random numbers.
+    turn : (n or 0, 3, 3) float32 array
+        `View.turn` of their views; no rows where the light stands still in the world.
+    """
 
     origin: Array
     flat: Array
     towards: Array
     key: Array
+    turn: Array
 
 
 class Lobes(NamedTuple):
@@ -217,7 +228,14 @@ def _cached(cache, a, b, c, u, v, dx, dy, dz, k):  # type: ignore[no-untyped-def
 
 
 @njit
-def _direction(strategy, numbers, normal, frame, view, alpha, bound, row, envmap):  # type: ignore[no-untyped-def]
+def _turned(to_light, x, y, z):  # type: ignore[no-untyped-def]
+    """A direction where the light stands still, from one of the world; the rotation row by row."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = to_light
+    return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z
+
+
+@njit
+def _direction(strategy, numbers, normal, frame, view, alpha, bound, row, envmap, to_light):  # type: ignore[no-untyped-def]
     """Direction of a strategy (0 cosine, 1 GGX, 2 light) from three random uint32."""
     n0, n1, n2 = numbers
     nx, ny, nz = normal
@@ -228,8 +246,9 @@ def _direction(strategy, numbers, normal, frame, view, alpha, bound, row, envmap
         while number > cell_end(place, envmap):
             place += 1
         _, column, upper, lower, _ = cell_at(place, envmap)
-        dx, dy, dz, _, _ = direction_in_cell(column, upper, lower, n1, n2, envmap)
-        return dx, dy, dz
+        lx, ly, lz, _, _ = direction_in_cell(column, upper, lower, n1, n2, envmap)
+        xx, xy, xz, yx, yy, yz, zx, zy, zz = to_light
+        return xx * lx + yx * ly + zx * lz, xy * lx + yy * ly + zy * lz, xz * lx + yz * ly + zz * lz
     if strategy == 0:
         x, y, z = cosine_hemisphere(unit(n0), unit(n1))
     else:
@@ -266,14 +285,20 @@ def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples): 
     samples : Samples
         Row `i` is written.
     """
-    origin, flat, towards, key = points
+    origin, flat, towards, key, turn = points
     normals, a2s = lobes
     counts, sequence = plan
     intersect, scene, faces, cache, seen, lift = occluder
     radiance, height, width = sky
     values, by_a2, by_normal = sums
     texel, share, weights = samples
-    learn_normals = by_normal.shape[0] > 0
+    learn_normals, turned = by_normal.shape[0] > 0, turn.shape[0] > 0
+    to_light = ONE, ZERO, ZERO, ZERO, ONE, ZERO, ZERO, ZERO, ONE
+    if turned:
+        to_light = (
+            turn[i, 0, 0], turn[i, 0, 1], turn[i, 0, 2], turn[i, 1, 0], turn[i, 1, 1], turn[i, 1, 2], turn[i, 2, 0],
+            turn[i, 2, 1], turn[i, 2, 2],
+        )  # fmt: skip
     nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
     gx, gy, gz = flat[i, 0], flat[i, 1], flat[i, 2]
     vx, vy, vz = towards[i, 0], towards[i, 1], towards[i, 2]
@@ -283,7 +308,8 @@ def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples): 
     alpha = F(math.sqrt(a2))
     bound, norm = vndf_terms(max(nv, F(1e-4)), a2)
     frame = basis(nx, ny, nz)
-    row = product_row(nx, ny, nz, envmap)
+    lx, ly, lz = _turned(to_light, nx, ny, nz)
+    row = product_row(lx, ly, lz, envmap)
     place = 0
     for half in range(2):
         for strategy in range(3):
@@ -298,7 +324,7 @@ def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples): 
                 n1 = scrambled(sequence[j, 1], mix(U(own + U(2))))
                 n2 = scrambled(sequence[j, 2], mix(U(own + U(3))))
                 dx, dy, dz = _direction(
-                    strategy, (n0, n1, n2), (nx, ny, nz), frame, (vx, vy, vz), alpha, bound, row, envmap
+                    strategy, (n0, n1, n2), (nx, ny, nz), frame, (vx, vy, vz), alpha, bound, row, envmap, to_light
                 )
                 nl = nx * dx + ny * dy + nz * dz
                 if not (nl > F(1e-6) and gx * dx + gy * dy + gz * dz > ZERO):
@@ -311,7 +337,8 @@ def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples): 
                 value, density, l_a2, l_nl, l_nv, l_nh = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
                 if nv > ZERO:
                     value, density, l_a2, l_nl, l_nv, l_nh = _lobe(nl, nv, nh, cx * cx + cy * cy + cz * cz, a2)
-                u, v = map_at(dx, dy, dz, envmap)
+                lx, ly, lz = _turned(to_light, dx, dy, dz)
+                u, v = map_at(lx, ly, lz, envmap)
                 total = F(counts[0]) * nl * INVERSE_PI + F(counts[1]) * density * norm
                 if counts[2] > 0:
                     total += F(counts[2]) * envmap_pdf(u, v, row, envmap)
@@ -329,9 +356,12 @@ def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples): 
                     if not seen:
                         continue
                     a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-                    red = _cached(cache, a, b, c, hu, hv, -dx, -dy, -dz, 0)
-                    green = _cached(cache, a, b, c, hu, hv, -dx, -dy, -dz, 1)
-                    blue = _cached(cache, a, b, c, hu, hv, -dx, -dy, -dz, 2)
+                    ex, ey, ez = -dx, -dy, -dz
+                    if turned:  # the cache has seen this light from this side alone
+                        ex, ey, ez = vx, vy, vz
+                    red = _cached(cache, a, b, c, hu, hv, ex, ey, ez, 0)
+                    green = _cached(cache, a, b, c, hu, hv, ex, ey, ez, 1)
+                    blue = _cached(cache, a, b, c, hu, hv, ex, ey, ez, 2)
                 else:
                     four, parts = _bilinear(u, v, height, width)
                     red, green, blue = (

@@ -23,6 +23,8 @@ class Lighting:
     settings : Settings
     level : float
         Radiance to begin with.
+    turns : list of array
+        `View.turn` of the views; empty where the light stands still in the world.
 
     Attributes
     ----------
@@ -31,8 +33,9 @@ class Lighting:
         The radiance by which directions are drawn.
     """
 
-    def __init__(self, gatherer: Gatherer, settings: Settings, level: float) -> None:
+    def __init__(self, gatherer: Gatherer, settings: Settings, level: float, turns: list[Array]) -> None:
         self._gatherer, self._rows = gatherer, settings.environment
+        self._turns = np.array(turns, np.float32).reshape(-1, 3, 3)
         self.learned = LearnedLight(settings.environment // (4 if settings.coarse_to_fine else 1), level)
         self.aimed: Array = np.ones((2, 4, 3), np.float32)
 
@@ -51,4 +54,6 @@ class Lighting:
 
     def gather(self, pixels: Pixels, key: Array, normal: Tensor, alpha2: Tensor, radiance: Tensor) -> Tensor:
         """Sums of light at pixels: `Gatherer`."""
-        return self._gatherer(Points(pixels.origin, pixels.flat, pixels.towards, key), normal, alpha2, radiance)
+        turn = self._turns[pixels.view] if len(self._turns) else self._turns
+        points = Points(pixels.origin, pixels.flat, pixels.towards, key, turn)
+        return self._gatherer(points, normal, alpha2, radiance)

@@ -54,8 +54,8 @@ class Decoupled:
     roughness, metallic : (v,) float32 array
         In [0, 1], of the mesh's vertices; linear Rec.709.
     environment : (h, 2 h, 3) float32 array
-        Radiance in the mapping of `asset.Environment`, Z up. What cannot be seen apart is its scale against that of the
-        albedo.
+        Radiance in the mapping of `asset.Environment`, Z up, as it was around the first view where the object was
+        turned (`View.turn`). What cannot be seen apart is its scale against that of the albedo.
     normals : (v, 3) float32 array
         Unit: smooth vertex normals, with what was learned on top.
     report : dict
@@ -218,7 +218,8 @@ class Job:
         # Grey light that shows a surface of albedo .4 as bright as the photographs, which has their hue. Colours begin
         # without any detail: light is to explain shading before albedo can.
         mean = self._pixels.colour.mean(axis=0)
-        self.lighting = Lighting(gatherer, settings, 2.5 * float(mean.mean()))
+        turns = [view.turn for view in capture.training if view.turn is not None]
+        self.lighting = Lighting(gatherer, settings, 2.5 * float(mean.mean()), turns)
         finer = fineness(mesh.vertices, mesh.faces[:, :2])
         grids = replace(settings, coarse=levels(settings.coarse, finer))
         self.surface = Surface(mesh, grids, mean, normals is not None, start)

@@ -117,10 +117,12 @@ class Gaussians:
         rays: Tensor | None = None,
         reflections: bool = True,
         materials: Tensor | None = None,
+        turn: Array | None = None,
     ) -> RenderedView:
         """Render a view over `background`, (3,) or (h, w, 3).
 
-        `rays` are `training_views.pixel_rays` where they are at hand, `materials` (n, c) values to blend as well.
+        `rays` are `training_views.pixel_rays` where they are at hand, `materials` (n, c) values to blend as well,
+        `turn` that of the view (`View.turn`).
         """
         reflections = reflections and self.light is not None
         centre, eye = self.centres(), np.asarray(camera.matrix_world)[:3, 3]
@@ -135,7 +137,11 @@ class Gaussians:
         if reflections:
             assert self.light is not None
             rays = pixel_rays(camera, self.backend.device) if rays is None else rays
-            colour = colour + self.backend.mirrored(maps.features, maps.alpha, rays, pyramid(self.light))
+            features = maps.features
+            if turn is not None:
+                to_light = torch.as_tensor(turn, dtype=torch.float32, device=self.backend.device).T
+                features, rays = _turned(features, to_light), (rays @ to_light).contiguous()
+            colour = colour + self.backend.mirrored(features, maps.alpha, rays, pyramid(self.light))
         return RenderedView(colour, maps.features[..., NORMAL : NORMAL + 3], maps, blended)
 
     def select(self, rows: Array) -> Gaussians:
@@ -177,3 +183,9 @@ class Gaussians:
                 self.centres().numpy().copy(), scale, quaternions(frame.astype(np.float64)),
                 self.opacities().numpy(), albedo, np.full(n, 0.5), np.zeros(n), sh,
             )  # fmt: skip
+
+
+def _turned(features: Tensor, turn: Tensor) -> Tensor:
+    """Blended features (h, w, c) with normals in another frame."""
+    normal = features[..., NORMAL : NORMAL + 3] @ turn
+    return torch.cat([features[..., :NORMAL], normal, features[..., NORMAL + 3 :]], -1)

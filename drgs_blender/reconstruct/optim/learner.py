@@ -114,7 +114,10 @@ class Learner:
         reflections = part >= schedule.reflections < 1
         bands = min(schedule.bands, int(part * 8))
         behind = self._behind(target)
-        return self.gaussians.render(target.camera, behind, bands, statistics, rays, reflections, materials), rays
+        seen = self.gaussians.render(
+            target.camera, behind, bands, statistics, rays, reflections, materials, target.turn
+        )
+        return seen, rays
 
     def _behind(self, target: Target) -> Tensor:
         """What is behind the surfels: (3,), or (h, w, 3)."""
@@ -170,7 +173,8 @@ class Learner:
         errors = []
         for target in views:
             with torch.no_grad():
-                errors.append(_squared_error(self.gaussians.render(target.camera, self._behind(target)), target))
+                seen = self.gaussians.render(target.camera, self._behind(target), turn=target.turn)
+                errors.append(_squared_error(seen, target))
         return float(np.mean(errors))
 
     def arrays(self) -> dict[str, Array]:

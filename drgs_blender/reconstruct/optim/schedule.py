@@ -71,7 +71,7 @@ class Schedule:
     densify: tuple[Part, Part] = (0.08, 0.6)
     rounds: Annotated[int, Range(0, 1000)] = 16
     shape: Part = 0.15
-    mask: Weight = 0.1
+    mask: Weight = 0.5
     distortion: Weight = 1.0
     consistency: Weight = 0.25
     median: Part = 0.0

@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import AssetError, UsageError, first_of
+from ...core.file_types import TURNTABLE
 from ...formats.axes import UP_AXES
-from ..capture.capture import Capture
+from ..capture.capture import Capture, View
+from ..capture.turntable import is_turned, light_turns
 from ..memory_budget import check_fits
 from . import colmap, llff, nero, tensoir, transforms
 from .camera_overlap import check_overlap
@@ -62,6 +64,7 @@ def read_capture(
     axes: str = "opengl",
     up: str | None = None,
     light: str | None = None,
+    turntable: str = "auto",
 ) -> Capture:
     """Read calibrated photographs of one object.
 
@@ -81,6 +84,9 @@ def read_capture(
         cameras, which people hold level.
     light : str, optional
         Which pictures to read where a layout has every view under several lights.
+    turntable : {"auto", "yes", "no"}
+        Whether the object was turned and the light stood still with the camera; "auto": where the surroundings of the
+        object are the same in all pictures, with a warning.
 
     Returns
     -------
@@ -99,7 +105,7 @@ def read_capture(
         A parameter out of range, or more pixels than the memory holds.
     """
     path = Path(path)
-    _check_parameters(resolution, test_every, axes, up)
+    _check_parameters(resolution, test_every, axes, up, turntable)
     layout, turn = read_layout(path, axes, up, light)
     photographs = layout.photographs
     _check_memory(layout, resolution, path)
@@ -125,8 +131,23 @@ def read_capture(
     check_silhouettes(learned, str(path), axes)
     if all(view.mask is None for view in learned):
         check_overlap(learned, str(path))
+    _turn_light(views, turntable, path)
     points = None if layout.points is None else (layout.points @ turn[:3, :3].T).astype(np.float32)
     return Capture(path, views, find_background(views), points)
+
+
+def _turn_light(views: list[View], turntable: str, path: Path) -> None:
+    """Let the light stand still with the camera where the object was turned."""
+    if turntable == "no" or (turntable == "auto" and not is_turned(views)):
+        return
+    if turntable == "auto":
+        logger.warning(
+            "%s: the surroundings are the same in all pictures, wherever the camera should be: the object was turned, "
+            "and the light is taken to stand still with the camera. If it does not, give --turntable no",
+            path,
+        )
+    for view, turn in zip(views, light_turns(views), strict=True):
+        view.turn = turn
 
 
 def read_layout(
@@ -217,13 +238,17 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part or -1), text) for text, part in re.findall(r"(\D*)(\d*)", name)]
 
 
-def _check_parameters(resolution: int | None, test_every: int | None, axes: str, up: str | None) -> None:
+def _check_parameters(
+    resolution: int | None, test_every: int | None, axes: str, up: str | None, turntable: str
+) -> None:
     if resolution is not None and resolution < 8:
         raise UsageError("resolution", f"is {resolution} pixels", "Choose at least 8")
     if test_every is not None and test_every < 2:
         raise UsageError("test-every", f"is {test_every}, which leaves nothing to learn from", "Choose at least 2")
     if axes not in AXES:
         raise UsageError("axes", f"is {axes!r}", f"Choose from {', '.join(AXES)}")
+    if turntable not in TURNTABLE:
+        raise UsageError("turntable", f"is {turntable!r}", f"Choose from {', '.join(TURNTABLE)}")
     if up is not None and up not in UP_AXES:
         raise UsageError("up", f"is {up!r}", f"Choose from {', '.join(UP_AXES)}")
 
