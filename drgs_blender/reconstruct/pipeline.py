@@ -65,6 +65,8 @@ CHECKPOINT_SETTINGS = {
     "surfels": ("schedule", "minutes"),
     "surfels on the mesh": ("schedule", "minutes", "mesh_resolution", "fixed"),
 }
+#: Part of the steps in which surfels of thin objects are learned with their materials.
+JOINT = 0.5
 #: Fainter surfels do not come into the asset.
 UNSEEN = 0.05
 
@@ -320,6 +322,8 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, thin: bool, rep
         work.on_progress(Progress("materials", 0.7 + 0.3 * at.part, count, at.psnr))
 
     rest = tell, work.cancelled, work.file("materials")
+    if settings.joint is None:
+        settings = replace(settings, joint=JOINT if thin and work.backend is CPU else 0.0)
     if settings.joint and work.settings.variant == "p":
         if work.backend is not CPU:
             log.warning("decoupling.joint: surfels, materials and light are learned on the CPU, not on the card")
