@@ -29,7 +29,7 @@ from drgs_blender.core.frame import Camera, RenderSettings, World
 from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.compare import compare
 from drgs_blender.evaluate.metrics import mean_psnr, straight
-from drgs_blender.reconstruct import pipeline
+from drgs_blender.reconstruct import held_out, pipeline
 from drgs_blender.reconstruct.capture.capture import Capture
 from drgs_blender.reconstruct.capture.training_views import background_of, composed
 from drgs_blender.reconstruct.losses.photometric import Photograph, structural_similarity
@@ -129,7 +129,7 @@ def main() -> None:
     kind = f"{'turned' if capture.turned else 'still'}-mask{options.mask:g}"
     name = f"{options.capture.name}-{options.size}-{options.steps[0]}-{kind}"
     gaussians, spent = learned(capture, schedule, name)
-    own = [pipeline.drawn(gaussians, view, capture) for view in capture.testing]
+    own = [held_out.drawn(gaussians, view, capture) for view in capture.testing]
     path = FOLDER / f"{name}-{options.steps[1]}.drgs"
     costs = spent, decoupled(capture, gaussians, options.steps[1], path)
     shown, lit_on_white = relit(capture, path, options.samples)

@@ -30,13 +30,14 @@ from drgs_blender.compute.threads import get_num_threads
 from drgs_blender.core.frame import Camera
 from drgs_blender.geometry.normals import VertexNormals
 from drgs_blender.reconstruct.capture.capture import Capture
+from drgs_blender.reconstruct.held_out import held_out_metrics
 from drgs_blender.reconstruct.meshing.visual_hull import find_region
 from drgs_blender.reconstruct.model.attached import attach_learned
 from drgs_blender.reconstruct.model.gaussians import Gaussians
 from drgs_blender.reconstruct.model.raster import rasterise
 from drgs_blender.reconstruct.optim.schedule import RATES, Schedule
 from drgs_blender.reconstruct.optim.train import Training
-from drgs_blender.reconstruct.pipeline import ON_MESH, held_out_metrics, mesh_of
+from drgs_blender.reconstruct.pipeline import ON_MESH, mesh_of
 from drgs_blender.reconstruct.readers import read_capture
 
 ROWS = OUT / "reconstruct"

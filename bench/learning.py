@@ -17,10 +17,10 @@ from drgs_blender.reconstruct.backend import CPU, LearningBackend
 from drgs_blender.reconstruct.capture.capture import Capture, View
 from drgs_blender.reconstruct.gpu.select_backend import select_backend
 from drgs_blender.reconstruct.gpu.warp_backend import WarpLearningBackend
+from drgs_blender.reconstruct.held_out import held_out_metrics
 from drgs_blender.reconstruct.meshing.visual_hull import find_region
 from drgs_blender.reconstruct.optim.schedule import Schedule
 from drgs_blender.reconstruct.optim.train import Training
-from drgs_blender.reconstruct.pipeline import held_out_metrics
 
 #: Views around the object, every fourth left out; steps of a run that is not timed, which compiles.
 VIEWS, FIRST = 24, 20

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from ..build.transfer import surfels_to_vertices
 from ..compute.prepare import PHASE, prepare_kernels
@@ -24,14 +23,13 @@ from ..deform.mesh_driven import MeshDriven
 from ..geometry.normals import VertexNormals
 from . import checkpoint
 from .backend import CPU
-from .capture.capture import Capture, View
-from .capture.training_views import background_of, composed
+from .capture.capture import Capture
 from .gpu.select_backend import select_backend
+from .held_out import held_out_metrics, preview
 from .inverse_rendering.joint import LearnedSurfels, decouple_jointly
 from .inverse_rendering.run import Decoupled, decouple
 from .inverse_rendering.run import Progress as MaterialProgress
 from .jit_warmup import warm_up
-from .losses.photometric import Photograph, structural_similarity
 from .meshing.depth_fusion import MOST, fuse, grid, voxels_that_fit
 from .meshing.normal_integration import follow_normals, shaded_by, shaded_by_own
 from .meshing.silhouette_fit import fill_silhouettes
@@ -367,37 +365,3 @@ def _visible_surfels(gaussians: Gaussians, visible: Array) -> Surfels:
 
 def _rows(binding: Binding, keep: Array) -> Binding:
     return Binding(*(getattr(binding, name)[keep] for name in Binding.__dataclass_fields__))
-
-
-def drawn(gaussians: Gaussians, view: View, capture: Capture) -> Array:
-    """The surfels' own colours in a view, (h, w, 3) sRGB in 0..1, over `background_of` the capture."""
-    with torch.no_grad():
-        background = torch.tensor(background_of(capture), dtype=torch.float32, device=gaussians.backend.device)
-        rendered = gaussians.render(view.camera, background, turn=view.turn)
-    return np.clip(rendered.colour.numpy(force=True), 0, 1)
-
-
-def preview(gaussians: Gaussians, capture: Capture) -> Array:
-    """A view, left out if there is one, beside its photograph: (h, 2 w, 3) sRGB."""
-    view = (capture.testing or capture.training)[0]
-    return np.concatenate([drawn(gaussians, view, capture), composed(view, capture)], axis=1)
-
-
-def held_out_metrics(gaussians: Gaussians, capture: Capture) -> dict[str, float]:
-    """Figures of the views left out, whole pictures.
-
-    "psnr" is the mean of that of each, as in published tables and in `drgs evaluate`; "psnr_pooled" that of the mean
-    squared error over all; "ssim".
-    """
-    if not capture.testing:
-        return {}
-    errors, similar = [], []
-    for view in capture.testing:
-        shown, truth = drawn(gaussians, view, capture), composed(view, capture)
-        errors.append(max(float(np.square(shown - truth).mean()), 1e-10))
-        similar.append(structural_similarity(shown, Photograph.of(truth)))
-    return {
-        "psnr": float(np.mean(-10 * np.log10(errors))),
-        "psnr_pooled": -10 * float(np.log10(np.mean(errors))),
-        "ssim": float(np.mean(similar)),
-    }

@@ -131,7 +131,7 @@ def elsewhere(ball_file):
 
 def reconstructing(ball_file):
     reconstruction = part("addon.reconstruction")
-    reconstruction.job = reconstruction.Reconstruction(ball_file)
+    reconstruction.job = reconstruction.Reconstruction(ball_file, ball_file.parent)
     image = bpy.data.images.new("Preview", 8, 4)
     image.file_format, image.filepath_raw = "PNG", str(ball_file.with_name("ball.preview.png"))
     image.save()
