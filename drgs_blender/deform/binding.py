@@ -22,8 +22,9 @@ log = logging.getLogger(__name__)
 
 #: Faces looked at beyond the nearest one when a surfel faces the other way.
 CANDIDATES = 16
-#: Largest barycentric weight of a centre that lies beside its face.
-REACH = 4.0
+#: Largest barycentric weight of a centre that lies beside its face; farther out that of the best face around, up to
+#: `FARTHEST`.
+REACH, FARTHEST = 4.0, 100.0
 #: Normals of a capture are trusted when at least this part of the surfels agrees with the nearest face.
 TRUST = 0.7
 #: Cosine to its face below which a surfel's normal is noise: the axis a flattened splat lost was not its normal.
@@ -88,7 +89,8 @@ def bind(mesh: Mesh, surfels: Surfels) -> tuple[Binding, dict[str, Any]]:
         "surfels", "flipped" (normal turned outwards), "unsure_normals" (the mesh's are used),
         "other_side" (moved to a farther face of the same direction),
         "normals_agree" (part of the surfels, 0..1), "distance_median", "distance_max" (metres), "far" (farther than
-        two mean edges from the mesh), "snapped" (moved because they lie far beside the mesh), "degenerate_faces".
+        two mean edges from the mesh), "beside" (far beside the nearest face, and carried by the one around that has the
+        smallest weights), "snapped" (moved because they lie too far beside any), "degenerate_faces".
 
     Examples
     --------
@@ -122,13 +124,18 @@ def bind(mesh: Mesh, surfels: Surfels) -> tuple[Binding, dict[str, Any]]:
     normal = np.where(flipped[:, None], -normal, normal)
     unsure = np.abs(agreement) < CREDIBLE
 
+    # A centre beyond the rim of its face keeps its place through weights that leave 0..1. Far out, or on a sliver,
+    # they magnify every motion of the face: then the face around that has the smallest ones carries it.
+    free = barycentric(faces.corners[face], surfels.centre.astype(np.float64))
+    beside = np.flatnonzero(~(np.abs(free).max(axis=1) <= REACH))
+    if len(beside):
+        face[beside], free[beside] = _least_magnified(faces, surfels.centre[beside].astype(np.float64), face[beside])
+        agreement = dot(normal, faces.normal[face])
+        weights[beside] = clamp_weights(free[beside])
+    snapped = ~(np.abs(free).max(axis=1) <= FARTHEST)
     corners = faces.corners[face]
     height = dot(surfels.centre - corners[:, 0], faces.normal[face])
     frames = shading_frames(faces, mesh.faces, mesh.vertices, face, weights)
-    # A centre beyond the rim of its face keeps its place through weights that leave 0..1. Far out, or on a sliver,
-    # they would magnify every motion of the face; such a surfel is snapped to above the closest point instead.
-    free = barycentric(corners, surfels.centre.astype(np.float64))
-    snapped = ~(np.abs(free).max(axis=1) <= REACH)
     weights = np.where(snapped[:, None], weights, free)
     binding = Binding(
         face=face,
@@ -145,11 +152,25 @@ def bind(mesh: Mesh, surfels: Surfels) -> tuple[Binding, dict[str, Any]]:
         "distance_median": float(np.median(distance)),
         "distance_max": float(distance.max()),
         "far": int((distance > 2 * faces.mean_edge[face]).sum()),
+        "beside": len(beside),
         "snapped": int(snapped.sum()),
         "degenerate_faces": int(faces.degenerate.sum()),
     }
     log.info("bound %d surfels to %d faces: %s", len(surfels), len(mesh.faces), report)
     return binding, report
+
+
+def _least_magnified(faces: Faces, centre: Array, face: Array) -> tuple[Array, Array]:
+    """Of the faces around each one of `face` (n,) that whose weights for `centre` (n, 3) are smallest; the weights."""
+    proper = np.flatnonzero(~faces.degenerate)
+    middles = faces.corners.mean(axis=1)
+    _, near = cKDTree(middles[proper]).query(middles[face], k=min(CANDIDATES, len(proper)))
+    near = np.column_stack([face, proper[near.reshape(len(face), -1)]])
+    weights = barycentric(faces.corners[near].reshape(-1, 3, 3), np.repeat(centre, near.shape[1], axis=0))
+    largest = np.nan_to_num(np.abs(weights).max(axis=1), nan=np.inf).reshape(near.shape)
+    best = largest.argmin(axis=1)
+    rows = np.arange(len(face))
+    return near[rows, best], weights.reshape(*near.shape, 3)[rows, best]
 
 
 def _prefer_own_side(

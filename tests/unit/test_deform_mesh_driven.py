@@ -77,6 +77,29 @@ def test_bound_surfels_stay_where_they_are_at_rest():
     np.testing.assert_allclose(posed.normal, normal, atol=1e-5)
 
 
+def test_surfels_of_parts_that_the_mesh_lacks_stay_where_they_are():
+    """Far beside the rim of a sheet of thin faces, up to thirty times their size: at rest, and as the sheet turns."""
+    rng = np.random.default_rng(3)
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, 0.5, 11), np.linspace(0, 0.05, 11)))
+    i = np.arange(100) + np.arange(100) // 10
+    faces = np.concatenate([np.stack([i, i + 1, i + 12], 1), np.stack([i, i + 12, i + 11], 1)])
+    mesh = Mesh(
+        np.stack([x, y, 0.02 * rng.normal(size=len(x))], 1), faces, np.ones((121, 3)), np.ones(121), np.ones(121)
+    )
+    n = 200
+    centre = rng.uniform((-1.5, -0.5, -0.3), (2.0, 0.6, 0.3), (n, 3))
+    turns = rng.normal(size=(n, 4))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    surfels = Surfels(centre, np.full((n, 2), 0.02), turns, np.ones(n), np.ones((n, 3)), np.ones(n), np.zeros(n))
+    binding, report = bind(mesh, surfels)
+    assert report["snapped"] == 0 and report["beside"] > n // 2
+    posed = MeshDriven(mesh, surfels, binding).pose(mesh.vertices)
+    np.testing.assert_allclose(posed.centre, surfels.centre, atol=2e-5)
+    turn = Rotation.from_rotvec([0.3, -1.1, 2.0]).as_matrix()
+    moved = posed_by(mesh, surfels, binding, matrix(turn, (3, -2, 5)))
+    np.testing.assert_allclose(moved.centre, surfels.centre @ turn.T + [3, -2, 5], atol=1e-4)
+
+
 def test_rigid_motion_is_rigid():
     mesh = blob()
     surfels = shell_surfels(mesh)

@@ -54,7 +54,7 @@ def exposed(pixels: Array, gain: float) -> Array:
     Examples
     --------
     >>> exposed(np.float32([0.5, 0.99]), 0.25).round(3)
-    array([0.257, 1.   ], dtype=float32)
+    array([0.256, 1.   ], dtype=float32)
     """
     changed = np.clip(linear_to_srgb(srgb_to_linear(pixels) * np.float32(gain)), 0, 1)
     return np.where(pixels >= _CLIPPED, np.float32(1.0), changed)
