@@ -52,6 +52,17 @@ def anchor(path: Path) -> bpy.types.Volume:
     return volume
 
 
+def remove_instanced_anchors() -> None:
+    """Remove the Volume objects that Blender makes of anchors when it appends or links what uses them.
+
+    It takes them for volumes that no object shows. The anchors stay.
+    """
+    for obj in list(bpy.data.objects):
+        volume = obj.data
+        if obj.type == "VOLUME" and obj.library is None and volume and volume.filepath.lower().endswith(".drgs"):
+            bpy.data.objects.remove(obj)
+
+
 def file_of(obj: bpy.types.Object) -> Path:
     """Path of the asset on disk; a packed one is written to the extension's folder first.
 

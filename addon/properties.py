@@ -10,7 +10,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, Po
 
 from ..drgs_blender.core.frame import RenderSettings
 from ..drgs_blender.core.passes import PASSES, Pass
-from . import mesh_display
+from . import blend_paths, mesh_display
 from .adjustment_settings import DrgsAdjustmentSettings, tag_changed
 from .physics_settings import DrgsPhysicsSettings
 from .property_limits import Limited
@@ -320,6 +320,7 @@ class DrgsObjectSettings(bpy.types.PropertyGroup):
         subtype="FILE_PATH",
         get=_get_path,
         set=_set_path,
+        options=blend_paths.RELATIVE,
     )
 
     adjustment: PointerProperty(

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from ..addon import assets, mesh_arrays, messages
+from ..addon import assets, blend_paths, mesh_arrays, messages
 from ..addon.export import export_baked
 from ..addon.export.camera import NO_CAMERA
 from ..addon.export.frame import WORKING_SPACE
@@ -46,7 +46,11 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
         default="relit",
     )
     directory: StringProperty(
-        name="Folder", description="Where the images go", subtype="DIR_PATH", default="//", options={"SKIP_SAVE"}
+        name="Folder",
+        description="Where the images go",
+        subtype="DIR_PATH",
+        default="//",
+        options={"SKIP_SAVE", *blend_paths.RELATIVE},
     )
     size: IntProperty(
         name="Size", description="Width and height of the images, texels", default=1024, min=16, max=16384

@@ -12,7 +12,7 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 from mathutils import Matrix
 
-from ..addon import engine_link, messages
+from ..addon import blend_paths, engine_link, messages
 from ..drgs_blender.core.errors import AssetError, UsageError, first_of
 from ..drgs_blender.core.file_integrity import crashes_blender
 from ..drgs_blender.core.file_types import READ
@@ -41,7 +41,9 @@ class DRGS_OT_import_cameras(DrgsOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
 
     filepath: StringProperty(
-        description="Folder of the capture, or a file in it", subtype="FILE_PATH", options={"SKIP_SAVE"}
+        description="Folder of the capture, or a file in it",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE", *blend_paths.RELATIVE},
     )
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     filter_glob: StringProperty(default=";".join(f"*{e}" for e in _IN_CAPTURES), options={"HIDDEN"})

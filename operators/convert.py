@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
-from ..addon import assets, splat_attributes
+from ..addon import assets, blend_paths, splat_attributes
 from ..drgs_blender.core.errors import UsageError
 from .engine_command import CommandOperator
 from .import_asset import import_assets
@@ -24,7 +24,7 @@ class DRGS_OT_convert(CommandOperator, bpy.types.Operator):
         name="Save As",
         description="The file to write; empty is beside the .blend, numbered where an object is made of that",
         subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
+        options={"SKIP_SAVE", *blend_paths.RELATIVE},
     )
     use_mesh: BoolProperty(
         name="Mesh from Splats",

@@ -12,7 +12,7 @@ from pathlib import Path, PurePath
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
-from ..addon import engine_environment, engine_link, preferences, setup_job
+from ..addon import blend_paths, engine_environment, engine_link, preferences, setup_job
 from ..drgs_blender.core.errors import UsageError
 from ..drgs_blender.ipc.locate import VARIABLE, locate_engine
 from .base import DrgsOperator
@@ -36,7 +36,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         description=f"Python {engine_environment.PYTHONS} that makes the environment. Empty: the one that Blender "
         "brings, which stays as it is",
         subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
+        options={"SKIP_SAVE", *blend_paths.RELATIVE},
     )
 
     afresh: BoolProperty(
@@ -189,7 +189,7 @@ class DRGS_OT_engine_choose(DrgsOperator, bpy.types.Operator):
         name="Engine",
         description="Folder of the environment, or its Python",
         subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
+        options={"SKIP_SAVE", *blend_paths.RELATIVE},
     )
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
 

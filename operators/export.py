@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
+from ..addon import blend_paths
 from ..drgs_blender.core.errors import UsageError
 from ..drgs_blender.core.file_types import READ, WRITTEN
 from ..drgs_blender.core.frame_sequences import frame_path
@@ -31,7 +32,9 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
 
     filepath: StringProperty(
-        description="The file to write; its ending chooses the format", subtype="FILE_PATH", options={"SKIP_SAVE"}
+        description="The file to write; its ending chooses the format",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE", *blend_paths.RELATIVE},
     )
     check_existing: BoolProperty(default=True, options={"HIDDEN"})
     filter_glob: StringProperty(default=_GLOB, options={"HIDDEN"})

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 from bpy.props import BoolProperty, CollectionProperty, StringProperty
 
-from ..addon import assets, mesh_arrays
+from ..addon import assets, blend_paths, mesh_arrays
 from ..addon.viewport_material import viewport_material
 from ..drgs_blender.core.asset import Asset, Environment
 from ..drgs_blender.core.asset.container import read_asset
@@ -24,7 +24,9 @@ class DRGS_OT_import_asset(DrgsOperator, bpy.types.Operator):
     bl_label = "Import DR-GS"
     bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
 
-    filepath: StringProperty(description="The .drgs file to import", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filepath: StringProperty(
+        description="The .drgs file to import", subtype="FILE_PATH", options={"SKIP_SAVE", *blend_paths.RELATIVE}
+    )
     directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", "HIDDEN"})
     files: CollectionProperty(type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
     filter_glob: StringProperty(default="*.drgs", options={"HIDDEN"})

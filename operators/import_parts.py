@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, StringProperty
 
-from ..addon import assets
+from ..addon import assets, blend_paths
 from ..drgs_blender.core.errors import UsageError
 from ..drgs_blender.core.file_types import READ, extensions
 from ..drgs_blender.core.frame_sequences import frame_path, frames_of, template_of
@@ -45,18 +45,25 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
         name="Splats or Surfels",
         description="PLY, SPZ, SOG, ... with surfels or splats; #### stands for the number of a sequence",
         subtype="FILE_PATH",
+        options=blend_paths.RELATIVE,
     )
     mesh: StringProperty(
         name="Mesh",
         description="The mesh they were reconstructed with; or, without surfels, any textured mesh",
         subtype="FILE_PATH",
+        options=blend_paths.RELATIVE,
     )
-    environment: StringProperty(name="Environment", description="EXR or HDR image of the light", subtype="FILE_PATH")
+    environment: StringProperty(
+        name="Environment",
+        description="EXR or HDR image of the light",
+        subtype="FILE_PATH",
+        options=blend_paths.RELATIVE,
+    )
     out: StringProperty(
         name="Save As",
         description="The file to write; empty is beside the first file, numbered where an object is made of that",
         subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
+        options={"SKIP_SAVE", *blend_paths.RELATIVE},
     )
     up: EnumProperty(name="Up", description="Axis that points up in the files", items=UP_ITEMS, default="auto")
     scale: FloatProperty(name="Scale", description="Factor on all lengths", default=1.0, min=1e-6, max=1e6)

@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 from bpy.props import FloatProperty, StringProperty
 
+from ..addon import blend_paths
 from ..addon.world_setup import choose_light, nodes_of
 from .base import DrgsOperator, DropTarget
 
@@ -21,7 +22,10 @@ class DRGS_OT_choose_light(DrgsOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
     filepath: StringProperty(
-        name="Image", description="Equirectangular image, EXR or HDR", subtype="FILE_PATH", options={"SKIP_SAVE"}
+        name="Image",
+        description="Equirectangular image, EXR or HDR",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE", *blend_paths.RELATIVE},
     )
     filter_glob: StringProperty(default="*.exr;*.hdr", options={"HIDDEN"})
     rotation: FloatProperty(

@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
-from ..addon import engine_link, messages
+from ..addon import blend_paths, engine_link, messages
 from .base import DrgsOperator
 from .engine_setup import without_capture
 
@@ -25,7 +25,10 @@ class DRGS_OT_print_markers(DrgsOperator, bpy.types.Operator):
     bl_label = "Print Marker Sheet"
 
     filepath: StringProperty(
-        name="File", description="The PDF to write. Print it at 100 %", subtype="FILE_PATH", options={"SKIP_SAVE"}
+        name="File",
+        description="The PDF to write. Print it at 100 %",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE", *blend_paths.RELATIVE},
     )
     check_existing: BoolProperty(default=True, options={"HIDDEN"})
     filter_glob: StringProperty(default="*.pdf", options={"HIDDEN"})

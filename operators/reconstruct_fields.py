@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
+from ..addon import blend_paths
 from ..drgs_blender.core.errors import UsageError
 from ..drgs_blender.core.file_types import CAMERAS, VIDEOS
 
@@ -144,14 +145,14 @@ class ReconstructFields:
     filepath: StringProperty(
         description="Folder of the photographs, with their cameras or without; or a video",
         subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
+        options={"SKIP_SAVE", *blend_paths.RELATIVE},
     )
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     out: StringProperty(
         name="Save As",
         description="The file to write; empty is beside the .blend, numbered where an object is made of that",
         subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
+        options={"SKIP_SAVE", *blend_paths.RELATIVE},
     )
     minutes: FloatProperty(
         name="Time Budget (min)",
@@ -186,6 +187,7 @@ class ReconstructFields:
         description="Segmentation model (.onnx), such as U2-Net or BiRefNet, or the name of one that rembg has "
         "downloaded. Nothing is downloaded here",
         subtype="FILE_PATH",
+        options=blend_paths.RELATIVE,
     )
     test_every: IntProperty(
         name="Hold Out Every Nth Photo",

@@ -10,7 +10,7 @@ from pathlib import Path
 import bpy
 from bpy.props import StringProperty
 
-from ..addon import assets, engine_link, messages
+from ..addon import assets, blend_paths, engine_link, messages
 from ..drgs_blender.core.errors import DrgsError, UsageError, WriteError
 from ..drgs_blender.core.version import __version__
 from ..drgs_blender.ipc.child_process import clean_environment
@@ -61,7 +61,10 @@ class DRGS_OT_report(DrgsOperator, bpy.types.Operator):
     bl_label = "Write Report"
 
     filepath: StringProperty(
-        name="File", description="The text file to write", subtype="FILE_PATH", options={"SKIP_SAVE"}
+        name="File",
+        description="The text file to write",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE", *blend_paths.RELATIVE},
     )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:

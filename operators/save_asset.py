@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
-from ..addon import assets, mesh_arrays, messages
+from ..addon import assets, blend_paths, mesh_arrays, messages
 from ..addon.export.objects import appearance_of
 from ..addon.viewport_material import update_viewport_material
 from ..drgs_blender.core.asset.container import write_asset
@@ -33,7 +33,7 @@ class DRGS_OT_save_asset(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
         name="File",
         description="The .drgs file to write; of several objects, each gets one of its own name beside it",
         subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
+        options={"SKIP_SAVE", *blend_paths.RELATIVE},
     )
     filter_glob: StringProperty(default="*.drgs", options={"HIDDEN"})
     check_existing: BoolProperty(default=True, options={"HIDDEN"})

@@ -314,3 +314,45 @@ def test_operators_that_cannot_run_say_what_they_need(scene):
         except RuntimeError as error:
             mute += [name] if "context is incorrect" in str(error) else []
     assert not mute
+
+
+@pytest.mark.parametrize("link", [False, True], ids=["append", "link"])
+@pytest.mark.parametrize("kind", ["Object", "Collection"])
+def test_what_is_appended_or_linked_brings_no_volume_object(ball, tmp_path, link, kind):
+    """Blender makes objects of the data that none shows: of the datablock that holds the asset's path."""
+    path = str(tmp_path / "library.blend")
+    name = ball.name if kind == "Object" else "Balls"
+    if kind == "Collection":
+        balls = bpy.data.collections.new(name)
+        bpy.context.scene.collection.children.link(balls)
+        balls.objects.link(ball)
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    bpy.ops.wm.read_homefile(use_empty=True)
+    (bpy.ops.wm.link if link else bpy.ops.wm.append)(directory=f"{path}/{kind}/", filename=name)
+    if not hasattr(bpy.app.handlers, "blend_import_post"):
+        part("addon.assets").remove_instanced_anchors()  # by a timer, which runs with a window
+    assert "VOLUME" not in {obj.type for obj in bpy.data.objects}
+    assert [volume.name for volume in bpy.data.volumes] == ["ball.drgs"]
+    (found,) = [obj for obj in bpy.data.objects if obj.type == "MESH"]
+    assert Path(bpy.path.abspath(found.drgs.path)).name == "ball.drgs"
+
+
+def test_paths_may_be_relative_to_the_file():
+    """Else newer Blenders show them in red."""
+    if not part("addon.blend_paths").RELATIVE:
+        pytest.skip("this Blender does not ask")
+    operators = [getattr(bpy.ops.drgs, name).get_rna_type() for name in dir(bpy.ops.drgs)]
+    groups = [
+        bpy.types.Object.bl_rna.properties["drgs"].fixed_type,
+        bpy.types.Scene.bl_rna.properties["drgs"].fixed_type,
+    ]
+    red = [
+        f"{rna.identifier}.{prop.identifier}"
+        for rna in (*operators, *groups)
+        for prop in rna.properties
+        if prop.type == "STRING"
+        and prop.subtype in ("FILE_PATH", "DIR_PATH")
+        and not prop.is_hidden
+        and not prop.is_path_supports_blend_relative
+    ]
+    assert red == []
