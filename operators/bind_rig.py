@@ -19,8 +19,11 @@ from .vertex_weights import Weights, read_weights, write_weights
 
 Array = np.ndarray
 
-#: Mean distance between the surfaces, as a part of the source's diagonal, above which the user is warned / refused.
-DOUBTFUL, WRONG = 0.02, 0.2
+#: Mean distance between the surfaces, as a part of the source's diagonal, above which it is refused.
+WRONG = 0.2
+#: Distance of a vertex, as such a part, above which it is off the surface, and part of the vertices from which on the
+#: user is warned: the others may fit well while an arm is elsewhere.
+OFF, DOUBTFUL = 0.005, 0.02
 
 
 class DRGS_OT_bind_to_rig(DrgsOperator, bpy.types.Operator):
@@ -45,11 +48,11 @@ class DRGS_OT_bind_to_rig(DrgsOperator, bpy.types.Operator):
             objects = selection.selected(context)
             sources = [o for o in sources if not assets.is_drgs(o)]
         for target in selection.editable(objects, data=True):
-            distance = bind_to_rig(context, target, sources)
-            if distance > DOUBTFUL:
+            off = bind_to_rig(context, target, sources)
+            if off > DOUBTFUL:
                 self.warn(
-                    f'"{target.name}" lies {distance:.1%} of its size away from the meshes it was bound to, and may '
-                    "bend wrongly. Undo, move it onto them, bind again"
+                    f'{off:.0%} of the vertices of "{target.name}" lie more than {OFF:.1%} of its size away from the '
+                    "meshes it was bound to, and may bend wrongly. Undo, move it onto them at rest, bind again"
                 )
         return {"FINISHED"}
 
@@ -63,7 +66,7 @@ def bind_to_rig(context: bpy.types.Context, target: bpy.types.Object, sources: l
     Returns
     -------
     float
-        Mean distance to the sources as a part of their diagonal.
+        Part of the vertices that are off the surface of the sources.
 
     Raises
     ------
@@ -86,8 +89,8 @@ def bind_to_rig(context: bpy.types.Context, target: bpy.types.Object, sources: l
     points = selection.world_vertices(target)
     match = by_numbers(points, _rest(target), places) or nearest(points, places)
     everything = np.concatenate([s.vertices for s in places])
-    distance = float(match.distance.mean() / max(np.linalg.norm(np.ptp(everything, axis=0)), 1e-12))
-    if distance > WRONG:
+    away = match.distance / max(float(np.linalg.norm(np.ptp(everything, axis=0))), 1e-12)
+    if (distance := float(away.mean())) > WRONG:
         raise UsageError(
             f'Object "{target.name}"',
             f"lies {distance:.0%} of their size away from the selected meshes",
@@ -97,7 +100,7 @@ def bind_to_rig(context: bpy.types.Context, target: bpy.types.Object, sources: l
         write_weights(target, _weights(places, match, armature))
         _attach(target, armature, armature_matrix, sources)
     transfer_shape_keys(target, matrix, [(s.object, s.matrix) for s in places], match)
-    return distance
+    return float((away > OFF).mean())
 
 
 def _rest(target: bpy.types.Object) -> Mesh:
@@ -110,7 +113,7 @@ def _rest(target: bpy.types.Object) -> Mesh:
 
 def armature_of(name: str, sources: list[bpy.types.Object]) -> bpy.types.Object | None:
     """The armature that moves the sources; None when shape keys alone do."""
-    found = {a for a in map(_armature, sources) if a is not None}
+    found = {a for a in map(armature_over, sources) if a is not None}
     if len(found) > 1:
         names = ", ".join(sorted(f'"{a.name}"' for a in found))
         raise UsageError(f'Object "{name}"', f"the selected meshes follow several armatures: {names}", "Bind to one")
@@ -121,7 +124,7 @@ def armature_of(name: str, sources: list[bpy.types.Object]) -> bpy.types.Object 
     return found.pop() if found else None
 
 
-def _armature(obj: bpy.types.Object) -> bpy.types.Object | None:
+def armature_over(obj: bpy.types.Object) -> bpy.types.Object | None:
     """Armature by modifier or parenting, through parents."""
     if (found := obj.find_armature()) is not None:
         return found

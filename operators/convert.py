@@ -1,7 +1,9 @@
-"""Convert to DR-GS: splats and meshes that other importers made become DR-GS objects at the same place."""
+"""Convert to DR-GS: splats and meshes of other importers become DR-GS objects at the same place, with their rig."""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
@@ -9,6 +11,7 @@ from bpy.props import BoolProperty, StringProperty
 
 from ..addon import assets, blend_paths, splat_attributes
 from ..drgs_blender.core.errors import UsageError
+from .bind_rig import armature_over, bind_to_rig, rest_pose
 from .engine_command import CommandOperator
 from .import_asset import import_assets
 
@@ -36,7 +39,6 @@ class DRGS_OT_convert(CommandOperator, bpy.types.Operator):
 
     _name = ""
     _target = Path()
-    _placed = False
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -68,8 +70,9 @@ class DRGS_OT_convert(CommandOperator, bpy.types.Operator):
         if original is None:
             raise UsageError(f'Object "{self._name}"', "is gone", "Undo what removed it")
         (made,) = import_assets(context, [self._target])
-        if not self._placed:
-            made.matrix_world = original.matrix_world
+        made.matrix_world = original.matrix_world
+        if original.type == "MESH" and len(original.data.polygons):
+            self._take_rig(context, made, original)
         if not self.use_original:
             original.hide_set(True)
             original.hide_render = True
@@ -79,7 +82,6 @@ class DRGS_OT_convert(CommandOperator, bpy.types.Operator):
         """Write what the object is, and return the arguments that make an asset of it."""
         subject = f'Object "{obj.name}"'
         data = obj.evaluated_get(context.evaluated_depsgraph_get()).data
-        self._placed = False
         if obj.type in ("MESH", "POINTCLOUD") and splat_attributes.is_splats(data):
             try:
                 columns = splat_attributes.read_splats(data)
@@ -93,24 +95,72 @@ class DRGS_OT_convert(CommandOperator, bpy.types.Operator):
         if obj.type != "MESH" or not len(data.polygons):
             raise UsageError(subject, "has neither faces nor the attributes of splats", "Choose splats or a mesh")
         path = self.work_folder / "mesh.glb"
-        selected, active = context.selected_objects, context.view_layer.objects.active
-        for other in selected:
-            other.select_set(other is obj)
-        obj.select_set(True)
-        try:
-            bpy.ops.export_scene.gltf(
-                filepath=str(path), use_selection=True, export_apply=True, export_skins=False, export_morph=False,
-                export_animations=False,
-            )  # fmt: skip
-        except (RuntimeError, AttributeError) as error:
-            problem = f"cannot be written by Blender's glTF exporter ({str(error).strip()[:200]})"
-            raise UsageError(subject, problem, "Enable the add-on glTF 2.0 format") from error
-        finally:
-            for other in selected:
-                other.select_set(True)
-            context.view_layer.objects.active = active
-        self._placed = True  # the file is in world space
+        with _alone_at_rest(context, obj):
+            try:
+                bpy.ops.export_scene.gltf(
+                    filepath=str(path), use_selection=True, export_apply=True, export_skins=False, export_morph=False,
+                    export_animations=False,
+                )  # fmt: skip
+            except (RuntimeError, AttributeError) as error:
+                problem = f"cannot be written by Blender's glTF exporter ({str(error).strip()[:200]})"
+                raise UsageError(subject, problem, "Enable the add-on glTF 2.0 format") from error
         return ["make", str(path)]
+
+    def _take_rig(self, context: bpy.types.Context, made: bpy.types.Object, original: bpy.types.Object) -> None:
+        """Let an object move as the one that it was made of: bones, shape keys, parent, constraints, animation."""
+        if armature_over(original) is not None or original.data.shape_keys:
+            bind_to_rig(context, made, [original])
+        if made.parent is None and original.parent is not None:
+            made.parent, made.parent_type = original.parent, original.parent_type
+            made.parent_bone = original.parent_bone
+            made.matrix_parent_inverse = original.matrix_parent_inverse
+        if armature_over(original) is not None:
+            return
+        made.rotation_mode, made.matrix_basis = original.rotation_mode, original.matrix_basis
+        for constraint in original.constraints:
+            made.constraints.copy(constraint)
+        animation = original.animation_data
+        if animation is not None and animation.action is not None:
+            own = made.animation_data_create()
+            own.action = animation.action
+            if getattr(animation, "action_slot", None) is not None:  # Blender 4.4 and later
+                own.action_slot = animation.action_slot
+        if animation is not None and (animation.nla_tracks or animation.drivers):
+            self.warn(f'"{made.name}" has no NLA tracks and drivers of "{original.name}": copy them, or parent it')
+
+
+@contextlib.contextmanager
+def _alone_at_rest(context: bpy.types.Context, obj: bpy.types.Object) -> Iterator[bpy.types.Object]:
+    """A copy of a mesh object at the origin, alone selected: modifiers are applied, bones and shape keys at rest."""
+    keys = obj.data.shape_keys.key_blocks if obj.data.shape_keys else ()
+    muted = [key.mute for key in keys]
+    selected, active = context.selected_objects, context.view_layer.objects.active
+    with rest_pose(context, armature_over(obj)):
+        try:
+            for key in keys:
+                key.mute = True
+            depsgraph = context.evaluated_depsgraph_get()
+            mesh = bpy.data.meshes.new_from_object(
+                obj.evaluated_get(depsgraph), preserve_all_data_layers=True, depsgraph=depsgraph
+            )
+        finally:
+            for key, mute in zip(keys, muted):
+                key.mute = mute
+    for index, slot in enumerate(obj.material_slots):  # those of the object, too
+        mesh.materials[index] = slot.material
+    alone = bpy.data.objects.new(obj.name, mesh)
+    assets.collection(context).objects.link(alone)
+    try:
+        for other in selected:
+            other.select_set(False)
+        alone.select_set(True)
+        context.view_layer.objects.active = alone
+        yield alone
+    finally:
+        bpy.data.meshes.remove(mesh)  # and the object
+        for other in selected:
+            other.select_set(True)
+        context.view_layer.objects.active = active
 
 
 CLASSES = (DRGS_OT_convert,)

@@ -8,7 +8,8 @@ import bpy
 import numpy as np
 import pytest
 from mathutils import Matrix
-from scenes import asset_of, mesh_object, part, select, sphere
+from mathutils.bvhtree import BVHTree
+from scenes import armature_object, asset_of, mesh_object, part, select, sphere
 
 pytestmark = pytest.mark.blender_api
 
@@ -203,3 +204,70 @@ def test_what_cannot_be_converted_is_said(ball, scene, tmp_path):
     with pytest.raises(RuntimeError, match=r'"ball": is made of .*would be lost'):
         bpy.ops.drgs.convert(out=str(tmp_path / "assets" / "ball"))
     assert (tmp_path / "assets" / "ball.drgs").read_bytes() == before
+
+
+def rigged_arm(scene):
+    """A bent arm: a column of two bones with weights, a shape key that swells it, posed and turned."""
+    vertices, faces = sphere(16, 24)
+    vertices = vertices * np.float32((0.3, 0.3, 1))
+    arm = mesh_object("Arm", vertices, faces)
+    rig = armature_object({"Lower": ((0, 0, -1), (0, 0, 0)), "Upper": ((0, 0, 0), (0, 0, 1))})
+    for name, members in (("Lower", vertices[:, 2] < 0), ("Upper", vertices[:, 2] >= 0)):
+        arm.vertex_groups.new(name=name).add(np.flatnonzero(members).tolist(), 1.0, "REPLACE")
+    arm.modifiers.new("Armature", "ARMATURE").object = rig
+    arm.parent = rig
+    arm.shape_key_add(name="Basis")
+    key = arm.shape_key_add(name="Fat", from_mix=False)
+    key.points.foreach_set("co", (vertices * np.float32((1.5, 1.5, 1))).ravel())
+    key.value = 1.0
+    rig.matrix_world = Matrix.Translation((1, 2, 3)) @ Matrix.Rotation(0.5, 4, "Y") @ Matrix.Scale(2, 4)
+    bone = rig.pose.bones["Upper"]
+    bone.rotation_mode, bone.rotation_euler = "XYZ", (1.2, 0, 0)
+    bpy.context.view_layer.update()
+    return arm, rig, key, bone
+
+
+def world_points(obj):
+    evaluated = obj.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    return np.array([evaluated.matrix_world @ v.co for v in evaluated.data.vertices])
+
+
+def test_a_rigged_mesh_keeps_its_rig_whatever_its_pose(scene, tmp_path):
+    """The asset is of the rest pose, and bends as the original does, in this pose and in others."""
+    arm, rig, key, bone = rigged_arm(scene)
+    select(arm)
+    assert bpy.ops.drgs.convert(out=str(tmp_path / "arm.drgs"), use_original=True) == {"FINISHED"}
+    made = bpy.context.active_object
+    rest = part("addon.assets").load(tmp_path / "arm.drgs").mesh.vertices
+    np.testing.assert_allclose(np.ptp(rest, axis=0), (0.6, 0.6, 2), atol=1e-3)
+    assert key.mute is False and rig.data.pose_position == "POSE" and [o.name for o in scene.objects].count("Arm") == 1
+    for angle, value in ((1.2, 1.0), (-0.7, 0.3), (0.0, 0.0)):
+        bone.rotation_euler[0], key.value = angle, value
+        made.data.shape_keys.key_blocks["Fat"].value = value
+        bpy.context.view_layer.update()
+        tree = BVHTree.FromPolygons(world_points(arm).tolist(), [list(p.vertices) for p in arm.data.polygons])
+        away = [tree.find_nearest(point)[3] for point in world_points(made)]
+        assert max(away) < 0.01, (angle, value)  # of 4 m
+        np.testing.assert_allclose(np.ptp(world_points(made), axis=0), np.ptp(world_points(arm), axis=0), atol=0.01)
+
+
+def test_a_moving_mesh_goes_on_moving(scene, tmp_path):
+    """Its action, its parent and its constraints are those of the object that is made of it."""
+    obj = mesh_object("Ball", *sphere(8, 12))
+    parent = bpy.data.objects.new("Parent", None)
+    scene.collection.objects.link(parent)
+    parent.location = (0, 0, 5)
+    obj.parent = parent
+    for frame, x in ((1, 0.0), (11, 4.0)):
+        obj.location.x = x
+        obj.keyframe_insert("location", frame=frame)
+    obj.constraints.new("COPY_ROTATION").target = parent
+    scene.frame_set(3)
+    select(obj)
+    assert bpy.ops.drgs.convert(out=str(tmp_path / "ball.drgs"), use_original=True) == {"FINISHED"}
+    made = bpy.context.active_object
+    assert [c.type for c in made.constraints] == ["COPY_ROTATION"]
+    parent.rotation_euler = (0.3, 0.2, 0.1)
+    for frame in (3, 7, 11):
+        scene.frame_set(frame)
+        np.testing.assert_allclose(np.array(made.matrix_world), np.array(obj.matrix_world), atol=1e-5)
