@@ -67,6 +67,15 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
     )
     up: EnumProperty(name="Up", description="Axis that points up in the files", items=UP_ITEMS, default="auto")
     scale: FloatProperty(name="Scale", description="Factor on all lengths", default=1.0, min=1e-6, max=1e6)
+    pose: EnumProperty(
+        name="Pose",
+        description="Of a rigged glTF file without surfels",
+        items=(
+            ("rest", "Rest", "As Blender's importer rests it, so that Transfer Rig fits"),
+            ("default", "As Viewers Show", "For files whose rest pose is broken, or that need no rig"),
+        ),
+        default="rest",
+    )
     use_mesh: BoolProperty(
         name="Mesh from Splats",
         description="Where no mesh is given, build one around the splats, so that they can be bent and cast shadows. "
@@ -157,6 +166,8 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
                     "Estimate Colour without Light", "needs the light of the capture", "Choose its environment"
                 )
             arguments.append("--remove-light")
+        if self.pose != "rest" and not surfels:
+            arguments += ["--pose", self.pose]
         if self.up != "auto":
             arguments.append(f"--up={self.up}")
         if self.scale != 1.0:

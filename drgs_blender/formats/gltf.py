@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,10 @@ from .gltf_materials import GltfMaterials
 from .gltf_nodes import INSTANCES, NodeTree, Pose
 
 Array = np.ndarray
+logger = logging.getLogger(__name__)
 
+#: How many times as large as viewers show it a rest pose may be.
+_ALIKE = 2.0
 #: Required extensions that change nothing of what is read here, or that are read.
 _UNDERSTOOD = {
     INSTANCES,
@@ -59,11 +63,44 @@ def read_gltf(path: Path, pose: Pose = "rest") -> MeshFile:
             piece = _primitive(document, primitive, tree, node, node_index, materials, notes)
             if piece is not None:
                 pieces.append((name, piece))
+    if tree.skins and pose == "rest":
+        _compare_poses(document, tree)
     if tree.skins:
         notes.append(f"skinned: the mesh is in its {'rest' if pose == 'rest' else 'default'} pose")
     if document.items("animations"):
         notes.append("animations ignored")
     return _join(pieces, materials.used, list(dict.fromkeys(notes)))
+
+
+def _compare_poses(document: Document, rest: NodeTree) -> None:
+    """Warn where what is skinned has another size at rest than viewers show: such a rest pose is broken."""
+    sizes = [_skinned_size(document, tree) for tree in (rest, NodeTree(document, "default"))]
+    own, shown = (float(np.linalg.norm(size)) for size in sizes)
+    if shown > 0 and not 1 / _ALIKE < own / shown < _ALIKE:
+        text = [" x ".join(f"{x:.3g}" for x in size) for size in sizes]
+        logger.warning(
+            "%s: its rest pose is %s large, %s as viewers show it: it is broken, in Blender as well. The pose that "
+            "viewers show (--pose default) is whole, but takes no rig", document.subject, *text,
+        )  # fmt: skip
+
+
+def _skinned_size(document: Document, tree: NodeTree) -> Array:
+    """(3,) size of the box around all skinned vertices, Z up."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for node_index in tree.order:
+        node = document.items("nodes")[node_index]
+        mesh_index, skin = document.index(node, "mesh"), document.index(node, "skin")
+        if mesh_index is None or skin is None:
+            continue
+        for primitive in document.get(document.item("meshes", mesh_index), "primitives", list, []):
+            attributes = document.get(primitive, "attributes", dict, {})
+            vertices = _float(document, attributes, "POSITION", ("VEC3",))
+            if vertices is None or not len(vertices) or "JOINTS_0" not in attributes or "WEIGHTS_0" not in attributes:
+                continue
+            blend = _blend_matrices(document, attributes, tree.skin_matrices(skin), len(vertices))
+            moved = vertices_up(np.einsum("nij,nj->ni", blend[:, :, :3], vertices) + blend[:, :, 3])
+            low, high = np.minimum(low, moved.min(axis=0)), np.maximum(high, moved.max(axis=0))
+    return np.nan_to_num(np.maximum(high - low, 0), posinf=0.0)
 
 
 def _check_extensions(document: Document, notes: list[str]) -> None:

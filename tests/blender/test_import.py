@@ -356,3 +356,12 @@ def test_paths_may_be_relative_to_the_file():
         and not prop.is_path_supports_blend_relative
     ]
     assert red == []
+
+
+def test_the_pose_of_a_mesh_can_be_chosen(scene, tmp_path, monkeypatch):
+    given = []
+    operator = part("operators.import_parts").DRGS_OT_import_parts
+    monkeypatch.setattr(operator, "start", lambda self, context, arguments, *_: given.append(arguments) or {"FINISHED"})
+    for pose in ("rest", "default"):
+        bpy.ops.drgs.import_parts(mesh=str(tmp_path / "a.glb"), pose=pose)
+    assert "--pose" not in given[0] and given[1][given[1].index("--pose") + 1] == "default"

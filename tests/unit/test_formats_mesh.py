@@ -545,3 +545,35 @@ def test_a_real_obj_with_texture(shared_data: Path) -> None:
     spot = read_mesh(shared_data / "meshes/spot_textured/spot_triangulated.obj")
     assert spot.faces.shape == (5856, 3) and spot.vertices.shape == (2930, 3)
     assert spot.corner_uvs.shape == (5856, 3, 2) and len(np.unique(spot.corner_uvs.reshape(-1, 2), axis=0)) > 2930
+
+
+@pytest.mark.parametrize(("scale", "broken"), [(40.0, True), (1.5, False), (1.0, False)])
+def test_a_rest_pose_of_another_size_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture, scale, broken) -> None:
+    """A joint that is scaled, and a bind matrix that takes it back: bones have no scale in Blender's rest pose."""
+    arrays = [
+        np.float32([(0, 0, 0), (1, 0, 0), (0, 1, 0)]), np.zeros((3, 4), np.uint8),
+        np.tile(np.float32((1, 0, 0, 0)), (3, 1)),
+        np.uint16([0, 1, 2, 0]), np.diag([1 / scale] * 3 + [1]).astype(np.float32),
+    ]  # fmt: skip
+    views, data = [], b""
+    for array in arrays:
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes})
+        data += array.tobytes()
+    kinds = [(5126, "VEC3", 3), (5121, "VEC4", 3), (5126, "VEC4", 3), (5123, "SCALAR", 3), (5126, "MAT4", 1)]
+    accessors = [
+        {"bufferView": k, "componentType": component, "type": kind, "count": count}
+        for k, (component, kind, count) in enumerate(kinds)
+    ]
+    text = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 1]}],
+        "nodes": [{"mesh": 0, "skin": 0}, {"scale": [scale] * 3}],
+        "skins": [{"joints": [1], "inverseBindMatrices": 4}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "JOINTS_0": 1, "WEIGHTS_0": 2}, "indices": 3}]}],
+        "buffers": [{"byteLength": len(data), "uri": "data:;base64," + base64.b64encode(data).decode()}],
+        "bufferViews": views, "accessors": accessors,
+    }  # fmt: skip
+    path = tmp_path / "arm.gltf"
+    path.write_text(json.dumps(text))
+    sizes = [np.ptp(read_mesh(path, pose).vertices, axis=0).max() for pose in ("rest", "default")]
+    assert sizes == pytest.approx([1 / scale, 1])
+    assert ("its rest pose is 0.025 x" in caplog.text and "--pose default" in caplog.text) == broken
