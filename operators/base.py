@@ -10,12 +10,16 @@ import bpy
 from ..addon import messages
 from ..drgs_blender.core.errors import DrgsError, UsageError, WriteError
 
+#: Identifier of an operator -> the errors it has told since it last succeeded.
+_errors: dict[str, list[str]] = {}
+
 
 class DrgsOperator:
     """Base of operators that do their work in `run` and may raise DrgsError there."""
 
     # Of Blender's Operator, which subclasses have as a base beside this, and their own.
     if TYPE_CHECKING:
+        bl_idname: str
         bl_label: str
         filepath: str
         report: Callable[[set[str], str], None]
@@ -28,9 +32,13 @@ class DrgsOperator:
         return self.guard(self.run, context)
 
     def guard(self, work: Callable[[bpy.types.Context], set[str]], context: bpy.types.Context) -> set[str]:
-        """Do `work`, and report its errors."""
+        """Do `work`, and report its errors; once it succeeds, those of before hold no longer."""
         try:
-            return work(context)
+            result = work(context)
+            if "FINISHED" in result:
+                for text in _errors.pop(self.bl_idname, ()):
+                    messages.withdraw("ERROR", text)
+            return result
         except DrgsError as error:
             return self.fail(error)
         except OSError as error:  # files, folders and disks that go away, refuse or have impossible names
@@ -47,6 +55,7 @@ class DrgsOperator:
     def fail(self, error: DrgsError) -> set[str]:
         """Report an error; from a script it is raised as RuntimeError."""
         messages.note("ERROR", str(error))
+        _errors.setdefault(self.bl_idname, []).append(str(error))
         self.report({"ERROR"}, str(error))
         return {"CANCELLED"}
 

@@ -271,3 +271,18 @@ def test_a_moving_mesh_goes_on_moving(scene, tmp_path):
     for frame in (3, 7, 11):
         scene.frame_set(frame)
         np.testing.assert_allclose(np.array(made.matrix_world), np.array(obj.matrix_world), atol=1e-5)
+
+
+def test_an_error_leaves_when_the_operator_succeeds(scene, tmp_path):
+    messages = part("addon.messages")
+    obj = mesh_object("Ball", *sphere(8, 12))
+    select(obj)
+    with pytest.raises(RuntimeError, match="cannot be read"):
+        bpy.ops.drgs.import_parts(mesh=str(tmp_path / "none.glb"))
+    assert [m.level for m in messages.history].count("ERROR") == 1
+    assert bpy.ops.drgs.convert(out=str(tmp_path / "ball.drgs")) == {"FINISHED"}
+    assert [m.level for m in messages.history].count("ERROR") == 1  # of another operator
+    path = tmp_path / "ball.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n")
+    assert bpy.ops.drgs.import_parts(mesh=str(path)) == {"FINISHED"}
+    assert "ERROR" not in [m.level for m in messages.history]
