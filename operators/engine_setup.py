@@ -187,14 +187,19 @@ class DRGS_OT_engine_choose(DrgsOperator, bpy.types.Operator):
 
     filepath: StringProperty(
         name="Engine",
-        description="Folder of the environment, or its Python",
+        description="Folder of the environment, or of the checkout it is in, or its Python",
         subtype="FILE_PATH",
         options={"SKIP_SAVE", *blend_paths.RELATIVE},
     )
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if not self.filepath:
+            self.filepath = os.path.join(
+                os.path.expanduser("~"), ""
+            )  # else Blender writes the name of the .blend there
         context.window_manager.fileselect_add(self)
+        bpy.app.timers.register(show_hidden, first_interval=0.1)  # when the browser is there
         return {"RUNNING_MODAL"}
 
     def run(self, context: bpy.types.Context) -> set[str]:
@@ -204,6 +209,14 @@ class DRGS_OT_engine_choose(DrgsOperator, bpy.types.Operator):
         if not preferences.write("engine_python", path):
             raise UsageError("Preferences", "the extension is not enabled", "Enable it in Preferences > Add-ons")
         return bpy.ops.drgs.engine_test()
+
+
+def show_hidden() -> None:
+    """Show hidden files in open file browsers: environments are often named .venv."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "FILE_BROWSER" and area.spaces.active.params is not None:
+                area.spaces.active.params.show_hidden = True
 
 
 def without_capture(subject: str, problem: str) -> UsageError:

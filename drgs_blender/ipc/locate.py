@@ -20,9 +20,9 @@ def _interpreter_in(folder: Path) -> Path | None:
 
 
 def _interpreter(place: Path) -> Path | None:
-    """The Python that `place` means: an interpreter, a ``drgs`` program, or the folder of an environment."""
+    """The Python that `place` means: an interpreter, a ``drgs`` program, or the folder of an environment or checkout."""
     if place.is_dir():
-        return _interpreter_in(place)
+        return _interpreter_in(place) or _interpreter_in(place / ".venv")
     if not place.is_file():
         return None
     if place.stem.lower() == "drgs":
@@ -40,7 +40,7 @@ def locate_engine(preference: str | os.PathLike[str] | None = None) -> list[str]
 
     Looked at in this order: the environment variable ``DRGS_ENGINE``, `preference`, and ``.venv`` beside the package
     when it runs from a source checkout. The first two may name an interpreter, a ``drgs`` program or the folder of an
-    environment; one that is set but leads nowhere is an error, never skipped.
+    environment, or of a checkout with ``.venv``; one that is set but leads nowhere is an error, never skipped.
 
     Raises
     ------

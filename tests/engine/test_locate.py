@@ -39,6 +39,11 @@ def test_folder_interpreter_and_program_lead_to_the_interpreter(environment, mon
     assert command == [str(environment / "bin/python3"), "-I", "-m", "drgs_blender.engine"]
 
 
+def test_a_checkout_has_its_environment_in_it(environment, tmp_path):
+    environment.rename(tmp_path / ".venv")
+    assert locate_engine(tmp_path)[0] == str(tmp_path / ".venv" / "bin" / "python3")
+
+
 def test_link_to_the_program_is_followed(environment, tmp_path):
     link = tmp_path / "local" / "drgs"
     link.parent.mkdir()
