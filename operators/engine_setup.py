@@ -195,9 +195,13 @@ class DRGS_OT_engine_choose(DrgsOperator, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if not self.filepath:
+<<<<<<< HEAD
             self.filepath = os.path.join(
                 os.path.expanduser("~"), ""
             )  # else Blender writes the name of the .blend there
+=======
+            self.filepath = os.path.join(os.path.expanduser("~"), "")  # not the name of the .blend
+>>>>>>> 4853f3d0 (Compositing that is left over is told, with what removes it)
         context.window_manager.fileselect_add(self)
         bpy.app.timers.register(show_hidden, first_interval=0.1)  # when the browser is there
         return {"RUNNING_MODAL"}

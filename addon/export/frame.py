@@ -174,8 +174,11 @@ def _check_features(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, war
     space = getattr(getattr(bpy.data, "colorspace", None), "working_space", WORKING_SPACE)
     if space != WORKING_SPACE:
         warn(f"The file works in {space}; DR-GS renders {WORKING_SPACE}, so colours will differ")
-    if scene.drgs.background_scene is not None and (changed := compositing.differences(scene)):
-        below = f'Scene "{scene.drgs.background_scene.name}"'
-        warn(f"{below} has another {', '.join(changed)} now: press Set Up Compositing again")
+    if (other := scene.drgs.background_scene) is not None:
+        below = f'Scene "{other.name}"'
+        if other.render.engine == compositing.ENGINE:
+            warn(f"{below} is rendered by DR-GS itself now, and composited with it: press Remove Compositing")
+        elif changed := compositing.differences(scene):
+            warn(f"{below} has another {', '.join(changed)} now: press Set Up Compositing again")
     if lacking := not_rendered(view_layer):
         warn(f'View layer "{view_layer.name}": DR-GS has no pass {", ".join(lacking)}')

@@ -17,6 +17,8 @@ class DRGS_PT_compositing(bpy.types.Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
+        if context.engine == compositing.ENGINE:  # after the engine was another one
+            return compositing.partner_of(context.scene) is not None
         return context.engine in ("CYCLES", "BLENDER_EEVEE", "BLENDER_EEVEE_NEXT")
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -24,6 +26,10 @@ class DRGS_PT_compositing(bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         partner = compositing.partner_of(context.scene)
+        if context.engine == compositing.ENGINE:
+            wrapped(layout, context, "DR-GS is composited over this scene, which it renders itself now", "ERROR")
+            layout.operator("drgs.clear_compositing", icon="X")
+            return
         if partner is None:
             wrapped(layout, context, "DR-GS objects rendered by DR-GS, everything else by this engine")
             layout.operator("drgs.set_up_compositing", icon="NODE_COMPOSITING")

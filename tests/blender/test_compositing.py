@@ -112,6 +112,24 @@ def test_settings_of_the_second_scene_survive_and_what_it_lacks_is_named(shared_
     assert len(captured[1].objects) == 2 and len(captured[1].meshes) == 4
 
 
+def test_compositing_that_is_left_over_is_told_with_what_removes_it(shared_scene, export):
+    """The scene's engine is DR-GS itself now: nothing is to be set up again."""
+    scene = shared_scene
+    bpy.ops.drgs.set_up_compositing()
+    compositing = part("addon.compositing")
+    partner = compositing.partner_of(scene)
+    panel = part("addon.panels.compositing").DRGS_PT_compositing
+    scene.render.engine = "DRGS"
+    warnings = []
+    with bpy.context.temp_override(scene=partner, view_layer=partner.view_layers[0]):
+        part("addon.export").export_frame(bpy.context.evaluated_depsgraph_get(), str, warnings.append)
+    (told,) = [text for text in warnings if "compos" in text.lower()]
+    assert "rendered by DR-GS itself now" in told and "Remove Compositing" in told
+    assert panel.poll(bpy.context)
+    assert bpy.ops.drgs.clear_compositing() == {"FINISHED"}
+    assert not panel.poll(bpy.context) and compositing.partner_of(scene) is None
+
+
 def test_what_cannot_be_composited_is_refused_in_words(shared_scene, ball):
     scene = shared_scene
     scene.render.engine = "DRGS"
