@@ -58,9 +58,13 @@ def remove_instanced_anchors() -> None:
     It takes them for volumes that no object shows. The anchors stay.
     """
     for obj in list(bpy.data.objects):
-        volume = obj.data
-        if obj.type == "VOLUME" and obj.library is None and volume and volume.filepath.lower().endswith(".drgs"):
+        if obj.library is None and shows_anchor(obj):
             bpy.data.objects.remove(obj)
+
+
+def shows_anchor(obj: bpy.types.Object) -> bool:
+    """Whether `obj` is a Volume object of a datablock that holds the path of an asset."""
+    return obj.type == "VOLUME" and obj.data is not None and obj.data.filepath.lower().endswith(".drgs")
 
 
 def file_of(obj: bpy.types.Object) -> Path:

@@ -10,8 +10,8 @@ import bpy
 from ..addon import messages
 from ..drgs_blender.core.errors import DrgsError, UsageError, WriteError
 
-#: Identifier of an operator -> the errors it has told since it last succeeded.
-_errors: dict[str, list[str]] = {}
+#: Identifier of an operator -> the errors it has told that may still hold.
+_errors: dict[str, set[str]] = {}
 
 
 class DrgsOperator:
@@ -32,12 +32,15 @@ class DrgsOperator:
         return self.guard(self.run, context)
 
     def guard(self, work: Callable[[bpy.types.Context], set[str]], context: bpy.types.Context) -> set[str]:
-        """Do `work`, and report its errors; once it succeeds, those of before hold no longer."""
+        """Do `work`, and report its errors; once it succeeds, those of before hold no longer, but of other objects."""
+        chosen = {obj.name for obj in context.selected_objects or ()}
         try:
             result = work(context)
             if "FINISHED" in result:
-                for text in _errors.pop(self.bl_idname, ()):
-                    messages.withdraw("ERROR", text)
+                for text in list(_errors.get(self.bl_idname, ())):
+                    if messages.named_in(text, bpy.data.objects) in ("", *chosen):
+                        messages.withdraw("ERROR", text)
+                        _errors[self.bl_idname].discard(text)
             return result
         except DrgsError as error:
             return self.fail(error)
@@ -55,7 +58,7 @@ class DrgsOperator:
     def fail(self, error: DrgsError) -> set[str]:
         """Report an error; from a script it is raised as RuntimeError."""
         messages.note("ERROR", str(error))
-        _errors.setdefault(self.bl_idname, []).append(str(error))
+        _errors.setdefault(self.bl_idname, set()).add(str(error))
         self.report({"ERROR"}, str(error))
         return {"CANCELLED"}
 

@@ -110,16 +110,22 @@ class DRGS_OT_convert(CommandOperator, bpy.types.Operator):
         """Let an object move as the one that it was made of: bones, shape keys, parent, constraints, animation."""
         if armature_over(original) is not None or original.data.shape_keys:
             bind_to_rig(context, made, [original])
-        if made.parent is None and original.parent is not None:
-            made.parent, made.parent_type = original.parent, original.parent_type
-            made.parent_bone = original.parent_bone
-            made.matrix_parent_inverse = original.matrix_parent_inverse
-        if armature_over(original) is not None:
+        animation = original.animation_data
+        if made.parent is not None and made.parent is not original.parent:  # the armature, by which it is moved now
+            if animation is not None or original.constraints:
+                self.warn(f'"{made.name}" moves with "{made.parent.name}" alone: the animation and constraints of '
+                          f'"{original.name}" itself are not taken over')  # fmt: skip
             return
+        if original.parent is not None:
+            made.parent, made.parent_type = original.parent, original.parent_type
+            made.parent_bone, made.parent_vertices = original.parent_bone, original.parent_vertices
+            made.matrix_parent_inverse = original.matrix_parent_inverse
         made.rotation_mode, made.matrix_basis = original.rotation_mode, original.matrix_basis
+        for name in ("location", "rotation_euler", "rotation_quaternion", "scale"):
+            setattr(made, name, getattr(original, name))
+            setattr(made, f"delta_{name}", getattr(original, f"delta_{name}"))
         for constraint in original.constraints:
             made.constraints.copy(constraint)
-        animation = original.animation_data
         if animation is not None and animation.action is not None:
             own = made.animation_data_create()
             own.action = animation.action
@@ -146,8 +152,9 @@ def _alone_at_rest(context: bpy.types.Context, obj: bpy.types.Object) -> Iterato
         finally:
             for key, mute in zip(keys, muted):
                 key.mute = mute
-    for index, slot in enumerate(obj.material_slots):  # those of the object, too
-        mesh.materials[index] = slot.material
+    for index, slot in enumerate(obj.material_slots):
+        if slot.link == "OBJECT" and index < len(mesh.materials):  # nodes may have made other slots
+            mesh.materials[index] = slot.material
     alone = bpy.data.objects.new(obj.name, mesh)
     assets.collection(context).objects.link(alone)
     try:

@@ -195,13 +195,7 @@ class DRGS_OT_engine_choose(DrgsOperator, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if not self.filepath:
-<<<<<<< HEAD
-            self.filepath = os.path.join(
-                os.path.expanduser("~"), ""
-            )  # else Blender writes the name of the .blend there
-=======
             self.filepath = os.path.join(os.path.expanduser("~"), "")  # not the name of the .blend
->>>>>>> 4853f3d0 (Compositing that is left over is told, with what removes it)
         context.window_manager.fileselect_add(self)
         bpy.app.timers.register(show_hidden, first_interval=0.1)  # when the browser is there
         return {"RUNNING_MODAL"}
@@ -216,11 +210,13 @@ class DRGS_OT_engine_choose(DrgsOperator, bpy.types.Operator):
 
 
 def show_hidden() -> None:
-    """Show hidden files in open file browsers: environments are often named .venv."""
+    """Show hidden files in the browser of *Choose Engine*: environments are often named .venv."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type == "FILE_BROWSER" and area.spaces.active.params is not None:
-                area.spaces.active.params.show_hidden = True
+            space = area.spaces.active
+            ours = area.type == "FILE_BROWSER" and space.active_operator is not None
+            if ours and space.active_operator.bl_idname == "DRGS_OT_engine_choose" and space.params is not None:
+                space.params.show_hidden = True
 
 
 def without_capture(subject: str, problem: str) -> UsageError:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ...drgs_blender.core.errors import Cancelled, first_of
 from ...drgs_blender.core.frame import Visibility
+from .. import assets
 
 T = TypeVar("T")
 Warn = Callable[[str], None]
@@ -113,7 +114,7 @@ class Unrendered:
 
     def add(self, obj: bpy.types.Object) -> None:
         """Remember an object of a type in `UNRENDERED`, or the hair on another."""
-        kind = UNRENDERED.get(obj.type)
+        kind = None if assets.shows_anchor(obj) else UNRENDERED.get(obj.type)
         if kind is not None:
             self._names.setdefault(kind, set()).add(obj.name)
         elif any(p.settings.type == "HAIR" and p.settings.render_type == "PATH" for p in obj.particle_systems):

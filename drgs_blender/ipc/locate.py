@@ -20,7 +20,7 @@ def _interpreter_in(folder: Path) -> Path | None:
 
 
 def _interpreter(place: Path) -> Path | None:
-    """The Python that `place` means: an interpreter, a ``drgs`` program, or the folder of an environment or checkout."""
+    """The Python of `place`: an interpreter, a ``drgs`` program, or the folder of an environment or of a checkout."""
     if place.is_dir():
         return _interpreter_in(place) or _interpreter_in(place / ".venv")
     if not place.is_file():

@@ -286,3 +286,40 @@ def test_an_error_leaves_when_the_operator_succeeds(scene, tmp_path):
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n")
     assert bpy.ops.drgs.import_parts(mesh=str(path)) == {"FINISHED"}
     assert "ERROR" not in [m.level for m in messages.history]
+
+
+def test_an_error_of_another_object_stays(scene, tmp_path):
+    messages = part("addon.messages")
+    empty = bpy.data.objects.new("Empty", bpy.data.meshes.new("Empty"))
+    scene.collection.objects.link(empty)
+    select(empty)
+    with pytest.raises(RuntimeError, match=r'"Empty".*neither faces'):
+        bpy.ops.drgs.convert(out=str(tmp_path / "empty.drgs"))
+    select(mesh_object("Ball", *sphere(8, 12)))
+    assert bpy.ops.drgs.convert(out=str(tmp_path / "ball.drgs")) == {"FINISHED"}
+    assert [m.level for m in messages.history].count("ERROR") == 1
+
+
+def test_slots_that_nodes_leave_out_are_no_error(scene, tmp_path):
+    obj = mesh_object("Ball", *sphere(8, 12))
+    for name in ("One", "Two"):
+        obj.data.materials.append(bpy.data.materials.new(name))
+    tree = bpy.data.node_groups.new("Cube", "GeometryNodeTree")
+    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    cube, out = tree.nodes.new("GeometryNodeMeshCube"), tree.nodes.new("NodeGroupOutput")
+    tree.links.new(cube.outputs["Mesh"], out.inputs[0])
+    obj.modifiers.new("Nodes", "NODES").node_group = tree
+    select(obj)
+    meshes = len(bpy.data.meshes)
+    assert bpy.ops.drgs.convert(out=str(tmp_path / "cube.drgs"), use_original=True) == {"FINISHED"}
+    assert len(bpy.data.meshes) == meshes + 1  # that of the new object
+
+
+def test_what_a_rigged_mesh_does_beside_its_rig_is_told(scene, tmp_path):
+    arm, _, _, _ = rigged_arm(scene)
+    arm.keyframe_insert("location", frame=1)
+    select(arm)
+    assert bpy.ops.drgs.convert(out=str(tmp_path / "arm.drgs")) == {"FINISHED"}
+    made, messages = bpy.context.active_object, part("addon.messages")
+    moves = made.animation_data is not None and made.animation_data.action is arm.animation_data.action
+    assert moves or any("is not taken over" in m.text or "are not taken over" in m.text for m in messages.history)

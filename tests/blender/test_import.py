@@ -337,6 +337,14 @@ def test_what_is_appended_or_linked_brings_no_volume_object(ball, tmp_path, link
     assert Path(bpy.path.abspath(found.drgs.path)).name == "ball.drgs"
 
 
+def test_the_volume_object_that_an_older_blender_makes_is_no_volume_that_is_left_out(ball, export):
+    volume = bpy.data.objects.new("ball.drgs", ball.drgs.asset)
+    bpy.context.scene.collection.objects.link(volume)
+    assert export()[1] == []
+    volume.data = bpy.data.volumes.new("Smoke")
+    assert "Smoke" not in export()[1] and "volume object is not rendered" in export()[1][0]
+
+
 def test_paths_may_be_relative_to_the_file():
     """Else newer Blenders show them in red."""
     if not part("addon.blend_paths").RELATIVE:
