@@ -259,7 +259,7 @@ def _make(
 
         capture = protocol.read(root, name, reading.resolution)
         asset = reconstruct(capture, settings, tell, cancelled, work)
-    asset.provenance["settings"]["capture"] = as_tables(settings, reading)["capture"]
+    asset.provenance.setdefault("settings", as_tables(settings))["capture"] = as_tables(settings, reading)["capture"]
     write_asset(file, asset)
     clear(work)
     if not args.quiet:

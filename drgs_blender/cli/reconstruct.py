@@ -213,7 +213,7 @@ def run(args: argparse.Namespace) -> int:
         finally:
             _remove_if_empty(work)  # where there is nothing to go on from
     # Beside those that `reconstruct` kept, of which some follow from the photographs and this machine.
-    asset.provenance["settings"]["capture"] = as_tables(settings, reading)["capture"]
+    asset.provenance.setdefault("settings", as_tables(settings))["capture"] = as_tables(settings, reading)["capture"]
     write_and_report(args.out, asset)
     clear(work)
     report = asset.provenance["report"]
@@ -231,6 +231,8 @@ def run(args: argparse.Namespace) -> int:
 def reconstruction() -> Callable[..., Asset]:
     """`pipeline.reconstruct`, which is imported when it is needed. Raises DeviceError where PyTorch is absent."""
     try:
+        import torch  # noqa: F401 - which the pipeline needs
+
         from ..reconstruct.pipeline import reconstruct
     except ImportError as error:
         if error.name != "torch":

@@ -555,7 +555,6 @@ def test_settings_of_reading_that_the_set_says_are_refused(given, sets, tmp_path
 
 def test_without_pytorch_it_is_said_before_anything_else(sets, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
-    monkeypatch.delitem(sys.modules, "drgs_blender.reconstruct.pipeline", raising=False)
     said = refused(capsys, 69, "--protocol", "shiny-blender", sets["shiny-blender"], "--out", tmp_path / "out")
     assert "reconstruct: needs PyTorch" in said
 
