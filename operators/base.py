@@ -10,7 +10,7 @@ import bpy
 from ..addon import messages
 from ..drgs_blender.core.errors import DrgsError, UsageError, WriteError
 
-#: Identifier of an operator -> the errors it has told that may still hold.
+#: Class of an operator -> the errors it has told that may still hold.
 _errors: dict[str, set[str]] = {}
 
 
@@ -19,7 +19,6 @@ class DrgsOperator:
 
     # Of Blender's Operator, which subclasses have as a base beside this, and their own.
     if TYPE_CHECKING:
-        bl_idname: str
         bl_label: str
         filepath: str
         report: Callable[[set[str], str], None]
@@ -37,10 +36,10 @@ class DrgsOperator:
         try:
             result = work(context)
             if "FINISHED" in result:
-                for text in list(_errors.get(self.bl_idname, ())):
+                for text in list(_errors.get(type(self).__name__, ())):
                     if messages.named_in(text, bpy.data.objects) in ("", *chosen):
                         messages.withdraw("ERROR", text)
-                        _errors[self.bl_idname].discard(text)
+                        _errors[type(self).__name__].discard(text)
             return result
         except DrgsError as error:
             return self.fail(error)
@@ -58,7 +57,7 @@ class DrgsOperator:
     def fail(self, error: DrgsError) -> set[str]:
         """Report an error; from a script it is raised as RuntimeError."""
         messages.note("ERROR", str(error))
-        _errors.setdefault(self.bl_idname, set()).add(str(error))
+        _errors.setdefault(type(self).__name__, set()).add(str(error))
         self.report({"ERROR"}, str(error))
         return {"CANCELLED"}
 
