@@ -321,6 +321,11 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, thin: bool, rep
 
     rest = tell, work.cancelled, work.file("materials")
     if settings.joint is None:
+        if thin and work.backend is not CPU and work.settings.variant == "p":
+            log.info(
+                "thin objects learn surfels with their materials on the CPU alone: on the card they stay; "
+                "decoupling.joint = %g learns them, on the CPU", JOINT,
+            )  # fmt: skip
         settings = replace(settings, joint=JOINT if thin and work.backend is CPU else 0.0)
     if settings.joint and work.settings.variant == "p":
         if work.backend is not CPU:

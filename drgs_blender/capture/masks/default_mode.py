@@ -7,8 +7,8 @@ import logging
 from pathlib import Path
 
 from ...core.errors import AssetError, DeviceError
-from .. import libraries
 from ..pictures import Picture, decode, find_pictures, find_video
+from .stage import check_mode
 
 logger = logging.getLogger(__name__)
 
@@ -39,8 +39,7 @@ def resolve_mode(mode: str, source: Path, calibrated: bool) -> str:
     if calibrated:
         return "given"
     try:
-        for name in ("opencv", "torch"):
-            libraries.load(name)
+        check_mode("auto")
     except DeviceError as error:
         if _has_masks(source):
             return "given"
