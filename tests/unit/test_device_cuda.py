@@ -80,7 +80,7 @@ def test_learnings_kernels_compile_for_a_card(tmp_path: Path) -> None:
     test_device_learning.test_what_is_mirrored(device)
     test_device_learning.test_losses_of_the_shape(device, (0.0, 0.0, 0.25))
     test_device_learning.test_a_step_down(device)
-    test_device_gather.test_what_arrives_and_its_derivatives(device, {})
+    test_device_gather.test_what_arrives_and_its_derivatives(device, {}, True)
     modules = appearance, kernels, losses, warp_backend, gather
     wanted = {
         kernel for module in modules for kernel in vars(module).values() if isinstance(kernel, kernels.WarpKernel)

@@ -250,8 +250,8 @@ def test_a_damaged_kernel_is_compiled_again_ahead(small) -> None:
 
 @pytest.fixture
 def full(small_disk) -> Path:
-    """A folder that can be written, on a disk without room for a kernel of any size."""
-    return small_disk("size=16k") / "kernels"
+    """A folder that can be written, as each process tries, on a disk without room for a few kernels."""
+    return small_disk("size=24k") / "kernels"
 
 
 @pytest.mark.slow
@@ -267,6 +267,7 @@ def test_a_full_disk_ends_preparing_and_is_named(full: Path, tmp_path: Path) -> 
     )
     assert done.returncode == EXIT_CANNOT_WRITE and "ready" not in done.stdout
     assert done.stderr.count("No space left on device") == 1 and str(full) in done.stderr
+    assert record.is_file(), done.stderr
     compiled = [row for row in map(json.loads, record.read_text().splitlines()) if row[3] > 0.0]
     assert 0 < len(compiled) < len(manifest.needed(["import"])) / 2
 
@@ -277,7 +278,7 @@ def test_an_engine_with_a_full_disk_goes_on(full: Path, small, monkeypatch, capl
     folders.cache_folder.cache_clear()
     monkeypatch.setattr(manifest, "needed", lambda _: kernels)
     assert not folders.cache_folder().trouble
-    (full / "filler").write_bytes(bytes(12 << 10))
+    (full / "filler").write_bytes(bytes(20 << 10))
     for _ in range(2):  # the second time there is no try
         prepare.prepare_kernels(["any"])
     assert len(caplog.messages) == 1 and str(full) in folders.cache_folder().trouble
