@@ -23,15 +23,16 @@ from ..deform.mesh_driven import MeshDriven
 from ..geometry.normals import VertexNormals
 from . import checkpoint
 from .backend import CPU
-from .capture.capture import Capture
+from .capture.capture import Capture, View
 from .gpu.select_backend import select_backend
 from .held_out import held_out_metrics, preview
 from .inverse_rendering.joint import LearnedSurfels, decouple_jointly
 from .inverse_rendering.run import Decoupled, decouple
 from .inverse_rendering.run import Progress as MaterialProgress
+from .inverse_rendering.surfel_values import blended_as
 from .jit_warmup import warm_up
 from .meshing.depth_fusion import MOST, fuse, grid, voxels_that_fit
-from .meshing.normal_integration import follow_normals, shaded_by, shaded_by_own
+from .meshing.normal_integration import blended, follow_normals, shaded_by, shaded_by_own
 from .meshing.silhouette_fit import fill_silhouettes
 from .meshing.surfel_normals import with_surfel_normals
 from .meshing.visual_hull import Region, find_region, have_silhouettes, silhouettes
@@ -183,10 +184,9 @@ def reconstruct(
         if thin or shape is not None:
             turns = found.normals - smooth if shape is None else np.zeros_like(smooth)
             binding = shaded_by_own(binding, mesh, surfels, turns)
-        elif settings.decoupling.normals:
-            binding = shaded_by(binding, mesh, found.normals)
         if shape is None:
-            _copy_materials(surfels, mesh, binding)
+            normals = found.normals if settings.decoupling.normals and not thin else None
+            binding = _show_the_mesh(final, visible, surfels, mesh, binding, normals, capture.training)
         else:
             surfels = replace(surfels, **{name: getattr(shape, name)[visible] for name in BASE_CHANNELS})
         environment, origin = Environment(found.environment), "separated from the lighting"
@@ -353,12 +353,28 @@ def _are_few(done: int, of: int) -> bool:
     return done < min(FEW_STEPS, of)
 
 
-def _copy_materials(surfels: Surfels, mesh: Mesh, binding: Binding) -> None:
-    """Give surfels the materials of the mesh where they hang on it, in place."""
-    corners, share = mesh.faces[binding.face], binding.barycentric
+def _show_the_mesh(
+    gaussians: Gaussians,
+    visible: Array,
+    surfels: Surfels,
+    mesh: Mesh,
+    binding: Binding,
+    normals: Array | None,
+    views: list[View],
+) -> Binding:
+    """Give surfels, in place, materials whose blend shows those of the mesh; the binding with such shading normals.
+
+    `normals` (v, 3) are the mesh's; None: the binding keeps its own. Roughness and metallic are smooth anyway, and
+    errors of the mesh's would only become larger.
+    """
     for name in BASE_CHANNELS:
-        blended = np.einsum("nk,nk...->n...", share, getattr(mesh, name)[corners])
-        setattr(surfels, name, np.clip(blended, 0, 1).astype(np.float32))
+        setattr(surfels, name, np.clip(blended(binding, mesh, getattr(mesh, name)), 0, 1).astype(np.float32))
+    values = mesh.albedo if normals is None else np.hstack([mesh.albedo, normals])
+    start = np.zeros((len(visible), values.shape[1]), np.float32)
+    start[visible] = blended(binding, mesh, values)
+    found = blended_as(gaussians, visible, start, mesh, values, views)[visible]
+    surfels.albedo = found[:, :3].clip(0, 1)
+    return binding if normals is None else shaded_by(binding, mesh, found[:, 3:])
 
 
 def _visible_surfels(gaussians: Gaussians, visible: Array) -> Surfels:

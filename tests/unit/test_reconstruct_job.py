@@ -17,6 +17,7 @@ from capture_cases import balls, colour_of_balls, distance_to_balls, write  # no
 from drgs_blender.core.asset.container import read_asset, write_asset  # noqa: E402
 from drgs_blender.core.color import linear_to_srgb  # noqa: E402
 from drgs_blender.core.errors import AssetError, Cancelled, UsageError, WriteError  # noqa: E402
+from drgs_blender.deform.binding import clamp_weights  # noqa: E402
 from drgs_blender.geometry.normals import VertexNormals  # noqa: E402
 from drgs_blender.reconstruct.capture.capture import Capture  # noqa: E402
 from drgs_blender.reconstruct.checkpoint import fingerprint  # noqa: E402
@@ -135,13 +136,15 @@ def test_materials_and_light_come_with_the_asset(capture, tmp_path):
     assert asset.provenance["report"]["decoupling"]["iterations"] == 30
     assert asset.provenance["materials"] == "separated from the lighting"
     assert told[-1].phase == "materials" and told[-1].part == 1.0
-    # A surfel has the mean of its face's corners, which have learned something.
+    # A surfel has the mean of its face's corners, which have learned something; of colours what blends to it.
     corners = asset.mesh.faces[asset.binding.face]
-    expected = np.einsum("nk,nkc->nc", asset.binding.barycentric, asset.mesh.albedo[corners])
-    assert np.abs(asset.surfels.albedo - np.clip(expected, 0, 1)).max() < 1e-5
-    assert asset.mesh.albedo.std(axis=0).max() > 0.01
+    shares = clamp_weights(asset.binding.barycentric)
+    expected = np.einsum("nk,nk->n", shares, asset.mesh.roughness[corners])
+    assert np.abs(asset.surfels.roughness - np.clip(expected, 0, 1)).max() < 1e-5
+    colour = np.einsum("nk,nkc->nc", shares, asset.mesh.albedo[corners])
+    assert 0 < np.abs(asset.surfels.albedo - colour).mean() < 0.5 * asset.mesh.albedo.std()
     # It is shaded by what was learned on the mesh, not by its own normal, which 60 steps have hardly turned.
-    assert asset.binding.normal[:, 2].min() > 0.9
+    assert np.median(asset.binding.normal[:, 2]) > 0.95
 
 
 def test_materials_of_too_few_steps_are_called_unreliable(capture, caplog):

@@ -9,7 +9,7 @@ from shapes import plain_mesh, sphere_mesh
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.geometry.normals import VertexNormals, rotation_matrices, unit
-from drgs_blender.reconstruct.meshing.normal_integration import follow_normals, shaded_by, shaded_by_own
+from drgs_blender.reconstruct.meshing.normal_integration import blended, follow_normals, shaded_by, shaded_by_own
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_normals_that_are_nonsense_turn_no_face(rough):
 def test_surfels_are_shaded_by_the_normals_in_every_pose(rough):
     mesh, true, _ = rough
     surfels, binding, _ = attach(mesh, None, density=20)
-    shaded = shaded_by(binding, mesh, true.astype(np.float32))
+    shaded = shaded_by(binding, mesh, blended(binding, mesh, true))
     driven = MeshDriven(mesh, surfels, shaded)
     wanted = unit(np.einsum("nk,nkc->nc", binding.barycentric, true[mesh.faces[binding.face]]))
     assert angles(driven.pose(mesh.vertices).normal, wanted).max() < 0.1

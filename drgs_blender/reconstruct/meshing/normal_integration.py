@@ -81,8 +81,8 @@ def _within(vertices: Array, old: Array, before: Faces, faces: Array, reach: flo
 
 
 def shaded_by(binding: Binding, mesh: Mesh, normals: Array) -> Binding:
-    """`binding` with shading normals that are blended of the unit `normals` (v, 3) of the mesh's vertices."""
-    return _shaded(binding, mesh, Faces.of(mesh.vertices, mesh.faces), _blended(binding, mesh, normals))
+    """`binding` with shading normals (n, 3) of the surfels, object space, of any length."""
+    return _shaded(binding, mesh, Faces.of(mesh.vertices, mesh.faces), normals)
 
 
 def shaded_by_own(binding: Binding, mesh: Mesh, surfels: Surfels, turns: Array) -> Binding:
@@ -93,12 +93,12 @@ def shaded_by_own(binding: Binding, mesh: Mesh, surfels: Surfels, turns: Array) 
     faces = Faces.of(mesh.vertices, mesh.faces)
     own = rotation_matrices(surfels.rotation.astype(np.float64))[..., 2]
     own = np.where(dot(own, faces.normal[binding.face])[:, None] < 0, -own, own)
-    return _shaded(binding, mesh, faces, own + _blended(binding, mesh, turns))
+    return _shaded(binding, mesh, faces, own + blended(binding, mesh, turns))
 
 
-def _blended(binding: Binding, mesh: Mesh, values: Array) -> Array:
-    """(n, 3) where surfels hang of `values` (v, 3) of the vertices."""
-    return np.einsum("nk,nkc->nc", clamp_weights(binding.barycentric), values[mesh.faces[binding.face]])
+def blended(binding: Binding, mesh: Mesh, values: Array) -> Array:
+    """(n, ...) where surfels hang, of `values` (v, ...) of the vertices."""
+    return np.einsum("nk,nk...->n...", clamp_weights(binding.barycentric), values[mesh.faces[binding.face]])
 
 
 def _shaded(binding: Binding, mesh: Mesh, faces: Faces, normals: Array) -> Binding:

@@ -1,0 +1,83 @@
+"""Values of surfels whose blend shows those of the mesh.
+
+A surfel that takes the values of the one point where it hangs blurs them: neighbours overlap, and so does what they
+carry. What they have to carry so that their blend shows the mesh's own colours and normals is found as in tomography
+(SIRT, Gilbert 1972): several times each surfel takes its part of what the pixels that it covers lack, the mean of all
+views. Taken view by view (SART) the last ones are shown best, and views left out worse than before.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ...core.arrays import Array
+from ...core.asset.model import Mesh
+from ...render.scene.triangle_bvh import TriangleBVH
+from ..capture.capture import View
+from ..meshing.crops import cropped_views
+from ..model.gaussians import Gaussians
+from .pixels import pixels_of
+
+#: How often views are gone through, how many of them at most, and the part of what lacks that is taken each time.
+#: More brings views that are gone through alone.
+_SWEEPS, _VIEWS, _RELAXATION = 4, 40, 0.5
+#: Pixels that are covered less show other things.
+_COVERED = 0.5
+#: Logit of an opacity that cannot be seen.
+_INVISIBLE = -30.0
+
+
+def blended_as(
+    gaussians: Gaussians, visible: Array, start: Array, mesh: Mesh, values: Array, views: list[View]
+) -> Array:
+    """Values of surfels, so that views of them show those of the mesh's vertices.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        On the CPU; they stay as they are.
+    visible : (n,) bool array
+        Surfels that are drawn.
+    start : (n, c) float array
+        Values to begin with; those of surfels that no view shows stay.
+    mesh : Mesh
+        World space.
+    values : (v, c) float array
+        Of its vertices.
+    views : list of View
+        Their cameras and masks say where the surface is seen, their photographs do not matter.
+
+    Returns
+    -------
+    (n, c) float32 array
+        Not held to the range of `values`: a blend that is as sharp may need more contrast.
+    """
+    tree = TriangleBVH()
+    tree.build(mesh.vertices, mesh.faces)
+    still = gaussians.like({name: tensor.detach().clone() for name, tensor in gaussians.parameters.items()})
+    for tensor in still.parameters.values():
+        tensor.requires_grad_(False)
+    still.parameters["opacity"][torch.from_numpy(~visible)] = _INVISIBLE
+    cut = cropped_views(views, mesh.vertices)
+    generator = np.random.default_rng(0)
+    found = torch.from_numpy(np.asarray(start, np.float32).copy())
+    for _ in range(_SWEEPS):
+        lack, parts = torch.zeros_like(found), torch.zeros(len(found), 1)
+        for k in generator.permutation(len(cut))[:_VIEWS]:
+            pixels = pixels_of(k, cut[k], mesh, tree)
+            wanted = np.einsum("nk,nkc->nc", pixels.corners, values[mesh.faces[pixels.face]]).astype(np.float32)
+            # One more column, of zeros: its slope is the sum of a surfel's parts in all pixels.
+            columns = torch.cat([found, torch.zeros(len(found), 1)], 1).requires_grad_(True)
+            shown = still.render(cut[k].camera, torch.zeros(3), 0, reflections=False, materials=columns)
+            assert shown.materials is not None
+            place = torch.from_numpy(pixels.place.astype(np.int64))
+            alpha = shown.maps.alpha.detach().flatten()[place][:, None]
+            blend = shown.materials.flatten(0, 1)[place] / alpha.clamp(min=_COVERED)
+            weight = torch.cat([torch.from_numpy(wanted) - blend.detach()[:, :-1], torch.ones_like(alpha)], 1)
+            (slope,) = torch.autograd.grad((blend * weight * (alpha > _COVERED)).sum(), columns)
+            lack += slope[:, :-1]
+            parts += slope[:, -1:]
+        # Of surfels that are hardly seen a little at a time: what their few pixels lack is of others as well.
+        found += _RELAXATION * lack / parts.clamp(min=1.0)
+    return found.numpy()
