@@ -39,8 +39,6 @@ ROWS: dict[str, dict[str, Any]] = {
     PLAIN: {"same_material": 0.0},
     "like vertices held alike, .003": {"same_material": 0.003},
     "like vertices held alike, .01": {"same_material": 0.01},
-    "photographs of a mean of .03": {"brightness": 0.03},
-    "photographs of a mean of .2": {"brightness": 0.2},
 }
 #: The row with four times the faces, about four vertices a pixel.
 CUT = "faces cut in four"

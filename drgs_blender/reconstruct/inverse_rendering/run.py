@@ -41,6 +41,8 @@ log = logging.getLogger(__name__)
 DEFAULT = Settings()
 #: Steps between two tables of light sampling, between two reports, and seconds between two checkpoints.
 _AIM, _REPORT, _SAVE = 25, 25, 20.0
+#: Photographs that end at white were exposed for it, unless their mean is less than so much of `Settings.brightness`.
+_DARKEST = 0.2
 
 
 @dataclass(slots=True)
@@ -206,7 +208,7 @@ class Job:
         tree = TriangleBVH()
         tree.build(mesh.vertices, mesh.faces)
         self._pixels = foreground_pixels(capture.training, mesh, tree, settings.most_pixels, settings.seed, normals)
-        self._gain = settings.brightness / max(float(self._pixels.colour.mean()), 1e-6)
+        self._gain = _gain(capture, float(self._pixels.colour.mean()), settings.brightness)
         self._pixels.colour *= np.float32(self._gain)
         cache, self._weight = radiance_cache(self._pixels, mesh)
         counts = (settings.cosine, settings.ggx, settings.light)
@@ -378,6 +380,16 @@ class Job:
         self._adam.steps = int(iteration)
         self.schedule.go_on(int(iteration), spent)
         log.info("materials: going on at step %d", self.schedule.iteration)
+
+
+def _gain(capture: Capture, mean: float, brightness: float) -> float:
+    """Factor of the photographs, by whose colours losses are weighed. `mean` is that of their linear colours.
+
+    Dark objects have dark photographs, rightly: one brightness for all took 3.6 dB of albedo from a bright one.
+    """
+    if any(view.above_white is not None for view in capture.training):
+        return brightness / max(mean, 1e-6)
+    return max(1.0, _DARKEST * brightness / max(mean, 1e-6))
 
 
 def _digest(*arrays: Array) -> str:

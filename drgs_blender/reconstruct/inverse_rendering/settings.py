@@ -42,8 +42,9 @@ class Settings:
         Also learn materials on this many nested grids of cells, which carry what many pixels agree on quickly. Where
         edges are shorter than 1/200 of the mesh, on one more for each halving.
     brightness : float
-        Mean of the photographs' linear colours to which the weights of all that is no photograph belong: photographs of
-        another exposure, or of a darker object, are learned as if they had it. Larger: photographs count for more.
+        Mean of the linear colours that photographs with values above white are brought to, as their scale says nothing
+        and weights of losses belong to one. Others count as they were exposed, but for those darker than a fifth of it.
+        Larger: photographs count for more.
     smoothness : float
         Weight of the differences of materials along edges, less where the photographs differ; where edges are shorter
         than 1/200 of the mesh, as many times more, at most 8.
@@ -104,7 +105,7 @@ class Settings:
     rate: Weight = 0.04
     light_rate: Weight = 0.4
     coarse: Annotated[int, Range(0, 8)] = 3
-    brightness: Annotated[float, Range(1e-3, 10.0)] = 0.08
+    brightness: Annotated[float, Range(1e-3, 10.0)] = 0.12
     smoothness: Weight = 0.01
     light_smoothness: Weight = 0.001
     grey_light_prior: Weight = 0.0003
