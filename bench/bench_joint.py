@@ -12,14 +12,15 @@ rows are kept, so that captures may be measured one by one.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from bench_evaluate import mean, score
-from bench_normals import FOLDER, figures, learned, same_surfels
+from bench_normals import FIGURES, FOLDER, figures, learned, same_surfels
 from report import processor_seconds, store_row, table, write_section
 
 from drgs_blender.cli.evaluate import session_renderer
@@ -36,6 +37,7 @@ from drgs_blender.reconstruct.settings import Settings
 #: Way -> its name in the table, and `decoupling.joint`.
 WAYS = {
     "on-the-mesh": ("surfels stay, materials on the mesh", 0.0),
+    "blurred": ("the same, surfels take the values of where they hang", 0.0),
     "last-half": ("surfels learned in the last half", 0.5),
     "all": ("surfels learned from the first step", 1.0),
 }
@@ -45,10 +47,17 @@ RAYS: dict[str, tuple[bool, Any]] = {
     "sheets of the surfels (default)": (True, "mesh"),
     "surfels": (True, "surfels"),
 }
-COLUMNS = (
-    "Object-pixels", "Stage (ii)", "Normals deg", "Relit scaled", "Views left out", "Albedo scaled",
-    "Roughness / metallic RMSE", "Processor s",
-)  # fmt: skip
+
+
+@contextmanager
+def values_of_where_they_hang() -> Iterator[None]:
+    """Let surfels take the values of the points where they hang, which their blend blurs."""
+    known = pipeline.blended_as
+    pipeline.blended_as = lambda gaussians, visible, start, *rest: start
+    try:
+        yield
+    finally:
+        pipeline.blended_as = known
 
 
 def ways(capture: Capture, folder: Path, truth: Truth, name: str, options: argparse.Namespace) -> None:
@@ -60,7 +69,7 @@ def ways(capture: Capture, folder: Path, truth: Truth, name: str, options: argpa
         settings = replace(settings, decoupling=replace(settings.decoupling, iterations=options.steps, joint=joint))
         surfels = learned(capture, name)  # joint learning moves them
         begun = processor_seconds()
-        with same_surfels(surfels):
+        with same_surfels(surfels), values_of_where_they_hang() if way == "blurred" else nullcontext():
             asset = pipeline.reconstruct(capture, settings)
         spent, path = processor_seconds() - begun, FOLDER / f"{name}-{way}.drgs"
         write_asset(path, asset)
@@ -70,10 +79,14 @@ def ways(capture: Capture, folder: Path, truth: Truth, name: str, options: argpa
     body = (
         f"The same surfels of stage (i), then {options.steps} steps of stage (ii); the camera sees surfels. Normals in "
         "mean degrees, PSNR of the foreground in dB, relit under the lights that were not photographed, scaled by one "
-        f"factor a channel, {options.samples} samples.\n\n"
+        f"factor a channel, {options.samples} samples; SSIM and FLIP of these pictures on white.\n\n"
     )
     cells = [(*key.split("|"), *row) for key, row in rows.items()]
-    write_section("reconstruct-joint", "Surfels learned with their materials", body + table(COLUMNS, cells))
+    write_section(
+        "reconstruct-joint",
+        "Surfels learned with their materials",
+        body + table(("Object-pixels", "Stage (ii)", *FIGURES), cells),
+    )
 
 
 def rays(capture: Capture, folder: Path, truth: Truth, name: str, options: argparse.Namespace) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from bench_evaluate import score
-from bench_normals import FOLDER, figures, learned, same_surfels
+from bench_normals import FIGURES, FOLDER, figures, learned, same_surfels
 from report import processor_seconds, store_row, table, write_section
 
 from drgs_blender.core.asset.container import write_asset
@@ -42,7 +42,6 @@ ROWS: dict[str, dict[str, Any]] = {
 }
 #: The row with four times the faces, about four vertices a pixel.
 CUT = "faces cut in four"
-HEAD = ("Object-pixels", "", "Relit", "Views left out", "Albedo scaled", "Roughness / metallic RMSE", "Processor s")
 
 
 def cut_in_four(mesh: Mesh) -> Mesh:
@@ -115,7 +114,11 @@ def main() -> None:
         f"foreground in dB, relit under {LIGHT!r} scaled by one factor a channel.\n\n"
     )
     lines = [(*name.split("|"), *cells) for name, cells in sorted(rows.items())]
-    write_section("material-terms", "Further terms of the materials' stage", body + table(HEAD, lines))
+    write_section(
+        "material-terms",
+        "Further terms of the materials' stage",
+        body + table(("Object-pixels", "", *FIGURES[1:]), lines),
+    )
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from bench_evaluate import mean, score, under_other_lights
+from bench_evaluate import mean, score, similarity, under_other_lights
 from bench_reconstruct import first_hits, trained
 from bench_shape import VOXELS, Truth, true_depth
 from report import OUT, processor_seconds, store_row, table, write_section
@@ -102,12 +102,20 @@ def same_surfels(gaussians: Gaussians) -> Iterator[None]:
             setattr(pipeline, name, value)
 
 
+#: Heads of `figures`.
+FIGURES = (
+    "Normals deg", "Relit scaled", "Relit: SSIM / FLIP", "Views left out", "Albedo scaled",
+    "Roughness / metallic RMSE", "Processor s",
+)  # fmt: skip
+
+
 def figures(report: dict, spent: float) -> list[str]:
-    """Cells of a report: normals, relit, views left out, albedo, roughness and metallic; and processor seconds."""
-    materials = report["materials"]
+    """Cells of `FIGURES`: of a report, and processor seconds."""
+    materials, lit = report["materials"], under_other_lights(report, False)
     return [
         f"{report['geometry']['normal_degrees']:.2f}",
-        f"{mean(under_other_lights(report, False), 'scaled', 'foreground'):.2f}",
+        f"{mean(lit, 'scaled', 'foreground'):.2f}",
+        similarity(lit),
         f"{report['novel']['psnr_foreground']:.2f}",
         f"{materials['albedo_psnr_scaled']:.2f}",
         f"{materials['roughness_rmse']:.3f} / {materials['metallic_rmse']:.3f}",
@@ -315,8 +323,7 @@ def write_relit(capture: Capture, folder: Path, name: str, steps: int) -> None:
         f"of the foreground in dB, relit under {LIGHT!r} scaled by one factor a channel. Of the fern learning has its "
         "surfels' normals alone, as it is thin.\n\n"
     )
-    head = ("Object-pixels", "Mesh", "Normals deg", "Relit", "Views left out", "Albedo scaled",
-            "Roughness / metallic RMSE", "Processor s")  # fmt: skip
+    head = ("Object-pixels", "Mesh", *FIGURES)
     write_section(
         "reconstruct-normals",
         "What even triangles and normals of surfels bring",
