@@ -7,6 +7,7 @@ import io
 import logging
 import re
 import shutil
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -39,6 +40,8 @@ FOLDERS = ("images", "photos", "input", ".")
 #: Where their masks are.
 MASKS = "masks"
 _QUALITY = 97
+#: Bytes of a picture's name without its extension, at most; file systems take 255 in all.
+_LONGEST = 200
 #: Part of the pixels that may be brighter than white and are written as white.
 _SPECKS = 1e-5
 #: EXIF orientation -> (quarter turns counter-clockwise, mirrored left to right afterwards); EXIF 2.3 figure 19.
@@ -152,7 +155,7 @@ def find_pictures(source: Path) -> list[Picture]:
     root = paths[0].parent.parent if paths and paths[0].parent.name in FOLDERS else source
     pictures, broken, names = [], [], set()
     for path in paths:
-        name = path.stem if path.stem not in names else path.name.replace(".", "_")
+        name = _name(path, names)
         names.add(name)
         mask = find_mask(root / MASKS, path) or find_mask(source / MASKS, path)
         try:
@@ -172,6 +175,17 @@ def find_pictures(source: Path) -> list[Picture]:
         )  # fmt: skip
     _check_masks(pictures)
     return pictures
+
+
+def _name(path: Path, taken: Collection[str]) -> str:
+    """A name for a picture that is not `taken`: its stem, in UTF-8 and so short that more can be added to it."""
+    stem = path.stem if path.stem not in taken else path.name.replace(".", "_")
+    short = name = re.sub("[\ud800-\udfff]", "_", stem).encode()[:_LONGEST].decode(errors="ignore")
+    number = 1
+    while name in taken:
+        number += 1
+        name = f"{short}-{number}"
+    return name
 
 
 def _described(picture: Picture) -> Picture:
@@ -335,5 +349,9 @@ def digest(pictures: list[Picture], *settings: object) -> str:
         for path in (picture.path, picture.mask):
             if path is not None:
                 stat = path.stat()
-                found.update(f"{path.resolve()}|{stat.st_size}|{stat.st_mtime_ns}|{picture.name}\n".encode())
+                found.update(
+                    f"{path.resolve()}|{stat.st_size}|{stat.st_mtime_ns}|{picture.name}\n".encode(
+                        errors="surrogateescape"
+                    )
+                )
     return found.hexdigest()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -75,11 +76,11 @@ def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bo
     masks.mkdir(parents=True, exist_ok=True)
     result = Prepared(folder)
     unmasked = []
-    for index, picture in enumerate(pictures):
+    files = copy_names([picture.name for picture in pictures])
+    for index, (picture, file) in enumerate(zip(pictures, files, strict=True)):
         if cancelled():
             raise Cancelled
         tell("reading pictures", index / len(pictures))
-        file = f"{picture.name}.jpg"
         try:
             small, mask = _small(picture, folder / file, masks / f"{file}.png", size)
         except AssetError as error:
@@ -102,6 +103,29 @@ def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bo
                 seek_markers = False
     _tell_unmasked(result, unmasked)
     return result
+
+
+def copy_names(names: Sequence[str]) -> list[str]:
+    """File names of working copies, each another one.
+
+    In COLMAP's lists of pairs a blank ends a name, a line ends a pair, and a line that begins with # says nothing.
+
+    Examples
+    --------
+    >>> copy_names(["IMG 1", "IMG_1", "#2"])
+    ['IMG_1.jpg', 'IMG_1-2.jpg', '_2.jpg']
+    """
+    found: set[str] = set()
+    files = []
+    for name in names:
+        plain = re.sub(r"[\s#\x00-\x1f\x7f]", "_", name)
+        number, file = 1, f"{plain}.jpg"
+        while file.lower() in found:  # some file systems take both for one
+            number += 1
+            file = f"{plain}-{number}.jpg"
+        found.add(file.lower())
+        files.append(file)
+    return files
 
 
 def _tell_unmasked(result: Prepared, unmasked: list[Picture]) -> None:

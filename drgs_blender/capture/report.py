@@ -12,6 +12,7 @@ from PIL import ImageDraw
 
 from ..core.arrays import Array
 from ..core.asset.archive import replace_by, replace_file
+from ..core.errors import printable
 from .registration import Registration
 
 #: Pixels of one of the two drawings; margin.
@@ -61,7 +62,7 @@ def draw_cameras(path: Path, found: Registration, said: list[str]) -> None:
             _frustum(draw, matrix, lens.width / lens.fx, lens.height / lens.fy, 0.05 * extent, place)
         draw.text((index * _SIDE + _MARGIN, 12), title, fill=_TEXT)
     for line, text in enumerate(said):
-        draw.text((_MARGIN, _SIDE + 18 * line), text, fill=_TEXT)
+        draw.text((_MARGIN, _SIDE + 18 * line), printable(text), fill=_TEXT)
     replace_by(path, lambda temporary: page.save(temporary, "PNG"))
 
 

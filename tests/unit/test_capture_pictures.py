@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from drgs_blender.capture import pictures
 from drgs_blender.capture.exif import Metadata, read_exif
 from drgs_blender.capture.inspection import FEWEST, inspect, look, tell_of_views
 from drgs_blender.capture.pictures import Picture, decode, find_pictures, has_pictures, shown, write_picture
+from drgs_blender.capture.preparation import prepare
 from drgs_blender.core.color import linear_to_srgb, srgb_to_linear
 from drgs_blender.core.errors import AssetError
 from drgs_blender.formats.exr import write_exr_picture
@@ -93,6 +96,28 @@ def test_masks_of_another_shape_are_refused_by_name(tmp_path):
         AssetError, match=r"masks/1.png: is 64 x 96 pixels, 1.png 96 x 64. Draw the mask over the turned"
     ):
         find_pictures(tmp_path)
+
+
+@pytest.mark.skipif(os.name == "nt" or sys.platform == "darwin", reason="all names of files are Unicode")
+def test_names_that_are_not_utf8_or_long_are_taken(tmp_path):
+    for k, name in enumerate((b"caf\xe9.png", b"caf\xe8.png", b"x" * 251 + b".png", b"x" * 250 + b"y.png")):
+        texture(k).save(tmp_path / f"{k}.png")
+        os.rename(tmp_path / f"{k}.png", os.fsencode(tmp_path) + b"/" + name)
+    found = find_pictures(tmp_path)
+    assert sorted(picture.name for picture in found) == ["caf_", "caf_-2", "x" * 200, f"{'x' * 200}-2"]
+    assert len(pictures.digest(found)) == 64
+
+
+def test_working_copies_have_names_that_lists_of_pairs_can_hold(tmp_path):
+    """A blank ends a name there, and what begins with # is no pair."""
+    for k, name in enumerate(("IMG 1", "IMG_1", "new\nline" if os.name != "nt" else "new line", "# 4", "img_1")):
+        texture(k).save(tmp_path / f"{name}{k}.png")
+    given = [Picture(path, path.stem[:-1]) for path in sorted(tmp_path.glob("*.png"), key=lambda path: path.stem[-1])]
+    ready = prepare(given, tmp_path / "work", 64, False, lambda *_: None, lambda: False)
+    files = [photo.file for photo in ready.photos]
+    assert files == ["IMG_1.jpg", "IMG_1-2.jpg", "new_line.jpg", "__4.jpg", "img_1-3.jpg"]
+    assert sorted(files) == sorted(path.name for path in ready.folder.iterdir())
+    assert [photo.given for photo in ready.photos] == [picture.path.name for picture in given]
 
 
 def test_what_cannot_be_read_is_left_out_and_named(tmp_path, caplog):
