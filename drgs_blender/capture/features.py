@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..core.errors import Cancelled
+from ..core.errors import Cancelled, WriteError
 from . import libraries
 
 logger = logging.getLogger(__name__)
@@ -22,6 +23,8 @@ EXHAUSTIVE = 120
 _OVERLAP, _LOOP_STEP = 12, 6
 #: Pictures and pairs that are computed before the user can cancel.
 _BATCH, _PAIRS = 8, 40
+#: Bytes that must be free for a batch: its features or matches, twice, as SQLite writes them to its log first.
+_ROOM = 32 << 20
 #: Features a picture. Matching grows with their square.
 _MOST = 6000
 #: Contrast of the faintest feature, COLMAP's own and that inside masks, which leave fewer.
@@ -73,6 +76,8 @@ def extract(database: Path, pictures: Path, masks: Path | None, photos: Sequence
     ------
     DeviceError
         pycolmap is not installed.
+    WriteError
+        The disk is nearly full.
     Cancelled
         `cancelled` said so.
     """
@@ -96,6 +101,7 @@ def extract(database: Path, pictures: Path, masks: Path | None, photos: Sequence
         for start in range(0, len(left), _BATCH):
             if cancelled():
                 raise Cancelled
+            check_room(database.parent)
             tell("finding features", done / len(photos))
             batch = left[start : start + _BATCH]
             reader = colmap.ImageReaderOptions()
@@ -116,6 +122,15 @@ def extract(database: Path, pictures: Path, masks: Path | None, photos: Sequence
                     camera = data.read_image_with_name(batch[0].file).camera_id
             done += len(batch)
     tell("finding features", 1.0)
+
+
+def check_room(folder: Path) -> None:
+    """Raise WriteError where a disk is nearly full: where COLMAP cannot write, it ends the whole process."""
+    if (free := shutil.disk_usage(folder).free) < _ROOM:
+        raise WriteError(
+            str(folder), f"has {free / 1e6:.0f} MB of free space left, {_ROOM / 1e6:.0f} are needed to go on",
+            "Free some and give the same command again, or choose another folder",
+        )  # fmt: skip
 
 
 def pairs(count: int, ordered: bool) -> list[tuple[int, int]]:
@@ -152,6 +167,8 @@ def match(database: Path, photos: Sequence[Photo], ordered: bool, masked: bool, 
 
     Raises
     ------
+    WriteError
+        The disk is nearly full.
     Cancelled
         `cancelled` said so.
     """
@@ -176,6 +193,7 @@ def match(database: Path, photos: Sequence[Photo], ordered: bool, masked: bool, 
     for start in range(0, len(left), _PAIRS):
         if cancelled():
             raise Cancelled
+        check_room(database.parent)
         tell("matching features", 1 - (len(left) - start) / len(wanted))
         batch = left[start : start + _PAIRS]
         listed.write_text("".join(f"{a} {b}\n" for a, b in batch), encoding="utf-8")

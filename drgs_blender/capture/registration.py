@@ -16,7 +16,7 @@ from ..core.errors import AssetError, Cancelled
 from ..reconstruct.readers.layout import OPENCV_TO_BLENDER, invert
 from ..reconstruct.readers.lens import Lens
 from . import libraries, moved_object, soundness
-from .features import Photo, Tell
+from .features import Photo, Tell, check_room
 
 logger = logging.getLogger(__name__)
 
@@ -112,6 +112,8 @@ def register(database: Path, pictures: Path, work: Path, photos: Sequence[Photo]
     ------
     AssetError
         Too few pictures are registered, with their names.
+    WriteError
+        The disk is nearly full.
     Cancelled
         `cancelled` said so.
     """
@@ -170,6 +172,7 @@ def _attempt(colmap: Any, database: Path, pictures: Path, folder: Path, settings
     """The models that one attempt finds."""
     if cancelled():
         raise Cancelled
+    check_room(folder)
     tell(name, 0.0)
     colmap.set_random_seed(_SEED)
     if settings is None:

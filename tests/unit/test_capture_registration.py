@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from drgs_blender.capture import capture_folder, libraries, pipeline, soundness
+from drgs_blender.capture import capture_folder, features, libraries, pipeline, soundness
 from drgs_blender.capture.features import Photo, pairs
 from drgs_blender.capture.pictures import Picture
 from drgs_blender.capture.pipeline import Settings, make_capture
 from drgs_blender.capture.preparation import Prepared
 from drgs_blender.capture.registration import Registration, register
 from drgs_blender.capture.world_alignment import align_to_ground, align_to_markers, ground_plane, similarity
-from drgs_blender.core.errors import AssetError, Cancelled, DeviceError, UsageError
+from drgs_blender.core.errors import AssetError, Cancelled, DeviceError, UsageError, WriteError
 from drgs_blender.reconstruct.readers import read_capture
 from drgs_blender.reconstruct.readers.layout import OPENCV_TO_BLENDER
 from drgs_blender.reconstruct.readers.lens import Lens, distort
@@ -439,6 +439,15 @@ def test_a_stopped_run_keeps_its_work_for_the_same_pictures_alone(cv2, tmp_path)
     with pytest.raises(Cancelled):
         make_capture(tmp_path / "photos", out, Settings(size=400), tell, lambda: True)
     assert not any(path.exists() for path in copies)
+
+
+def test_a_full_disk_is_told_before_colmap_ends_the_process(tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap", reason="structure from motion needs pycolmap")
+    full = type("Usage", (), {"free": 3_000_000})
+    monkeypatch.setattr(features.shutil, "disk_usage", lambda _: full)
+    photos = [Photo(f"{k}.jpg", (), None, (64, 48)) for k in range(2)]
+    with pytest.raises(WriteError, match="has 3 MB of free space left, 34 are needed"):
+        features.extract(tmp_path / "a.db", tmp_path, None, photos, tell, never)
 
 
 def test_folders_of_others_are_not_written_to(tmp_path):
