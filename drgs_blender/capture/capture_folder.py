@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import shutil
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +16,7 @@ from PIL import Image as Pillow
 
 from ..core.asset.archive import replace_by, replace_file
 from ..core.errors import UsageError, WriteError
+from ..core.file_lock import FileLock
 from ..reconstruct.readers.layout import decode_mask
 from .pictures import FOLDERS, MASKS, Picture, write_picture
 from .registration import Registration
@@ -22,42 +26,100 @@ from .report import draw_cameras, write_report
 REPORT, DRAWING, POINTS, CAMERAS = "capture.json", "capture.png", "sparse_points.ply", "transforms.json"
 #: Folder of what a run needs to go on; removed when the capture is complete.
 WORK = "registration"
+#: In it: locked by the process that makes the capture.
+LOCK = "lock"
 
 
-def open_folder(folder: Path, source: Path) -> None:
-    """Make the folder of a capture; it may be a new one beside the photographs.
+def check_folder(folder: Path, source: Path) -> None:
+    """Raise an error where a capture cannot be made in `folder`; it may be a new one beside the photographs.
 
     Raises
     ------
     UsageError
         It is the input, or one of its folders of pictures or inside that, or has files that are not a capture's of
-        ours.
+        ours, or its name is not in UTF-8, which COLMAP wants.
     WriteError
         It cannot be made.
     """
-    inner, outer = folder.resolve(), source.resolve()
-    taken = [outer / name for name in (*(name for name in FOLDERS if name != "."), MASKS)]
-    if inner == outer or any(inner == one or one in inner.parents for one in taken):
-        raise UsageError(str(folder), "is where the pictures or masks are", "Choose another folder for the capture")
     try:
+        inner, outer = folder.resolve(), source.resolve()
+        taken = [outer / name for name in (*(name for name in FOLDERS if name != "."), MASKS)]
+        if inner == outer or any(inner == one or one in inner.parents for one in taken):
+            raise UsageError(str(folder), "is where the pictures or masks are", "Choose another folder for the capture")
         if folder.exists() and any(folder.iterdir()) and not _is_ours(folder):
             raise UsageError(str(folder), "holds other files", "Choose a new or empty folder for the capture")
-        (folder / WORK).mkdir(parents=True, exist_ok=True)
+        str(inner).encode()
+    except UnicodeEncodeError as error:
+        raise UsageError(str(folder), "is not a name in UTF-8", "Choose another folder") from error
+    except (OSError, RuntimeError) as error:  # pathlib's RuntimeError: links in a circle
+        raise _cannot_be_made(folder, error) from error
+
+
+@contextlib.contextmanager
+def open_folder(folder: Path) -> Iterator[Path]:
+    """Make the folder of a capture for this process alone; what it gives is the folder of work in it.
+
+    Raises
+    ------
+    UsageError
+        Another process is at work there.
+    WriteError
+        It cannot be made.
+    """
+    work = folder / WORK
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(work / LOCK)
     except OSError as error:
-        raise WriteError(str(folder), f"cannot be made ({error.strerror or error})", "Choose another folder") from error
+        raise _cannot_be_made(folder, error) from error
+    with lock:
+        try:
+            free = lock.acquire()
+        except OSError:  # a drive that cannot lock files
+            free = True
+        if not free:
+            raise UsageError(str(folder), "is being made by another process", "Wait for it, or choose another folder")
+        yield work
+    if os.name == "nt" and complete(folder):  # where a file that is open cannot be removed
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _cannot_be_made(folder: Path, error: OSError | RuntimeError) -> WriteError:
+    reason = (error.strerror if isinstance(error, OSError) else None) or error
+    return WriteError(str(folder), f"cannot be made ({reason})", "Choose another folder")
+
+
+def keep_work(work: Path, key: str) -> None:
+    """Empty the folder of work unless it is that of the same `key`: the same pictures, prepared in the same way."""
+    mark = work / "inputs"
+    if mark.is_file() and mark.read_text(encoding="utf-8") == key:
+        return
+    for old in work.iterdir():
+        if old.name != LOCK:
+            remove(old)
+    replace_file(mark, [key.encode()])
+
+
+def remove(path: Path) -> None:
+    """Remove a file or folder, as far as that is possible."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink()
 
 
 def _is_ours(folder: Path) -> bool:
     return (folder / WORK).is_dir() or (folder / REPORT).is_file()
 
 
-def complete(folder: Path, digest: str) -> bool:
-    """Whether `folder` has a finished capture of these inputs and settings, with all its pictures."""
+def complete(folder: Path, digest: str | None = None) -> bool:
+    """Whether `folder` has a finished capture, of these inputs and settings where given, with all its pictures."""
     try:
         report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
         frames = json.loads((folder / CAMERAS).read_text(encoding="utf-8"))["frames"]
         files = [frame[key] for frame in frames for key in ("file_path", "mask_path") if key in frame]
-        return bool(report["digest"] == digest and all((folder / file).is_file() for file in files))
+        return bool(digest in (None, report["digest"]) and all((folder / file).is_file() for file in files))
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -97,8 +159,8 @@ def write_capture(
     """
     images, masks = folder / "images", folder / "masks"
     (folder / CAMERAS).unlink(missing_ok=True)  # first: what is left after a kill is no capture
-    for old in (images, masks):
-        shutil.rmtree(old, ignore_errors=True)
+    for old in (images, masks, *folder.glob(".*.tmp")):  # the last of runs that were killed
+        remove(old)
     images.mkdir()
     frames, notes = [], {}
     for file, matrix in sorted(found.matrices.items()):

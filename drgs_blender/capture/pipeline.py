@@ -12,7 +12,7 @@ from typing import Any
 from ..core.errors import AssetError, UsageError, first_of
 from . import bracket_merge, brackets, capture_folder, features, gravity, libraries, marker_poses, pictures, video
 from .features import Photo, Tell
-from .inspection import inspect
+from .inspection import check_count, inspect
 from .marker_sheet import MarkerSheet, recognise
 from .masks import stage as mask_stage
 from .pictures import Picture
@@ -104,8 +104,7 @@ def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, can
     check_settings(settings)
     if not source.exists():
         raise AssetError(str(source), "does not exist", "Check the path")
-    capture_folder.open_folder(folder, source)
-    work = folder / capture_folder.WORK
+    capture_folder.check_folder(folder, source)
     film = pictures.find_video(source)
     given = pictures.find_pictures(source) if film is None else [Picture(film, film.stem)]
     if settings.masks == "none":
@@ -114,11 +113,21 @@ def make_capture(source: Path, folder: Path, settings: Settings, tell: Tell, can
     if film is not None and settings.brackets not in (brackets.AUTO, brackets.NONE):
         raise UsageError("brackets", f"is {settings.brackets}, and {film.name} a video", "Leave it out for videos")
     bracketed = brackets.find_brackets(given, settings.brackets, source) if film is None else None
+    if film is None and len(given) < FEWEST:
+        check_count(given, str(source))
+    with capture_folder.open_folder(folder) as work:
+        return _make(source, folder, work, film, given, bracketed, settings, tell, cancelled)
+
+
+def _make(source: Path, folder: Path, work: Path, film: Path | None, given: list[Picture],
+          bracketed: brackets.Brackets | None, settings: Settings, tell: Tell,
+          cancelled: Callable[[], bool]) -> Made:  # fmt: skip
+    """`make_capture` in a folder that is open."""
     digest = pictures.digest(given, settings)
     if capture_folder.complete(folder, digest):
         shutil.rmtree(work, ignore_errors=True)
         return Made(folder, 0, 0, {}, "", 0.0, kept=True, lines=[f"{folder}: is made of the same pictures already"])
-    _keep_work(work, work_key(given, settings))
+    capture_folder.keep_work(work, work_key(given, settings))
     if film is not None:
         given = _frames(film, work, settings.frames, _part(tell, 0.0, 0.1), cancelled)
     unread, bracket_lines = {}, []
@@ -179,16 +188,7 @@ def _part(tell: Tell, start: float, end: float) -> Tell:
 
 def work_key(given: list[Picture], settings: Settings) -> str:
     """Fingerprint of what features and matches depend on."""
-    return pictures.digest(given, settings.frames, settings.size, settings.brackets)
-
-
-def _keep_work(work: Path, digest: str) -> None:
-    """Empty the folder of work unless it is that of the same pictures, prepared in the same way."""
-    mark = work / "inputs"
-    if not mark.is_file() or mark.read_text(encoding="utf-8") != digest:
-        shutil.rmtree(work, ignore_errors=True)
-        work.mkdir(parents=True)
-        mark.write_text(digest, encoding="utf-8")
+    return pictures.digest(given, settings.frames, settings.size, settings.brackets, settings.masks == "none")
 
 
 def _frames(film: Path, work: Path, count: int, tell: Tell, cancelled: Callable[[], bool]) -> list[Picture]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from PIL import Image as Pillow
 from scipy.ndimage import laplace
 
 from ..core.arrays import Array
+from ..core.asset.archive import replace_by
 from ..core.errors import AssetError, Cancelled
 from . import libraries
 
@@ -80,7 +82,8 @@ def extract_frames(
             raise Cancelled
         if number in chosen:
             path = folder / f"frame_{number:06d}.jpg"
-            Pillow.fromarray(_upright(frame)).save(path, quality=_QUALITY, subsampling=0)
+            shown = Pillow.fromarray(_upright(frame))
+            replace_by(path, partial(shown.save, format="JPEG", quality=_QUALITY, subsampling=0))
             paths.append(path)
             tell("writing frames", 0.6 + 0.4 * len(paths) / len(chosen))
     logger.info("%s: %d of %d frames are used", video, len(paths), len(samples))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +19,7 @@ from drgs_blender.capture.pictures import Picture, decode, find_pictures, write_
 from drgs_blender.capture.preparation import prepare
 from drgs_blender.capture.world_alignment import GUESSED, LOWEST, PLANE, Alignment, align_to_ground
 from drgs_blender.core.color import srgb_to_linear
-from drgs_blender.core.errors import DeviceError, UsageError
+from drgs_blender.core.errors import AssetError, DeviceError, UsageError, WriteError
 from drgs_blender.formats.exr import write_exr_picture
 from drgs_blender.formats.images import load_image
 from drgs_blender.reconstruct.readers import read_capture
@@ -195,7 +196,7 @@ def written_capture(tmp_path, alignment: Alignment, bright: int = 0):
             texture(k, 800, 600).save(path)
         pictures[file] = Picture(path, file[:-4], size=(800, 600))
     folder = tmp_path / "out"
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     more = {"ground": alignment.ground_from}
     capture_folder.write_capture(folder, pictures, found, ["said"], more, alignment.guessed)
     return folder
@@ -248,15 +249,67 @@ def test_deep_tiff_with_alpha_is_read_back(tmp_path):
 
 
 def test_a_capture_may_lie_beside_its_photographs(tmp_path):
-    capture_folder.open_folder(tmp_path / "a.capture", tmp_path)
+    capture_folder.check_folder(tmp_path / "a.capture", tmp_path)
     for taken in (tmp_path, tmp_path / "images", tmp_path / "masks" / "new"):
         with pytest.raises(UsageError, match="is where the pictures or masks are"):
-            capture_folder.open_folder(taken, tmp_path)
+            capture_folder.check_folder(taken, tmp_path)
     other = tmp_path / "other"
     other.mkdir()
     (other / "file").touch()
     with pytest.raises(UsageError, match="holds other files"):
-        capture_folder.open_folder(other, tmp_path)
+        capture_folder.check_folder(other, tmp_path)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need rights there")
+def test_folders_that_cannot_be_are_refused_by_name(tmp_path):
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(WriteError, match="a: cannot be made"):
+        capture_folder.check_folder(tmp_path / "a", tmp_path / "photos")
+    with pytest.raises(UsageError, match="is not a name in UTF-8"):
+        capture_folder.check_folder(tmp_path / "caf\udce9", tmp_path / "photos")
+
+
+def test_two_processes_do_not_make_one_capture(tmp_path):
+    folder = tmp_path / "out"
+    with capture_folder.open_folder(folder) as work:
+        capture_folder.keep_work(work, "one")
+        (work / "copy").touch()
+        with pytest.raises(UsageError, match="is being made by another process"), capture_folder.open_folder(folder):
+            pass
+        capture_folder.keep_work(work, "one")
+        assert (work / "copy").exists()
+    with capture_folder.open_folder(folder) as work:  # the lock is kept, what is not of these pictures is not
+        capture_folder.keep_work(work, "other")
+        assert sorted(path.name for path in work.iterdir()) == ["inputs", capture_folder.LOCK]
+        with pytest.raises(UsageError, match="is being made by another process"), capture_folder.open_folder(folder):
+            pass
+
+
+def test_what_a_killed_run_was_writing_is_removed_by_the_next(tmp_path):
+    alignment = align_to_ground(registration(ring(6), scene(True)))
+    (tmp_path / "out" / ".0123abcd.tmp").mkdir(parents=True)
+    (tmp_path / "out" / ".0123abcd.tmp" / "file.png").touch()
+    (tmp_path / "out" / ".capture.json.0123abcd.tmp").touch()
+    folder = written_capture(tmp_path, alignment)
+    assert not [path for path in folder.rglob("*") if path.name.endswith(".tmp")]
+
+
+def test_what_is_refused_at_once_leaves_nothing(tmp_path):
+    photographs, out = tmp_path / "photos", tmp_path / "out"
+    photographs.mkdir()
+    for count in (0, 3):
+        for k in range(count):
+            texture(k).save(photographs / f"{k}.png")
+        with pytest.raises(AssetError):
+            pipeline.make_capture(photographs, out, pipeline.Settings(), print, lambda: False)
+        assert not out.exists()
+
+
+def test_masks_of_alpha_are_not_kept_where_none_are_wanted(tmp_path):
+    write_with_alpha(tmp_path / "a.png", 0, MASK)
+    given = pipeline.pictures.find_pictures(tmp_path)
+    assert pipeline.work_key(given, pipeline.Settings(masks="none")) != pipeline.work_key(given, pipeline.Settings())
 
 
 def test_a_capture_without_one_of_its_pictures_is_made_again(tmp_path):
