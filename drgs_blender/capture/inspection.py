@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -140,7 +141,7 @@ def inspect(pictures: Sequence[Picture], looks: Sequence[Look], subject: str) ->
     fit = [picture for picture in pictures if picture.path.name not in left_out]
     reasons = defaultdict(list)
     for name, reason in left_out.items():
-        reasons[reason.partition(" of ")[0]].append(name)
+        reasons[re.split(r" of | \(", reason)[0]].append(name)
     for reason, names in reasons.items():
         logger.warning("%s: %d pictures are left out, %s: %s", subject, len(names), reason, first_of(names))
     check_count(fit, subject)

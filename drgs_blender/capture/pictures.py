@@ -40,6 +40,8 @@ FOLDERS = ("images", "photos", "input", ".")
 #: Where their masks are.
 MASKS = "masks"
 _QUALITY = 97
+#: Pixels of the shorter side of a picture, at least.
+_SMALLEST = 4
 #: Bytes of a picture's name without its extension, at most; file systems take 255 in all.
 _LONGEST = 200
 #: Part of the pixels that may be brighter than white and are written as white.
@@ -133,6 +135,9 @@ def find_pictures(source: Path) -> list[Picture]:
         There are none, or masks have another shape than their photographs.
     """
     paths = _photographs(source)
+    if source.is_file():
+        problem = f"is neither a folder of photographs nor a video ({', '.join(sorted(VIDEOS))})"
+        raise AssetError(str(source), problem, "Give the folder of the photographs")
     if not paths:
         raise AssetError(
             str(source), "has no photographs", f"Known are {', '.join(sorted(PHOTOGRAPHS | LINEAR | RAW))}"
@@ -159,7 +164,10 @@ def find_pictures(source: Path) -> list[Picture]:
         names.add(name)
         mask = find_mask(root / MASKS, path) or find_mask(source / MASKS, path)
         try:
-            pictures.append(_described(Picture(path, name, mask)))
+            picture = _described(Picture(path, name, mask))
+            if min(picture.size) < _SMALLEST:
+                raise AssetError(str(path), "is {} x {} pixels, too small".format(*picture.size))
+            pictures.append(picture)
         except AssetError as error:
             broken.append(f"{path.name} ({error.problem})")
     if broken:
@@ -173,8 +181,23 @@ def find_pictures(source: Path) -> list[Picture]:
             "%s: %d pictures are not used as they are stored, the first is %s: %s",
             source, len(noted), noted[0].path.name, "; ".join(noted[0].notes),
         )  # fmt: skip
+    for masks in {root / MASKS, source / MASKS}:
+        _tell_masks_alone(masks, paths[0].parent)
     _check_masks(pictures)
     return pictures
+
+
+def _tell_masks_alone(masks: Path, folder: Path) -> None:
+    """Name masks that belong to none of the files of a folder of pictures."""
+    if not masks.is_dir():
+        return
+    known = {name for path in folder.iterdir() for name in (path.name, path.stem)}
+    files = [path for path in masks.iterdir() if path.suffix.lower() in PHOTOGRAPHS and not path.name.startswith(".")]
+    if alone := sorted(path.name for path in files if not {path.name, path.stem} & known):
+        logger.warning(
+            "%s: %d of %d masks belong to no picture in %s: %s. Name each as its picture",
+            masks, len(alone), len(files), folder, first_of(alone),
+        )  # fmt: skip
 
 
 def _name(path: Path, taken: Collection[str]) -> str:

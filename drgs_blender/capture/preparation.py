@@ -22,6 +22,9 @@ from .pictures import Picture, decode, mask_of_alpha, reduced, shown
 
 logger = logging.getLogger(__name__)
 
+#: Part of a picture's edges that a mask of an object seldom is at.
+_AT_EDGES = 0.9
+
 
 @dataclass(slots=True)
 class Prepared:
@@ -75,7 +78,7 @@ def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bo
     folder.mkdir(parents=True, exist_ok=True)
     masks.mkdir(parents=True, exist_ok=True)
     result = Prepared(folder)
-    unmasked = []
+    unmasked, edges = [], []
     files = copy_names([picture.name for picture in pictures])
     for index, (picture, file) in enumerate(zip(pictures, files, strict=True)):
         if cancelled():
@@ -93,6 +96,7 @@ def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bo
         result.looks.append(look(small, mask))
         if mask is not None:
             result.masks = masks
+            edges.append(np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean() > _AT_EDGES)
         else:
             unmasked.append(picture)
         if seek_markers:
@@ -102,6 +106,11 @@ def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bo
                 logger.warning("marker sheets are not looked for: %s", error)
                 seek_markers = False
     _tell_unmasked(result, unmasked)
+    if 2 * sum(edges) > len(edges):
+        logger.warning(
+            "%s: %d of %d masks are white along the edges of their pictures: are they inverted? White is the object, "
+            "black is left out", pictures[0].path.parent, sum(edges), len(edges),
+        )  # fmt: skip
     return result
 
 
@@ -147,6 +156,9 @@ def _small(picture: Picture, copy: Path, mask_copy: Path, size: int) -> tuple[Ar
         pixels = decode(picture)
         colour = reduced(shown(pixels), size)
         mask = mask_of_alpha(pixels, str(picture.path)) if picture.mask is None else decode_mask(picture.mask)
+        if picture.mask is not None and mask is not None and not mask.max() > 0.5:
+            remedy = "Draw it white on the object, leave the picture out, or give --masks none"
+            raise AssetError(str(picture.mask), "is black all over: nothing of it is the object", remedy)
         if mask is not None:
             drawn = Pillow.fromarray(np.asarray(mask > 0.5).astype(np.uint8) * 255)
             drawn = drawn.resize((colour.shape[1], colour.shape[0]), Pillow.Resampling.NEAREST)

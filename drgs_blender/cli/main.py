@@ -224,10 +224,21 @@ def join_values(arguments: Sequence[str]) -> list[str]:
     return joined
 
 
+class _Printable(logging.Formatter):
+    """Messages on one line, without control characters, which names of files can have."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """The message in its format."""
+        record.message = errors.printable(record.message)
+        return super().formatMessage(record)
+
+
 def set_up_logging(verbose: int, quiet: bool) -> None:
     """Messages go to stderr: warnings by default, errors with -q, information with -v, all with -vv."""
     level = logging.ERROR if quiet else [logging.WARNING, logging.INFO, logging.DEBUG][min(verbose, 2)]
-    logging.basicConfig(level=level, format="drgs: %(message)s", stream=sys.stderr, force=True)
+    logging.basicConfig(level=level, stream=sys.stderr, force=True)
+    for handler in logging.getLogger().handlers:
+        handler.setFormatter(_Printable("drgs: %(message)s"))
     for noisy in ("numba", "PIL", "trimesh"):
         logging.getLogger(noisy).setLevel(max(level, logging.WARNING))
 

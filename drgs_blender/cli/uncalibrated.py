@@ -106,3 +106,5 @@ def tell_unused(reading: Reading, source: Path, calibrated: bool) -> None:
     if changed:
         names = ", ".join(f"capture.{name}" for name in changed)
         logger.warning("%s: %s: no effect, %s", source, names, "it has cameras" if calibrated else "it is no video")
+    if not calibrated and reading.poses == "features" and reading.marker_length is not None:
+        logger.warning("%s: capture.marker_length: no effect, capture.poses is features", source)

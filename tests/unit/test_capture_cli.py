@@ -102,6 +102,10 @@ def test_what_only_photographs_without_cameras_need_is_told_of_others(photograph
     uncalibrated.tell_unused(reading, photographs, calibrated=False)
     assert caplog.messages == [f"{photographs}: capture.video_frames: no effect, it is no video"]
     caplog.clear()
+    marked = Reading(poses="features", marker_length=29.0)
+    uncalibrated.tell_unused(marked, photographs, calibrated=False)
+    assert caplog.messages == [f"{photographs}: capture.marker_length: no effect, capture.poses is features"]
+    caplog.clear()
     (video := photographs.parent / "walk.mp4").touch()
     uncalibrated.tell_unused(reading, video, calibrated=False)
     uncalibrated.tell_unused(Reading(), scene.folder, calibrated=True)

@@ -120,6 +120,35 @@ def test_working_copies_have_names_that_lists_of_pairs_can_hold(tmp_path):
     assert [photo.given for photo in ready.photos] == [picture.path.name for picture in given]
 
 
+def test_masks_that_say_nothing_are_told_before_the_work(tmp_path, caplog):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "masks").mkdir()
+    for k in range(4):
+        texture(k).save(tmp_path / "images" / f"{k}.png")
+        Image.new("L", (96, 64), 255 if k else 0).save(tmp_path / "masks" / f"{k}.png")
+    Image.new("L", (96, 64)).save(tmp_path / "masks" / "3.png.png")
+    given = find_pictures(tmp_path)
+    assert not caplog.messages
+    ready = prepare(given, tmp_path / "work", 64, False, lambda *_: None, lambda: False)
+    assert list(ready.broken) == ["0.png"] and "masks/0.png: is black all over" in caplog.messages[0]
+    assert "3 of 3 masks are white along the edges" in caplog.messages[1] and len(caplog.messages) == 2
+    caplog.clear()
+    for k in range(4):
+        (tmp_path / "masks" / f"{k}.png").rename(tmp_path / "masks" / f"mask_{k}.png")
+    find_pictures(tmp_path)
+    (told,) = caplog.messages
+    assert "4 of 5 masks belong to no picture" in told and "mask_0.png" in told
+
+
+def test_what_is_no_picture_to_use_is_told(tmp_path, caplog):
+    texture(0).save(tmp_path / "a.png")
+    Image.new("RGB", (1, 64)).save(tmp_path / "b.png")
+    assert [picture.name for picture in find_pictures(tmp_path)] == ["a"]
+    assert "b.png (is 1 x 64 pixels, too small)" in caplog.text
+    with pytest.raises(AssetError, match=r"a\.png: is neither a folder of photographs nor a video"):
+        find_pictures(tmp_path / "a.png")
+
+
 def test_what_cannot_be_read_is_left_out_and_named(tmp_path, caplog):
     for k in range(4):
         texture(k).save(tmp_path / f"{k}.png")
@@ -162,6 +191,7 @@ def test_blurred_pictures_and_duplicates_are_left_out(caplog):
     fit, left_out = inspect(*looks(images), "photos")
     assert set(left_out) == {"3.jpg", "7.jpg"} and len(fit) == 8
     assert "blurred" in left_out["3.jpg"] and "2.jpg" in left_out["7.jpg"]
+    assert "1 pictures are left out, blurred: 3.jpg" in caplog.text
     assert "3.jpg" in caplog.text and "7.jpg" in caplog.text
 
 

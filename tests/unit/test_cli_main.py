@@ -118,6 +118,13 @@ def test_traceback_of_an_unexpected_error_only_when_asked(monkeypatch, capsys):
     assert "Traceback" in capsys.readouterr().err
 
 
+def test_warnings_are_one_line_without_control_characters(capsys, monkeypatch):
+    monkeypatch.setattr(command_line.logging.getLogger(), "handlers", [])
+    command_line.set_up_logging(0, False)
+    command_line.logger.warning("%s: is not used", "new\nline\x1b[2J.jpg")
+    assert capsys.readouterr().err == "drgs: new\\nline\\x1b[2J.jpg: is not used\n"
+
+
 def test_render_refuses_before_it_starts_anything(tmp_path, capsys):
     out = str(tmp_path / "####.exr")
     scene = tmp_path / "s.blend"
