@@ -34,7 +34,9 @@ def decode_raw(path: Path) -> Array:
             pixels = raw.postprocess(use_camera_wb=True, no_auto_bright=True, gamma=(1, 1), output_bps=16)
     except (rawpy.LibRawError, rawpy.NotSupportedError, OSError, ValueError) as error:
         remedy = "Develop it in another program, to TIFF or EXR"
-        raise AssetError(str(path), f"cannot be developed ({error})", remedy) from error
+        reason = error.args[0] if error.args else error
+        said = reason.decode(errors="replace") if isinstance(reason, bytes) else error  # LibRaw's are bytes
+        raise AssetError(str(path), f"cannot be developed ({said})", remedy) from error
     return np.asarray(pixels, np.float32) / np.float32(65535)
 
 

@@ -15,6 +15,7 @@ import logging
 import re
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -237,6 +238,7 @@ def set_up_logging(verbose: int, quiet: bool) -> None:
     """Messages go to stderr: warnings by default, errors with -q, information with -v, all with -vv."""
     level = logging.ERROR if quiet else [logging.WARNING, logging.INFO, logging.DEBUG][min(verbose, 2)]
     logging.basicConfig(level=level, stream=sys.stderr, force=True)
+    warnings.filterwarnings("ignore", category=UserWarning, module="PIL")  # of damaged metadata: they name no file
     for handler in logging.getLogger().handlers:
         handler.setFormatter(_Printable("drgs: %(message)s"))
     for noisy in ("numba", "PIL", "trimesh"):

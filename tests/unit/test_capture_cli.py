@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
+
 import captures
 import numpy as np
 import pytest
@@ -14,6 +18,8 @@ from drgs_blender.cli.main import main
 from drgs_blender.core.errors import EXIT_BAD_ASSET, EXIT_NO_DEVICE, EXIT_USAGE, AssetError, DeviceError
 from drgs_blender.reconstruct.readers import has_cameras, read_capture
 from drgs_blender.reconstruct.settings import Reading
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -29,6 +35,24 @@ def test_three_pictures_are_refused_before_any_work(photographs, tmp_path, capsy
     words = ["capture", str(photographs), "--out", str(tmp_path / "out"), "--poses", "features", "--no-progress"]
     assert main(words) == EXIT_BAD_ASSET
     assert "has 3 usable pictures (0.png, 1.png, 2.png)" in capsys.readouterr().err
+
+
+def test_damaged_exif_is_none_without_a_word_that_names_no_file(photographs, tmp_path):
+    data = Image.Exif()
+    data[271] = "Maker"
+    Image.new("RGB", (32, 24)).save(photographs / "a.jpg", exif=data.tobytes()[:20])
+    command = [
+        sys.executable,
+        "-m",
+        "drgs_blender.cli.main",
+        "capture",
+        str(photographs),
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    done = subprocess.run([*command, "--masks", "none"], capture_output=True, text=True, timeout=60, cwd=ROOT)
+    assert done.returncode == EXIT_BAD_ASSET and "has 4 usable pictures" in done.stderr
+    assert "Warning" not in done.stderr
 
 
 def test_lengths_are_above_zero(photographs, tmp_path, capsys):
