@@ -158,7 +158,7 @@ def find_pictures(source: Path) -> list[Picture]:
         )  # fmt: skip
         paths = [path for path in paths if path.suffix.lower() not in RAW]
     root = paths[0].parent.parent if paths and paths[0].parent.name in FOLDERS else source
-    pictures, broken, names = [], [], set()
+    pictures, broken, names = [], [], set[str]()
     for path in paths:
         name = _name(path, names)
         names.add(name)
