@@ -261,7 +261,7 @@ def _make(
         asset = reconstruct(capture, settings, tell, cancelled, work)
     asset.provenance.setdefault("settings", as_tables(settings))["capture"] = as_tables(settings, reading)["capture"]
     write_asset(file, asset)
-    clear(work)
+    clear(work, file)
     if not args.quiet:
         print(f"drgs: {file}: {len(asset.surfels)} surfels", file=sys.stderr)
 

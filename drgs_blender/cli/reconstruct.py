@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import glob
 import logging
 import sys
 import time
@@ -68,6 +69,8 @@ OPTIONS = {
 
 #: Seconds between two lines of progress on stdout.
 _REPORT_EVERY = 2.0
+#: Seconds within which an asset is surely written: a younger half of one may be another process's.
+_WRITTEN_WITHIN = 60.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -215,7 +218,7 @@ def run(args: argparse.Namespace) -> int:
     # Beside those that `reconstruct` kept, of which some follow from the photographs and this machine.
     asset.provenance.setdefault("settings", as_tables(settings))["capture"] = as_tables(settings, reading)["capture"]
     write_and_report(args.out, asset)
-    clear(work)
+    clear(work, args.out)
     report = asset.provenance["report"]
     steps = ", ".join(f"{phase} {done} of {of}" for phase, (done, of) in report["steps"].items())
     print(f"  steps: {steps}")
@@ -339,12 +342,16 @@ def _give_normals(args: argparse.Namespace, capture: Capture, model: str) -> Non
         give_normals(capture, model, _telling(args, bar), cancelled)
 
 
-def clear(folder: Path) -> None:
-    """Remove what a run kept to go on from, and nothing else: a folder of this name may have been there before."""
-    for pattern in ("*.state", ".*.state.*.tmp"):  # the latter of runs that were killed
-        for file in folder.glob(pattern):
-            with contextlib.suppress(OSError):
-                file.unlink()
+def clear(folder: Path, made: Path) -> None:
+    """Remove what a run kept to go on from, and nothing else: a folder of this name may have been there before.
+
+    Of runs that were killed as they wrote a state or what they had `made`, half of it as well.
+    """
+    old = time.time() - _WRITTEN_WITHIN
+    halves = [file for file in made.parent.glob(f".{glob.escape(made.name)}.*.tmp") if file.stat().st_mtime < old]
+    for file in (*folder.glob("*.state"), *folder.glob(".*.state.*.tmp"), *halves):
+        with contextlib.suppress(OSError):
+            file.unlink()
     _remove_if_empty(folder)
 
 

@@ -22,6 +22,7 @@ from capture_cases import balls, write
 
 from drgs_blender.cli.interrupt import interruptible
 from drgs_blender.cli.main import main
+from drgs_blender.cli.reconstruct import clear
 from drgs_blender.core.errors import Cancelled
 from drgs_blender.core.phases import PREPARING
 
@@ -104,3 +105,16 @@ def test_a_signal_is_not_lost_in_a_callback_from_c_and_a_second_one_ends_at_once
     with pytest.raises(SystemExit, match="143"), interruptible() as cancelled:
         signal.raise_signal(signal.SIGTERM)
         raise Cancelled
+
+
+def test_halves_of_assets_that_killed_runs_were_writing_go_with_what_they_kept(tmp_path):
+    work, asset = tmp_path / "[a].reconstruct", tmp_path / "[a].drgs"
+    work.mkdir()
+    others = [tmp_path / name for name in (".a.drgs.12345678.tmp", ".[a].drgs.young.tmp", "[a].drgs")]
+    mine = [work / "surfels.state", work / ".surfels.state.1234.tmp", tmp_path / ".[a].drgs.12345678.tmp"]
+    for file in (*others, *mine):
+        file.touch()
+        if "young" not in file.name:
+            os.utime(file, (1e9, 1e9))
+    clear(work, asset)
+    assert all(file.exists() for file in others) and not any(file.exists() for file in (*mine, work))
