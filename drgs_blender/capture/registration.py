@@ -237,7 +237,13 @@ def _refine(colmap: Any, model: Any) -> None:
     options.refine_focal_length = options.refine_extra_params = True
     options.refine_principal_point = False
     options.print_summary = False
-    colmap.bundle_adjustment(model, options)
+    # As `pycolmap.bundle_adjustment` does, which turns COLMAP's log on for everything after it.
+    colmap.ObservationManager(model).filter_observations_with_negative_depth()
+    config = colmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        config.add_image(number)
+    config.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    colmap.create_default_bundle_adjuster(options, config, model).solve()
     model.update_point_3d_errors()
 
 

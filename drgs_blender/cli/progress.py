@@ -101,7 +101,7 @@ class FractionBar:
             self._emit(phase, fraction)
         elif self._for_people and self._every and time.monotonic() >= self._next:
             self._next = time.monotonic() + self._every
-            emit(f"drgs: {phase}\n", sys.stderr)
+            emit(f"drgs: {_counted(phase, fraction)}\n", sys.stderr)
 
     def _emit(self, phase: str, fraction: float) -> None:
         """Nothing else is heard for minutes where there is no bar."""
@@ -113,7 +113,12 @@ class FractionBar:
             emit(f'DRGS_PROGRESS part={fraction:.3f} phase="{phase}"\n', sys.stdout)
         elif self._for_people:
             self._next = now + PEOPLE_SECONDS
-            emit(f"drgs: {phase}\n", sys.stderr)
+            emit(f"drgs: {_counted(phase, fraction)}\n", sys.stderr)
+
+
+def _counted(phase: str, fraction: float) -> str:
+    """The phase and how far it is, which some say themselves ("3 of 12")."""
+    return phase if " of " in phase else f"{phase}, {min(fraction, 1.0):.0%}"
 
 
 def prepare_engine(args: argparse.Namespace, *jobs: str) -> None:
