@@ -29,6 +29,9 @@ COMPARED_PASSES = ("Combined", "Depth", "Normal", "Albedo", "Roughness", "Metall
 Distance = Callable[[Array, Array], float]
 #: By name; None where it is not computed.
 Distances = dict[str, Distance | None]
+#: Spacing of the points of the true mesh that carry others, in parts of its extent, and their number along an edge at
+#: most.
+_SPACING, _MOST_PARTS = 0.01, 100
 #: Called with the part done and what is rendered.
 Progress = Callable[[float, str], None]
 #: Where files of pictures go: (name of the set, number of the view, ours and the true one, encoded).
@@ -133,13 +136,45 @@ def _warn_of_known(asset: Asset, capture: Capture) -> None:
         )  # fmt: skip
 
 
+def surface_points(vertices: Array, faces: Array, spacing: float) -> tuple[Array, Array]:
+    """Points of a mesh no farther apart than `spacing`: its corners, and a lattice in faces that are larger.
+
+    Where faces are large, as on flat sides, corners alone say little of how the surface between them moves.
+
+    Returns
+    -------
+    corners : (n, 3) int array
+        Numbers of vertices.
+    shares : (n, 3) float array
+        Barycentric coordinates.
+
+    Examples
+    --------
+    >>> corners, shares = surface_points(np.eye(3), np.array([[0, 1, 2]]), 0.8)
+    >>> shares[3:].tolist()
+    [[0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]]
+    """
+    edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
+    parts = np.ceil(np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0) / spacing).astype(int).clip(1, _MOST_PARTS)
+    used = np.unique(faces)
+    corners, shares = [np.repeat(used[:, None], 3, axis=1)], [np.tile((1.0, 0.0, 0.0), (len(used), 1))]
+    for count in np.unique(parts[parts > 1]):
+        lattice = np.array([(i, j, count - i - j) for i in range(count + 1) for j in range(count + 1 - i)]) / count
+        lattice = lattice[lattice.max(axis=1) < 1]
+        large = faces[parts == count]
+        corners.append(np.repeat(large, len(lattice), axis=0))
+        shares.append(np.tile(lattice, (len(large), 1)))
+    return np.concatenate(corners), np.concatenate(shares)
+
+
 def posed_vertices(asset: Asset, truth: Truth) -> Array:
     """(n, 3) float32 vertices of the asset's mesh, carried along by the true mesh around them."""
     assert truth.rest is not None and truth.posed is not None and truth.faces is not None
     source = MeshSource(truth.rest, truth.faces)
-    used = np.unique(truth.faces)
-    weights = bind_points(asset.mesh.vertices, truth.rest[used])
-    points, _, turned = carry(weights, truth.posed[used], source.gradients(truth.posed)[used])
+    corners, shares = surface_points(truth.rest, truth.faces, _SPACING * float(np.ptp(truth.rest, axis=0).max()))
+    at = lambda values: np.einsum("nk,nk...->n...", shares, values[corners])  # noqa: E731
+    weights = bind_points(asset.mesh.vertices, at(truth.rest))
+    points, _, turned = carry(weights, at(truth.posed), at(source.gradients(truth.posed)))
     if turned:
         logger.info("%d vertices are carried by their nearest neighbour alone", turned)
     return points.astype(np.float32)

@@ -15,6 +15,7 @@ import captures
 import numpy as np
 import pytest
 from PIL import Image
+from shapes import plain_mesh
 
 from drgs_blender.cli import evaluate
 from drgs_blender.cli.main import main
@@ -156,6 +157,20 @@ def test_the_pose_is_carried_to_another_mesh_of_the_same_shape(scenes):
     error = np.linalg.norm(found - wanted, axis=1)
     assert np.median(error) < 2e-3 and np.quantile(error, 0.95) < 0.02
     assert len(used) > 1000
+
+
+def test_flat_sides_carry_what_lies_on_them():
+    """A roof of two large faces that folds: corners alone would bend what lies in between."""
+    rest = np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]], np.float32)
+    posed = rest + np.float32([[0, 0, 0], [0, 0, 1], [0, 0, 0], [0, 0, 1]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    random = np.random.default_rng(0).dirichlet((1, 1, 1), 200)
+    points = np.einsum("nk,nkc->nc", random, rest[faces[np.arange(200) % 2]])
+    wanted = np.einsum("nk,nkc->nc", random, posed[faces[np.arange(200) % 2]])
+    mesh = plain_mesh(points.astype(np.float32), np.arange(198, dtype=np.int32).reshape(-1, 3))
+    found = posed_vertices(Asset(attach_nothing(), mesh, None), Truth([], "sun", rest, posed, faces))
+    assert np.linalg.norm(found - wanted, axis=1).mean() < 0.005
+
 
 
 def attach_nothing():
