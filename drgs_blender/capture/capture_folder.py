@@ -28,6 +28,8 @@ REPORT, DRAWING, POINTS, CAMERAS = "capture.json", "capture.png", "sparse_points
 WORK = "registration"
 #: In it: locked by the process that makes the capture.
 LOCK = "lock"
+#: In it: the key of the inputs that it belongs to.
+INPUTS = "inputs"
 
 
 def check_folder(folder: Path, source: Path) -> None:
@@ -91,7 +93,7 @@ def _cannot_be_made(folder: Path, error: OSError | RuntimeError) -> WriteError:
 
 def keep_work(work: Path, key: str) -> None:
     """Empty the folder of work unless it is that of the same `key`: the same pictures, prepared in the same way."""
-    mark = work / "inputs"
+    mark = work / INPUTS
     if mark.is_file() and mark.read_text(encoding="utf-8") == key:
         return
     for old in work.iterdir():

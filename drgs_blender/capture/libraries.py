@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import signal
 import sys
 import threading
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 # Before pycolmap, because it loads the system's zlib: if pycolmap is the first to do so, that zlib calls functions of
@@ -50,13 +52,28 @@ def load(name: str) -> Any:
         raise DeviceError(
             library.purpose,
             f"needs {name}, which cannot be loaded ({error})",
-            f'Install it: "{sys.executable}" -m pip install "{library.package}"',
+            f"Install all that is absent: {install_command(absent(name))}",
         ) from error
     if name == "pycolmap":
         if threading.current_thread() is threading.main_thread() and terminated is not None:
             signal.signal(signal.SIGTERM, terminated)  # its log library takes it for a crash
         module.logging.minloglevel = module.logging.Level.FATAL.value  # its errors arrive as exceptions
     return module
+
+
+def absent(*needed: str) -> list[str]:
+    """Rows of `LIBRARIES` that are not installed, those `needed` among them; torch, which is large, if it is needed."""
+    return [
+        name
+        for name, library in LIBRARIES.items()
+        if name in needed or (name != "torch" and importlib.util.find_spec(library.module) is None)
+    ]
+
+
+def install_command(names: Iterable[str]) -> str:
+    """Command that installs rows of `LIBRARIES` into this Python's environment, however DR-GS came there."""
+    packages = " ".join(f'"{LIBRARIES[name].package}"' for name in names)
+    return f'"{sys.executable}" -m pip install {packages}'
 
 
 def is_there(name: str) -> bool:

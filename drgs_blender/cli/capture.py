@@ -11,6 +11,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from ..core.errors import Cancelled
 from .frame_lines import emit
 from .interrupt import interruptible
 from .progress import WORK_SECONDS, FractionBar
@@ -34,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make one capture."""
+    from ..capture.capture_folder import INPUTS, WORK
     from ..capture.masks.default_mode import resolve_mode
     from ..capture.pipeline import make_capture
     from ..reconstruct.settings import Reading
@@ -45,8 +47,16 @@ def run(args: argparse.Namespace) -> int:
         emit(f"{args.input}: {said_of_masks(masks)}\n", sys.stderr)
     tell_unused(reading, args.input, calibrated=False)
     settings = capture_settings(reading, masks)
+    work = args.out / WORK
+    if (work / INPUTS).is_file() and not args.quiet:
+        emit(f"an earlier run was stopped: going on with {work}, where it is of these pictures\n", sys.stderr)
     with interruptible() as cancelled, FractionBar(args, "capturing", every=WORK_SECONDS) as bar:
-        made = make_capture(args.input, args.out, settings, bar, cancelled)
+        try:
+            made = make_capture(args.input, args.out, settings, bar, cancelled)
+        except (Cancelled, KeyboardInterrupt):
+            if (work / INPUTS).is_file() and not args.quiet:
+                emit("the same command goes on from here\n", sys.stderr)
+            raise
     if not args.quiet:
         print(f"{args.out}: {made.lines[0]}" if not made.kept else made.lines[0])
         for line in made.lines[1:]:

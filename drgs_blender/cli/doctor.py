@@ -11,6 +11,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -214,16 +215,20 @@ def torch(args: argparse.Namespace) -> str:
 
 def capture(args: argparse.Namespace) -> str:
     """Libraries that find the cameras of photographs and videos, and that run models of masks. They are not loaded."""
+    from ..capture import libraries
+
     found, absent = [], []
-    for name in ("pycolmap", "opencv-python-headless", "av", "onnxruntime"):
+    for name, library in libraries.LIBRARIES.items():
+        if name == "torch":  # a row of its own
+            continue
+        package = re.split("[<>=]", library.package)[0]
         try:
-            found.append(f"{name} {importlib.metadata.version(name)}")
+            found.append(f"{package} {importlib.metadata.version(package)}")
         except importlib.metadata.PackageNotFoundError:
             absent.append(name)
     if absent:
-        raise DeviceError(
-            ", ".join(absent), "not installed", f"Only drgs capture needs it: pip install '{_PACKAGE}[capture]'"
-        )
+        remedy = f"Only drgs capture needs it: {libraries.install_command(absent)}"
+        raise DeviceError(", ".join(absent), "not installed", remedy)
     return ", ".join(found)
 
 

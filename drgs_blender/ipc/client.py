@@ -74,7 +74,7 @@ class EngineClient:
         command: list[str],
         *,
         silence: float = 20.0,
-        handshake: float = 15.0,
+        handshake: float = 45.0,
         stall: float = 900.0,
         restarts: int = 1,
         shared: bool = True,

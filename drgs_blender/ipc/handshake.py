@@ -50,7 +50,9 @@ def greet(child: Child, program: str, watchdog: Watchdog, stopped: Callable[[], 
                 watchdog.check()
             except EngineLost as silence:
                 problem = f"does not greet as an engine does: it said nothing for {watchdog.silence:g} s"
-                raise DeviceError(program, problem, _REMEDY) from silence
+                raise DeviceError(
+                    program, problem, f"Try again where the machine was busy. Else: {_REMEDY}"
+                ) from silence
             continue
         if isinstance(item, OSError) and child.pid == 0:
             raise DeviceError(program, f"cannot be started ({item})", _REMEDY) from item

@@ -59,6 +59,8 @@ FEW_VOXELS = 256
 FEW_VIEWS = 5
 #: Fewer steps of materials than this separate them poorly from the light.
 FEW_STEPS = 300
+#: Fewer steps of surfels than this leave their shape rough.
+FEW_SURFEL_STEPS = 400
 #: Phase -> the settings that decide its result.
 CHECKPOINT_SETTINGS = {
     "surfels": ("schedule", "minutes"),
@@ -285,7 +287,12 @@ class _Work:
                     Progress(phase, begin + (end - begin) * reached, len(training.gaussians), training.psnr, picture)
                 )
                 reported, shown = now, now if draw else shown
-        self.steps[phase] = [training.iteration, training.schedule.iterations]
+        done, of = self.steps[phase] = [training.iteration, training.schedule.iterations]
+        if done < min(FEW_SURFEL_STEPS, of):
+            log.warning(
+                "%s got %d of %d steps in their part of %g minutes, too few for their shape: it is rough. Give more "
+                "minutes, --time-budget M, or a lower --resolution", phase, done, of, self.settings.minutes or 0.0,
+            )  # fmt: skip
         return training.attempt(lambda: training.gaussians.on(CPU))
 
 

@@ -12,10 +12,19 @@ import pytest
 from PIL import Image
 
 from drgs_blender.capture import libraries, pipeline
+from drgs_blender.capture.capture_folder import INPUTS, WORK
 from drgs_blender.capture.masks.default_mode import resolve_mode
 from drgs_blender.cli import uncalibrated
 from drgs_blender.cli.main import main
-from drgs_blender.core.errors import EXIT_BAD_ASSET, EXIT_NO_DEVICE, EXIT_USAGE, AssetError, DeviceError
+from drgs_blender.core.errors import (
+    EXIT_BAD_ASSET,
+    EXIT_INTERRUPTED,
+    EXIT_NO_DEVICE,
+    EXIT_USAGE,
+    AssetError,
+    Cancelled,
+    DeviceError,
+)
 from drgs_blender.reconstruct.readers import has_cameras, read_capture
 from drgs_blender.reconstruct.settings import Reading
 
@@ -223,3 +232,20 @@ def test_the_number_of_a_bracket_is_checked_and_handed_on(photographs, tmp_path,
     for given in ([], ["--brackets", "none"], ["--brackets", "5"]):
         assert main([*words, *given]) == EXIT_BAD_ASSET
     assert asked == ["auto", "none", "5"]
+
+
+def test_a_capture_that_is_stopped_says_how_it_goes_on(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "statue"
+
+    def stopped(*_: object) -> None:
+        (folder / WORK).mkdir(parents=True, exist_ok=True)
+        (folder / WORK / INPUTS).touch()
+        raise Cancelled
+
+    monkeypatch.setattr(pipeline, "make_capture", stopped)
+    said = []
+    for quiet in ([], [], ["-q"]):
+        assert main(["capture", str(tmp_path), "--out", str(folder), "--masks", "none", *quiet]) == EXIT_INTERRUPTED
+        said.append(capsys.readouterr().err)
+    assert ["an earlier run was stopped" in text for text in said] == [False, True, False]
+    assert ["the same command goes on from here" in text for text in said] == [True, True, False]

@@ -288,7 +288,8 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(monkeypatc
     monkeypatch.setitem(
         libraries.LIBRARIES, "pycolmap", libraries.Library("no_such_module", "pycolmap>=4.2", "structure")
     )
-    with pytest.raises(DeviceError, match=r"needs pycolmap.*pip install .pycolmap>=4.2"):
+    monkeypatch.setitem(libraries.LIBRARIES, "av", libraries.Library("no_such_module", "av>=14", "video"))
+    with pytest.raises(DeviceError, match=r'needs pycolmap.*pip install "pycolmap>=4.2".* "av>=14"'):
         libraries.load("pycolmap")
 
 

@@ -172,7 +172,6 @@ def test_flat_sides_carry_what_lies_on_them():
     assert np.linalg.norm(found - wanted, axis=1).mean() < 0.005
 
 
-
 def attach_nothing():
     from drgs_blender.core.asset import Surfels
 

@@ -216,7 +216,7 @@ def find_layout(path: Path) -> Reader:
         raise AssetError(str(path), f"cannot be read: {error.strerror or error}", "Check its permissions") from error
     if captures:
         raise AssetError(str(path), f"is no capture, but holds some: {first_of(captures)}", "Give one of them")
-    raise AssetError(str(path), "is no capture", understood)
+    raise AssetError(str(path), "is no capture", f"{understood}. Photographs without cameras: drgs capture")
 
 
 def has_cameras(path: Path) -> bool:
