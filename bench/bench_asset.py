@@ -12,6 +12,7 @@ takes its minutes and three more for what scores it.
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -110,19 +111,19 @@ def row(report: dict[str, Any], beside: list[str], seconds: float) -> list[str]:
 
 
 def rescore_deformed(objects: list[str], scenes: Path, samples: int) -> None:
-    """Score how the surfels of kept assets look deformed, without learning them again; the rest of their rows stays."""
+    """Score how kept assets look deformed, without learning them again; the rest of their rows stays."""
     before, section = DOCUMENT.read_text(encoding="utf-8").split("<!-- begin asset -->")
-    for name in objects:
+    for name, sees in itertools.product(objects, ("surfels", "mesh")):
         truth = relit_truth(scenes / name, posed=True)
-        found = score(FOLDER / f"{name}.drgs", scenes / name, "surfels", samples, truth)["lights"]
-        line = next(line for line in section.splitlines() if line.startswith(f"| {name} | surfels |"))
+        found = score(FOLDER / f"{name}.drgs", scenes / name, sees, samples, truth)["lights"]
+        line = next(line for line in section.splitlines() if line.startswith(f"| {name} | {sees} |"))
         cells = line.strip("| ").split(" | ")
         columns = next(line for line in section.splitlines() if line.startswith(f"| {COLUMNS[0]} |"))
         for column, cell in ((DEFORMED, pair(found)), (DEFORMED_SIMILARITY, similarity(found))):
             if column in columns:  # the page may be older than the column
                 cells[columns.strip("| ").split(" | ").index(column)] = cell
         section = section.replace(line, f"| {' | '.join(cells)} |")
-        store_row(FOLDER / "rows.json", f"{name}|surfels", cells[2:])
+        store_row(FOLDER / "rows.json", f"{name}|{sees}", cells[2:])
         print(*cells, flush=True)
     DOCUMENT.write_text(f"{before}<!-- begin asset -->{section}", encoding="utf-8")
 
