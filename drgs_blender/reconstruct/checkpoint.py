@@ -94,8 +94,3 @@ class Checkpoint:
         if self._path is not None:
             save(self._path, state, self._key)
             self._saved = self._now()
-
-    def remove(self) -> None:
-        """Delete the file: the run is over."""
-        if self._path is not None:
-            self._path.unlink(missing_ok=True)

@@ -23,7 +23,7 @@ from ..deform.mesh_driven import MeshDriven
 from ..geometry.normals import VertexNormals
 from . import checkpoint
 from .backend import CPU
-from .capture.capture import Capture, View
+from .capture.capture import Capture
 from .gpu.select_backend import select_backend
 from .held_out import held_out_metrics, preview
 from .inverse_rendering.joint import LearnedSurfels, decouple_jointly
@@ -66,6 +66,8 @@ CHECKPOINT_SETTINGS = {
     "surfels": ("schedule", "minutes"),
     "surfels on the mesh": ("schedule", "minutes", "mesh_resolution", "fixed"),
 }
+#: Part of a run's progress in which materials are learned; what is left goes by as surfels take what blends to them.
+_LEARNING = 0.27
 #: Part of the steps in which surfels of thin objects are learned with their materials.
 JOINT = 0.5
 #: Fainter surfels do not come into the asset.
@@ -188,13 +190,14 @@ def reconstruct(
             binding = shaded_by_own(binding, mesh, surfels, turns)
         if shape is None:
             normals = found.normals if settings.decoupling.normals and not thin else None
-            binding = _show_the_mesh(final, visible, surfels, mesh, binding, normals, capture.training)
+            binding = _show_the_mesh(work, final, visible, surfels, mesh, binding, normals)
         else:
             surfels = replace(surfels, **{name: getattr(shape, name)[visible] for name in BASE_CHANNELS})
         environment, origin = Environment(found.environment), "separated from the lighting"
         done, of = report["steps"]["materials"]
         if _are_few(done, of):
             origin = f"hardly separated from the lighting, in {done} of {of} steps: unreliable"
+        work.on_progress(Progress("materials", 1.0, len(surfels)))
     learned = [view.name for view in capture.training]
     provenance: dict[str, Any] = {"capture": capture.name, "learned_from": learned, "variant": settings.variant}
     provenance |= {"materials": origin, "settings": as_tables(settings), "report": report}
@@ -324,7 +327,7 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, thin: bool, rep
     own, count = shown if thin else None, len(surfels.gaussians)
 
     def tell(at: MaterialProgress) -> None:
-        work.on_progress(Progress("materials", 0.7 + 0.3 * at.part, count, at.psnr))
+        work.on_progress(Progress("materials", 0.7 + _LEARNING * at.part, count, at.psnr))
 
     rest = tell, work.cancelled, work.file("materials")
     if settings.joint is None:
@@ -361,25 +364,31 @@ def _are_few(done: int, of: int) -> bool:
 
 
 def _show_the_mesh(
+    work: _Work,
     gaussians: Gaussians,
     visible: Array,
     surfels: Surfels,
     mesh: Mesh,
     binding: Binding,
     normals: Array | None,
-    views: list[View],
 ) -> Binding:
     """Give surfels, in place, materials whose blend shows those of the mesh; the binding with such shading normals.
 
     `normals` (v, 3) are the mesh's; None: the binding keeps its own. Roughness and metallic are smooth anyway, and
     errors of the mesh's would only become larger.
     """
+
+    def tell(part: float) -> None:
+        if work.cancelled():
+            raise Cancelled
+        work.on_progress(Progress("materials", 0.7 + _LEARNING + (0.3 - _LEARNING) * part, len(surfels)))
+
     for name in BASE_CHANNELS:
         setattr(surfels, name, np.clip(blended(binding, mesh, getattr(mesh, name)), 0, 1).astype(np.float32))
     values = mesh.albedo if normals is None else np.hstack([mesh.albedo, normals])
     start = np.zeros((len(visible), values.shape[1]), np.float32)
     start[visible] = blended(binding, mesh, values)
-    found = blended_as(gaussians, visible, start, mesh, values, views)[visible]
+    found = blended_as(gaussians, visible, start, mesh, values, work.capture.training, tell)[visible]
     surfels.albedo = found[:, :3].clip(0, 1)
     return binding if normals is None else shaded_by(binding, mesh, found[:, 3:])
 

@@ -25,7 +25,7 @@ from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Deco
 from drgs_blender.reconstruct.meshing.visual_hull import find_region  # noqa: E402
 from drgs_blender.reconstruct.optim.schedule import Schedule  # noqa: E402
 from drgs_blender.reconstruct.optim.train import Training  # noqa: E402
-from drgs_blender.reconstruct.pipeline import Settings, reconstruct  # noqa: E402
+from drgs_blender.reconstruct.pipeline import Progress, Settings, reconstruct  # noqa: E402
 
 QUICK = Schedule(iterations=240, surfels=2500)
 
@@ -145,6 +145,20 @@ def test_materials_and_light_come_with_the_asset(capture, tmp_path):
     assert 0 < np.abs(asset.surfels.albedo - colour).mean() < 0.5 * asset.mesh.albedo.std()
     # It is shaded by what was learned on the mesh, not by its own normal, which 60 steps have hardly turned.
     assert np.median(asset.binding.normal[:, 2]) > 0.95
+
+
+@pytest.mark.slow
+def test_a_run_that_is_stopped_after_its_materials_learns_none_again(capture, tmp_path, caplog):
+    quick = Decoupling(iterations=6, pixels=64, cosine=2, ggx=2, light=2, environment=8)
+    short = Settings(schedule=replace(QUICK, iterations=20, surfels=500), mesh_resolution=24, decoupling=quick)
+    told: list[Progress] = []
+    with pytest.raises(Cancelled):
+        reconstruct(capture, short, told.append, lambda: bool(told) and told[-1].part > 0.97, tmp_path)
+    first, told[:] = len(told), []
+    with caplog.at_level("INFO"):
+        asset = reconstruct(capture, short, told.append, folder=tmp_path)
+    assert first > 0 and "materials: going on at step 6" in caplog.text and told[-1].part == 1.0
+    assert asset.provenance["report"]["steps"]["materials"] == [6, 6]
 
 
 def test_materials_of_too_few_steps_are_called_unreliable(capture, caplog):

@@ -138,7 +138,7 @@ def decouple(
     cancelled : callable, optional
         Asked every step; then a checkpoint is left behind and Cancelled raised.
     checkpoint : Path, optional
-        File to go on from when it lies there and fits, written every few seconds, removed at the end.
+        File to go on from when it lies there and fits, written every few seconds and at the end.
     backend : LearningBackend
         Backend that traces rays; the rest runs on the CPU.
     normals : callable, optional
@@ -175,9 +175,8 @@ def learned(
         if on_progress is not None and (schedule.iteration % _REPORT == 0 or not schedule.going()):
             score = job.score
             on_progress(Progress(schedule.iteration, min(schedule.part, 1.0), score.loss, score.psnr, job.result))
-    result = job.result()
-    job.checkpoint.remove()
-    return result
+    job.save()  # what is made of it can be stopped, too
+    return job.result()
 
 
 class Job:

@@ -8,6 +8,8 @@ views. Taken view by view (SART) the last ones are shown best, and views left ou
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 
@@ -29,7 +31,13 @@ _INVISIBLE = -30.0
 
 
 def blended_as(
-    gaussians: Gaussians, visible: Array, start: Array, mesh: Mesh, values: Array, views: list[View]
+    gaussians: Gaussians,
+    visible: Array,
+    start: Array,
+    mesh: Mesh,
+    values: Array,
+    views: list[View],
+    tell: Callable[[float], None] = lambda _: None,
 ) -> Array:
     """Values of surfels, so that views of them show those of the mesh's vertices.
 
@@ -47,6 +55,8 @@ def blended_as(
         Of its vertices.
     views : list of View
         Their cameras and masks say where the surface is seen, their photographs do not matter.
+    tell : callable
+        Called before each view with the part that is done; what it raises ends it.
 
     Returns
     -------
@@ -62,9 +72,11 @@ def blended_as(
     cut = cropped_views(views, mesh.vertices)
     generator = np.random.default_rng(0)
     found = torch.from_numpy(np.asarray(start, np.float32).copy())
-    for _ in range(_SWEEPS):
+    count = min(len(cut), _VIEWS)
+    for sweep in range(_SWEEPS):
         lack, parts = torch.zeros_like(found), torch.zeros(len(found), 1)
-        for k in generator.permutation(len(cut))[:_VIEWS]:
+        for done, k in enumerate(generator.permutation(len(cut))[:count]):
+            tell((sweep + done / count) / _SWEEPS)
             pixels = pixels_of(k, cut[k], mesh, tree)
             wanted = np.einsum("nk,nkc->nc", pixels.corners, values[mesh.faces[pixels.face]]).astype(np.float32)
             # One more column, of zeros: its slope is the sum of a surfel's parts in all pixels.
