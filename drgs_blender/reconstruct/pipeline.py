@@ -68,8 +68,6 @@ CHECKPOINT_SETTINGS = {
 }
 #: Part of a run's progress in which materials are learned; what is left goes by as surfels take what blends to them.
 _LEARNING = 0.27
-#: Part of the steps in which surfels of thin objects are learned with their materials.
-JOINT = 0.5
 #: Fainter surfels do not come into the asset.
 UNSEEN = 0.05
 
@@ -330,13 +328,6 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, thin: bool, rep
         work.on_progress(Progress("materials", 0.7 + _LEARNING * at.part, count, at.psnr))
 
     rest = tell, work.cancelled, work.file("materials")
-    if settings.joint is None:
-        if thin and work.backend is not CPU and work.settings.variant == "p":
-            log.info(
-                "thin objects learn surfels with their materials on the CPU alone: on the card they stay; "
-                "decoupling.joint = %g learns them, on the CPU", JOINT,
-            )  # fmt: skip
-        settings = replace(settings, joint=JOINT if thin and work.backend is CPU else 0.0)
     if settings.joint and work.settings.variant == "p":
         if work.backend is not CPU:
             log.warning("decoupling.joint: surfels, materials and light are learned on the CPU, not on the card")

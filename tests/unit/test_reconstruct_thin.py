@@ -76,7 +76,7 @@ def test_surfels_of_thin_things_are_shaded_by_their_own_normals(thin, monkeypatc
     learn = pipeline.decouple
     monkeypatch.setattr(pipeline, "is_thin", lambda *_: thin)
     monkeypatch.setattr(pipeline, "decouple", lambda *given: told.append(given[-2:]) or learn(*given))
-    asset = reconstruct(balls(), replace(QUICK, decoupling=replace(QUICK.decoupling, joint=0.0)))
+    asset = reconstruct(balls(), QUICK)
     assert asset.provenance["report"]["thin"] is thin
     [(normals, start)] = told
     assert (normals is not None) is thin  # learned with them, too
@@ -98,7 +98,7 @@ def test_surfels_of_thin_things_are_learned_with_materials_of_their_own_where_as
 
     monkeypatch.setattr(pipeline, "is_thin", lambda *_: True)
     monkeypatch.setattr(pipeline, "decouple_jointly", learn)
-    settings = QUICK if asked else replace(QUICK, decoupling=replace(QUICK.decoupling, joint=0.0))
+    settings = replace(QUICK, decoupling=replace(QUICK.decoupling, joint=0.5)) if asked else QUICK
     asset = reconstruct(balls(), settings)
     assert len(shapes) == asked
     if asked:
@@ -118,7 +118,7 @@ def test_a_card_does_not_learn_surfels_with_materials_and_says_so(monkeypatch, c
         learn = getattr(pipeline, name)
         monkeypatch.setattr(pipeline, name, lambda *given, name=name, learn=learn: used.append(name) or learn(*given))
     monkeypatch.setattr(pipeline, "select_backend", lambda _: LearningBackend())
-    for joint in (None, 0.5):
+    for joint in (0.0, 0.5):
         reconstruct(balls(), replace(QUICK, decoupling=replace(QUICK.decoupling, joint=joint)))
     assert used == ["decouple", "decouple_jointly"]
     assert "decoupling.joint: surfels, materials and light are learned on the CPU" in caplog.text

@@ -140,7 +140,7 @@ class JointJob(Job):
 
     def step(self) -> None:
         """One step of the optimiser."""
-        if self._own is None and self.schedule.part >= 1 - (self._settings.joint or 0.0):
+        if self._own is None and self.schedule.part >= 1 - self._settings.joint:
             self._begin()
         super().step()
 

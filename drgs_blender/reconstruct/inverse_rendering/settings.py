@@ -78,11 +78,10 @@ class Settings:
         Also learn an offset of each vertex normal, held by `normal_smoothness`.
     normal_smoothness : float
         Weight of the squared differences of these offsets along edges, as `smoothness` more on finer meshes.
-    joint : float, optional
+    joint : float
         Last part of the steps in which the surfels are learned, too, with materials of their own (the paper's way), on
-        the CPU; 0: they stay as they are, and materials are learned on the mesh; 1: from the first step on. None: .5
-        of thin objects on the CPU, which gain, else 0; of solid ones normals mostly gain, relit pictures on the mean
-        nothing.
+        the CPU; 0: they stay as they are, and materials are learned on the mesh; 1: from the first step on. Views left
+        out and normals mostly gain, relit pictures and albedo do not.
     exposure : bool
         Also learn the brightness of every photograph.
     most_pixels : int
@@ -119,7 +118,7 @@ class Settings:
     parametrisation: Literal["metallic", "specular", "dielectric"] = "metallic"
     normals: bool = False
     normal_smoothness: Weight = 0.3
-    joint: Annotated[float | None, Range(0.0, 1.0)] = None
+    joint: Part = 0.0
     exposure: bool = False
     most_pixels: Annotated[int, Range(1, 1 << 31)] = 2_000_000
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
