@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
+import logging
 import shutil
 from collections.abc import Iterator
 from functools import partial
@@ -15,12 +15,14 @@ import numpy as np
 from PIL import Image as Pillow
 
 from ..core.asset.archive import replace_by, replace_file
-from ..core.errors import UsageError, WriteError
+from ..core.errors import UsageError, WriteError, first_of
 from ..core.file_lock import FileLock
 from ..reconstruct.readers.layout import decode_mask
 from .pictures import FOLDERS, MASKS, Picture, write_picture
 from .registration import Registration
 from .report import draw_cameras, write_report
+
+logger = logging.getLogger(__name__)
 
 #: Files of a finished capture; the last is written last.
 REPORT, DRAWING, POINTS, CAMERAS = "capture.json", "capture.png", "sparse_points.ply", "transforms.json"
@@ -82,7 +84,7 @@ def open_folder(folder: Path) -> Iterator[Path]:
         if not free:
             raise UsageError(str(folder), "is being made by another process", "Wait for it, or choose another folder")
         yield work
-    if os.name == "nt" and complete(folder):  # where a file that is open cannot be removed
+    if work.exists() and complete(folder):  # Windows and network drives cannot remove a file that is open
         shutil.rmtree(work, ignore_errors=True)
 
 
@@ -95,10 +97,14 @@ def keep_work(work: Path, key: str) -> None:
     """Empty the folder of work unless it is that of the same `key`: the same pictures, prepared in the same way."""
     mark = work / INPUTS
     if mark.is_file() and mark.read_text(encoding="utf-8") == key:
+        logger.warning("%s: going on with what an earlier run of the same pictures has done", work)
         return
+    mark.unlink(missing_ok=True)  # first: what is left after a kill belongs to nothing
     for old in work.iterdir():
         if old.name != LOCK:
             remove(old)
+    if left := sorted(old.name for old in work.iterdir() if old.name != LOCK):
+        raise WriteError(str(work), f"cannot be emptied ({first_of(left)})", "Remove it, or choose another folder")
     replace_file(mark, [key.encode()])
 
 

@@ -48,8 +48,6 @@ def run(args: argparse.Namespace) -> int:
     tell_unused(reading, args.input, calibrated=False)
     settings = capture_settings(reading, masks)
     work = args.out / WORK
-    if (work / INPUTS).is_file() and not args.quiet:
-        emit(f"an earlier run was stopped: going on with {work}, where it is of these pictures\n", sys.stderr)
     with interruptible() as cancelled, FractionBar(args, "capturing", every=WORK_SECONDS) as bar:
         try:
             made = make_capture(args.input, args.out, settings, bar, cancelled)

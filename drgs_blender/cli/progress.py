@@ -118,7 +118,7 @@ class FractionBar:
 
 def _counted(phase: str, fraction: float) -> str:
     """The phase and how far it is, which some say themselves ("3 of 12")."""
-    return phase if " of " in phase else f"{phase}, {min(fraction, 1.0):.0%}"
+    return phase if " of " in phase else f"{phase}, {min(fraction, 1.0):.0%} of all"
 
 
 def prepare_engine(args: argparse.Namespace, *jobs: str) -> None:

@@ -347,11 +347,13 @@ def clear(folder: Path, made: Path) -> None:
 
     Of runs that were killed as they wrote a state or what they had `made`, half of it as well.
     """
-    old = time.time() - _WRITTEN_WITHIN
-    halves = [file for file in made.parent.glob(f".{glob.escape(made.name)}.*.tmp") if file.stat().st_mtime < old]
-    for file in (*folder.glob("*.state"), *folder.glob(".*.state.*.tmp"), *halves):
+    for file in (*folder.glob("*.state"), *folder.glob(".*.state.*.tmp")):
         with contextlib.suppress(OSError):
             file.unlink()
+    for file in made.parent.glob(f".{glob.escape(made.name)}.*.tmp"):
+        with contextlib.suppress(OSError):
+            if file.stat().st_mtime < time.time() - _WRITTEN_WITHIN:
+                file.unlink()
     _remove_if_empty(folder)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -29,9 +30,8 @@ COMPARED_PASSES = ("Combined", "Depth", "Normal", "Albedo", "Roughness", "Metall
 Distance = Callable[[Array, Array], float]
 #: By name; None where it is not computed.
 Distances = dict[str, Distance | None]
-#: Spacing of the points of the true mesh that carry others, in parts of its extent, and their number along an edge at
-#: most.
-_SPACING, _MOST_PARTS = 0.01, 100
+#: Spacing of the points of the true mesh that carry others, in parts of its extent, and their number at most.
+_SPACING, _MOST_POINTS = 0.01, 300_000
 #: Called with the part done and what is rendered.
 Progress = Callable[[float, str], None]
 #: Where files of pictures go: (name of the set, number of the view, ours and the true one, encoded).
@@ -137,7 +137,7 @@ def _warn_of_known(asset: Asset, capture: Capture) -> None:
 
 
 def surface_points(vertices: Array, faces: Array, spacing: float) -> tuple[Array, Array]:
-    """Points of a mesh no farther apart than `spacing`: its corners, and a lattice in faces that are larger.
+    """Points of a mesh: its corners, and on its faces one to each square of `spacing`, as many as `_MOST_POINTS`.
 
     Where faces are large, as on flat sides, corners alone say little of how the surface between them moves.
 
@@ -150,21 +150,25 @@ def surface_points(vertices: Array, faces: Array, spacing: float) -> tuple[Array
 
     Examples
     --------
-    >>> corners, shares = surface_points(np.eye(3), np.array([[0, 1, 2]]), 0.8)
-    >>> shares[3:].tolist()
-    [[0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]]
+    >>> corners, shares = surface_points(np.eye(3), np.array([[0, 1, 2]]), 0.5)
+    >>> len(corners), bool(np.allclose(shares.sum(axis=1), 1))
+    (7, True)
     """
-    edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
-    parts = np.ceil(np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0) / spacing).astype(int).clip(1, _MOST_PARTS)
+    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).astype(np.float64)
+    end = np.cumsum(area)
+    total = float(end[-1]) if len(end) else 0.0
+    count = min(math.ceil(total / spacing**2), _MOST_POINTS)
+    # As evenly over the faces as over each, by two additive sequences (Roberts 2018).
+    number = np.arange(count)
+    on = faces[np.searchsorted(end, (number + 0.5) * total / max(count, 1))]
+    u, v = (0.5 + number * step for step in (0.7548776662466927, 0.5698402909980532))
+    u, v = u % 1, v % 1
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     used = np.unique(faces)
-    corners, shares = [np.repeat(used[:, None], 3, axis=1)], [np.tile((1.0, 0.0, 0.0), (len(used), 1))]
-    for count in np.unique(parts[parts > 1]):
-        lattice = np.array([(i, j, count - i - j) for i in range(count + 1) for j in range(count + 1 - i)]) / count
-        lattice = lattice[lattice.max(axis=1) < 1]
-        large = faces[parts == count]
-        corners.append(np.repeat(large, len(lattice), axis=0))
-        shares.append(np.tile(lattice, (len(large), 1)))
-    return np.concatenate(corners), np.concatenate(shares)
+    corners = np.concatenate([np.repeat(used[:, None], 3, axis=1), on])
+    shares = np.concatenate([np.tile((1.0, 0.0, 0.0), (len(used), 1)), np.stack([1 - u - v, u, v], 1)])
+    return corners, shares
 
 
 def posed_vertices(asset: Asset, truth: Truth) -> Array:

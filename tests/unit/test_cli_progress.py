@@ -63,7 +63,7 @@ def test_without_a_terminal_long_work_says_how_far_it_is(capsys):
         assert capsys.readouterr().err.splitlines() == said
     with FractionBar(options(), "capturing", every=60.0) as bar:
         bar("matching features", 0.4)
-    assert capsys.readouterr().err.splitlines() == ["drgs: matching features, 40%"]
+    assert capsys.readouterr().err.splitlines() == ["drgs: matching features, 40% of all"]
 
 
 def test_programs_read_it_with_its_fraction(capsys, monkeypatch):

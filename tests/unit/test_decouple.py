@@ -451,8 +451,9 @@ def test_what_is_brighter_than_white_tells_materials_and_light(ball, capture):
         views = []
         for view in capture.views:
             linear = exposure * srgb_to_linear(view.colour)
-            above = np.maximum(linear - 1, 0) if keeps else None
-            views.append(replace(view, colour=linear_to_srgb(np.clip(linear, 0, 1)), above_white=above))
+            above = np.maximum(linear - 1, 0) if keeps and linear.max() > 1 else None
+            colour = linear_to_srgb(np.clip(linear, 0, 1))
+            views.append(replace(view, colour=colour, above_white=above, linear=keeps))
         settings = Settings(iterations=250, pixels=512, environment=16, smoothness=0.002, seed=3)
         found = decouple(replace(capture, views=views), ball, settings)
         scale = (found.albedo * ball.albedo).sum(0) / (found.albedo**2).sum(0)

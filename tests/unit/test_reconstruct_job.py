@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -144,7 +145,7 @@ def test_materials_and_light_come_with_the_asset(capture, tmp_path):
     colour = np.einsum("nk,nkc->nc", shares, asset.mesh.albedo[corners])
     assert 0 < np.abs(asset.surfels.albedo - colour).mean() < 0.5 * asset.mesh.albedo.std()
     # It is shaded by what was learned on the mesh, not by its own normal, which 60 steps have hardly turned.
-    assert np.median(asset.binding.normal[:, 2]) > 0.95
+    assert np.median(asset.binding.normal[:, 2]) > 0.95 and asset.binding.normal[:, 2].min() > 0.4
 
 
 @pytest.mark.slow
@@ -159,6 +160,26 @@ def test_a_run_that_is_stopped_after_its_materials_learns_none_again(capture, tm
         asset = reconstruct(capture, short, told.append, folder=tmp_path)
     assert first > 0 and "materials: going on at step 6" in caplog.text and told[-1].part == 1.0
     assert asset.provenance["report"]["steps"]["materials"] == [6, 6]
+
+
+def test_surfels_of_too_few_steps_are_called_rough(capture, caplog):
+    short = Settings(
+        schedule=replace(QUICK, iterations=500, surfels=300), mesh_resolution=24, materials=False, minutes=1e-3
+    )
+    reconstruct(capture, short)
+    assert re.search(r"surfels got \d+ of 500 steps in their part of 0.001 minutes", caplog.text)
+
+
+@pytest.mark.slow
+def test_surfels_on_the_mesh_take_what_blends_to_it_as_well(capture):
+    quick = Decoupling(iterations=6, pixels=64, cosine=2, ggx=2, light=2, environment=8, normals=True)
+    schedule = replace(QUICK, iterations=20, surfels=500)
+    asset = reconstruct(capture, Settings(schedule=schedule, mesh_resolution=24, decoupling=quick, variant="m"))
+    colour = np.einsum(
+        "nk,nkc->nc", clamp_weights(asset.binding.barycentric), asset.mesh.albedo[asset.mesh.faces[asset.binding.face]]
+    )
+    assert 0 < np.abs(asset.surfels.albedo - colour).mean() < 0.1
+    assert np.isfinite(asset.binding.normal).all() and asset.binding.normal[:, 2].min() > 0.3
 
 
 def test_materials_of_too_few_steps_are_called_unreliable(capture, caplog):

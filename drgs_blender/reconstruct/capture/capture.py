@@ -32,6 +32,8 @@ class View:
     turn : (3, 3) float64 array, optional
         Rotation of world directions to those in which the light stands still (`turntable`); None: it does so in the
         world.
+    linear : bool
+        The picture's file holds linear floats (EXR, merged brackets): their scale says nothing.
     """
 
     name: str
@@ -42,6 +44,7 @@ class View:
     normals: Array | None = None
     above_white: Array | None = None
     turn: Array | None = None
+    linear: bool = False
 
 
 @dataclass(slots=True)

@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 DEFAULT = Settings()
 #: Steps between two tables of light sampling, between two reports, and seconds between two checkpoints.
 _AIM, _REPORT, _SAVE = 25, 25, 20.0
-#: Photographs that end at white were exposed for it, unless their mean is less than so much of `Settings.brightness`.
+#: Photographs in display values were exposed for white, unless their mean is less than so much of `brightness`.
 _DARKEST = 0.2
 
 
@@ -386,7 +386,7 @@ def _gain(capture: Capture, mean: float, brightness: float) -> float:
 
     Dark objects have dark photographs, rightly: one brightness for all took 3.6 dB of albedo from a bright one.
     """
-    if any(view.above_white is not None for view in capture.training):
+    if any(view.linear for view in capture.training):
         return brightness / max(mean, 1e-6)
     return max(1.0, _DARKEST * brightness / max(mean, 1e-6))
 

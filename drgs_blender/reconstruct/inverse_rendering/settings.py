@@ -42,9 +42,9 @@ class Settings:
         Also learn materials on this many nested grids of cells, which carry what many pixels agree on quickly. Where
         edges are shorter than 1/200 of the mesh, on one more for each halving.
     brightness : float
-        Mean of the linear colours that photographs with values above white are brought to, as their scale says nothing
-        and weights of losses belong to one. Others count as they were exposed, but for those darker than a fifth of it.
-        Larger: photographs count for more.
+        Mean of the linear colours that photographs of linear floats (EXR, merged brackets) are brought to, as their
+        scale says nothing and weights of losses belong to one. Others count as they were exposed, but for those darker
+        than a fifth of it. Larger: photographs count for more.
     smoothness : float
         Weight of the differences of materials along edges, less where the photographs differ; where edges are shorter
         than 1/200 of the mesh, as many times more, at most 8.
@@ -80,8 +80,8 @@ class Settings:
         Weight of the squared differences of these offsets along edges, as `smoothness` more on finer meshes.
     joint : float
         Last part of the steps in which the surfels are learned, too, with materials of their own (the paper's way), on
-        the CPU; 0: they stay as they are, and materials are learned on the mesh; 1: from the first step on. Views left
-        out and normals mostly gain, relit pictures and albedo do not.
+        the CPU; 0: they stay as they are, and materials are learned on the mesh; 1: from the first step on. Normals and
+        views left out gain on some objects, relit pictures and albedo do not.
     exposure : bool
         Also learn the brightness of every photograph.
     most_pixels : int

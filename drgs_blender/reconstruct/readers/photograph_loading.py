@@ -104,7 +104,8 @@ def load_photograph(
     colour = np.ascontiguousarray(np.clip(colour, 0, 1), np.float32)
     mask = None if mask is None else np.ascontiguousarray(mask, np.float32)
     above = None if above is None else np.ascontiguousarray(layers[..., -3:], np.float32)
-    return View(photograph.name, camera, colour, mask, photograph.test, above_white=above)
+    linear = stored.dtype.kind == "f"
+    return View(photograph.name, camera, colour, mask, photograph.test, above_white=above, linear=linear)
 
 
 def _fitting(lens: Lens, width: int, height: int, subject: str) -> Lens:

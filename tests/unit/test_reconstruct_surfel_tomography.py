@@ -12,7 +12,7 @@ from capture_cases import balls  # noqa: E402
 
 from drgs_blender.geometry.normals import unit  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.pixels import pixels_of  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.surfel_values import blended_as  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.surfel_tomography import blended_as  # noqa: E402
 from drgs_blender.reconstruct.model.gaussians import Gaussians  # noqa: E402
 from drgs_blender.render.scene.triangle_bvh import TriangleBVH  # noqa: E402
 
@@ -82,3 +82,11 @@ def test_surfels_that_are_not_drawn_keep_theirs_and_hide_nothing(gaussians, mesh
     kept = gaussians.select(np.flatnonzero(visible))
     before = lacking(kept, start[visible], mesh, values, views)
     assert lacking(kept, found[visible], mesh, values, views) < 0.9 * before
+
+
+def test_no_round_is_begun_that_time_does_not_allow(gaussians, mesh, views):
+    values, start = striped(mesh.vertices), striped(gaussians.centres().detach().numpy())
+    told: list[float] = []
+    visible = np.ones(len(start), bool)
+    found = blended_as(gaussians, visible, start, mesh, values, views, told.append, seconds=1e-6)
+    assert len(told) == len(views) and max(told) < 0.25 and not np.array_equal(found, start)

@@ -8,6 +8,7 @@ views. Taken view by view (SART) the last ones are shown best, and views left ou
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -38,6 +39,7 @@ def blended_as(
     values: Array,
     views: list[View],
     tell: Callable[[float], None] = lambda _: None,
+    seconds: float | None = None,
 ) -> Array:
     """Values of surfels, so that views of them show those of the mesh's vertices.
 
@@ -57,6 +59,8 @@ def blended_as(
         Their cameras and masks say where the surface is seen, their photographs do not matter.
     tell : callable
         Called before each view with the part that is done; what it raises ends it.
+    seconds : float, optional
+        Of the wall clock: after the first round no other is begun that would take longer.
 
     Returns
     -------
@@ -73,7 +77,10 @@ def blended_as(
     generator = np.random.default_rng(0)
     found = torch.from_numpy(np.asarray(start, np.float32).copy())
     count = min(len(cut), _VIEWS)
+    began = time.monotonic()
     for sweep in range(_SWEEPS):
+        if seconds is not None and sweep and (time.monotonic() - began) * (sweep + 1) > seconds * sweep:
+            break
         lack, parts = torch.zeros_like(found), torch.zeros(len(found), 1)
         for done, k in enumerate(generator.permutation(len(cut))[:count]):
             tell((sweep + done / count) / _SWEEPS)
