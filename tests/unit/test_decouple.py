@@ -27,7 +27,7 @@ from drgs_blender.reconstruct.inverse_rendering.materials import Materials, from
 from drgs_blender.reconstruct.inverse_rendering.pixels import foreground_pixels  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.radiance_cache import edges_of, radiance_cache  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.regularisers import Regularisers, fineness  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.run import Decoupled, Progress, decouple  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.run import Decoupled, Progress, _gain, decouple  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.surface import SurfaceSamples  # noqa: E402
 from drgs_blender.render.integrator.integrate import integrate as kernel_integrate  # noqa: E402
@@ -459,6 +459,14 @@ def test_what_is_brighter_than_white_tells_materials_and_light(ball, capture):
         scale = (found.albedo * ball.albedo).sum(0) / (found.albedo**2).sum(0)
         errors.append(np.sqrt(((found.albedo * scale - ball.albedo) ** 2).mean()))
     assert errors[1] == pytest.approx(errors[0], rel=0.02) and errors[2] > 1.5 * errors[1]
+
+
+def test_only_pictures_whose_scale_says_nothing_are_brought_to_one_brightness(capture):
+    linear = replace(capture, views=[replace(view, linear=True) for view in capture.views])
+    for mean in (1e-3, 0.3, 40.0):
+        assert _gain(linear, mean, 0.12) * mean == pytest.approx(0.12)
+    assert _gain(capture, 0.05, 0.12) == _gain(capture, 0.3, 0.12) == 1.0
+    assert _gain(capture, 1e-3, 0.12) * 1e-3 == pytest.approx(0.2 * 0.12)  # darker than anybody would photograph it
 
 
 @pytest.mark.slow
