@@ -20,7 +20,7 @@ from ..core.errors import Cancelled, WriteError, first_of
 from ..core.frame import Camera
 from ..deform.binding import bind
 from ..deform.mesh_driven import MeshDriven
-from ..geometry.normals import VertexNormals, unit
+from ..geometry.normals import VertexNormals
 from . import checkpoint
 from .backend import CPU
 from .capture.capture import Capture
@@ -29,7 +29,7 @@ from .held_out import held_out_metrics, preview
 from .inverse_rendering.joint import LearnedSurfels, decouple_jointly
 from .inverse_rendering.run import Decoupled, decouple
 from .inverse_rendering.run import Progress as MaterialProgress
-from .inverse_rendering.surfel_tomography import blended_as
+from .inverse_rendering.surfel_tomography import blended_as, bounded
 from .jit_warmup import warm_up
 from .meshing.depth_fusion import MOST, fuse, grid, voxels_that_fit
 from .meshing.normal_integration import blended, follow_normals, shaded_by, shaded_by_own
@@ -55,8 +55,6 @@ SURFEL_TIME_FRACTION, MESH_SURFEL_TIME_FRACTION = 0.45, 0.15
 MATERIAL_TIME_FRACTION = 0.35
 #: Part of the time budget in which surfels take what blends to the mesh.
 BLEND_TIME_FRACTION = 0.05
-#: Least cosine between a surfel's shading normal and that of the mesh where it hangs.
-LEAST_COSINE = 0.8
 #: Voxels where none are asked for and each face gets a surfel, or time decides.
 FEW_VOXELS = 256
 #: Fewer views than this leave the shape open between them.
@@ -388,9 +386,7 @@ def _show_the_mesh(
     surfels.albedo = found[:, :3].clip(0, 1)
     if normals is None:
         return binding
-    there, turned = unit(start[visible][:, 3:]), unit(found[:, 3:])
-    alike = (there * turned).sum(axis=1, keepdims=True) > LEAST_COSINE  # else it makes up for others alone
-    return shaded_by(binding, mesh, np.where(alike, turned, there))
+    return shaded_by(binding, mesh, bounded(found[:, 3:], start[visible][:, 3:]))
 
 
 def _visible_surfels(gaussians: Gaussians, visible: Array) -> Surfels:

@@ -16,6 +16,7 @@ import torch
 
 from ...core.arrays import Array
 from ...core.asset.model import Mesh
+from ...geometry.normals import unit
 from ...render.scene.triangle_bvh import TriangleBVH
 from ..capture.capture import View
 from ..meshing.crops import cropped_views
@@ -27,6 +28,8 @@ from .pixels import pixels_of
 _SWEEPS, _VIEWS, _RELAXATION = 4, 40, 0.5
 #: Pixels that are covered less show other things.
 _COVERED = 0.5
+#: Least cosine between a surfel's normal and that of the mesh where it hangs: a farther one makes up for others alone.
+_LEAST_COSINE = 0.8
 #: Logit of an opacity that cannot be seen.
 _INVISIBLE = -30.0
 
@@ -100,3 +103,15 @@ def blended_as(
         # Of surfels that are hardly seen a little at a time: what their few pixels lack is of others as well.
         found += _RELAXATION * lack / parts.clamp(min=1.0)
     return found.numpy()
+
+
+def bounded(normals: Array, there: Array) -> Array:
+    """Unit `normals` (n, 3) where they are within 37 degrees of `there`, those of the mesh, else these.
+
+    Examples
+    --------
+    >>> bounded(np.array([[0, 0.6, 1.0], [0, 2.0, 1.0]]), np.array([[0, 0, 2.0], [0, 0, 2.0]])).round(2).tolist()
+    [[0.0, 0.51, 0.86], [0.0, 0.0, 1.0]]
+    """
+    normals, there = unit(normals), unit(there)
+    return np.where((normals * there).sum(axis=1, keepdims=True) > _LEAST_COSINE, normals, there)
