@@ -12,11 +12,12 @@ rows are kept, so that captures may be measured one by one.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from bench_evaluate import mean, score
@@ -49,27 +50,17 @@ RAYS: dict[str, tuple[bool, Any]] = {
 }
 
 
-@contextmanager
-def values_of_where_they_hang() -> Iterator[None]:
-    """Let surfels take the values of the points where they hang, which their blend blurs."""
-    known = pipeline.blended_as
-    pipeline.blended_as = lambda gaussians, visible, start, *rest: start
-    try:
-        yield
-    finally:
-        pipeline.blended_as = known
-
-
 def ways(capture: Capture, folder: Path, truth: Truth, name: str, options: argparse.Namespace) -> None:
     """Measure and write the ways of stage (ii)."""
     rows: dict[str, Any] = {}
+    blurred = patch.object(pipeline, "blended_as", lambda gaussians, visible, start, *rest: start)
     for way in options.ways:
         label, joint = WAYS[way]
         settings = Settings()
         settings = replace(settings, decoupling=replace(settings.decoupling, iterations=options.steps, joint=joint))
         surfels = learned(capture, name)  # joint learning moves them
         begun = processor_seconds()
-        with same_surfels(surfels), values_of_where_they_hang() if way == "blurred" else nullcontext():
+        with same_surfels(surfels), blurred if way == "blurred" else nullcontext():
             asset = pipeline.reconstruct(capture, settings)
         spent, path = processor_seconds() - begun, FOLDER / f"{name}-{way}.drgs"
         write_asset(path, asset)

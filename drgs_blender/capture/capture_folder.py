@@ -63,6 +63,8 @@ def check_folder(folder: Path, source: Path) -> None:
 def open_folder(folder: Path) -> Iterator[Path]:
     """Make the folder of a capture for this process alone; what it gives is the folder of work in it.
 
+    That goes where the capture is complete.
+
     Raises
     ------
     UsageError
@@ -84,7 +86,7 @@ def open_folder(folder: Path) -> Iterator[Path]:
         if not free:
             raise UsageError(str(folder), "is being made by another process", "Wait for it, or choose another folder")
         yield work
-    if work.exists() and complete(folder):  # Windows and network drives cannot remove a file that is open
+    if complete(folder):  # not before: Windows and network drives cannot remove a file that is open
         shutil.rmtree(work, ignore_errors=True)
 
 

@@ -125,7 +125,6 @@ def _make(source: Path, folder: Path, work: Path, film: Path | None, given: list
     """`make_capture` in a folder that is open."""
     digest = pictures.digest(given, settings)
     if capture_folder.complete(folder, digest):
-        shutil.rmtree(work, ignore_errors=True)
         return Made(folder, 0, 0, {}, "", 0.0, kept=True, lines=[f"{folder}: is made of the same pictures already"])
     capture_folder.keep_work(work, work_key(given, settings))
     if film is not None:
@@ -177,7 +176,6 @@ def _make(source: Path, folder: Path, work: Path, film: Path | None, given: list
         }
     said = [f"{source.name}: {made.lines[0]}", *made.lines[1:]]
     capture_folder.write_capture(folder, by_file, found, said, more, alignment.guessed)
-    shutil.rmtree(work, ignore_errors=True)
     return made
 
 

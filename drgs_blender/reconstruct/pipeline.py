@@ -376,7 +376,7 @@ def _show_the_mesh(
             raise Cancelled
         work.on_progress(Progress("materials", 0.7 + _LEARNING + (0.3 - _LEARNING) * part, len(surfels)))
 
-    for name in BASE_CHANNELS:
+    for name in ("roughness", "metallic"):
         setattr(surfels, name, np.clip(blended(binding, mesh, getattr(mesh, name)), 0, 1).astype(np.float32))
     values = mesh.albedo if normals is None else np.hstack([mesh.albedo, normals])
     start = np.zeros((len(visible), values.shape[1]), np.float32)

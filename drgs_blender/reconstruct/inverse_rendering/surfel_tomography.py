@@ -8,11 +8,13 @@ views. Taken view by view (SART) the last ones are shown best, and views left ou
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ...core.arrays import Array
 from ...core.asset.model import Mesh
@@ -77,6 +79,14 @@ def blended_as(
         tensor.requires_grad_(False)
     still.parameters["opacity"][torch.from_numpy(~visible)] = _INVISIBLE
     cut = cropped_views(views, mesh.vertices)
+
+    @functools.cache
+    def wanted_of(k: int) -> tuple[Tensor, Tensor]:
+        """Pixels of a view that see the mesh, and what they see."""
+        pixels = pixels_of(k, cut[k], mesh, tree)
+        shown = np.einsum("nk,nkc->nc", pixels.corners, values[mesh.faces[pixels.face]]).astype(np.float32)
+        return torch.from_numpy(pixels.place.astype(np.int64)), torch.from_numpy(shown)
+
     generator = np.random.default_rng(0)
     found = torch.from_numpy(np.asarray(start, np.float32).copy())
     count = min(len(cut), _VIEWS)
@@ -87,16 +97,14 @@ def blended_as(
         lack, parts = torch.zeros_like(found), torch.zeros(len(found), 1)
         for done, k in enumerate(generator.permutation(len(cut))[:count]):
             tell((sweep + done / count) / _SWEEPS)
-            pixels = pixels_of(k, cut[k], mesh, tree)
-            wanted = np.einsum("nk,nkc->nc", pixels.corners, values[mesh.faces[pixels.face]]).astype(np.float32)
+            place, wanted = wanted_of(k)
             # One more column, of zeros: its slope is the sum of a surfel's parts in all pixels.
             columns = torch.cat([found, torch.zeros(len(found), 1)], 1).requires_grad_(True)
             shown = still.render(cut[k].camera, torch.zeros(3), 0, reflections=False, materials=columns)
             assert shown.materials is not None
-            place = torch.from_numpy(pixels.place.astype(np.int64))
             alpha = shown.maps.alpha.detach().flatten()[place][:, None]
             blend = shown.materials.flatten(0, 1)[place] / alpha.clamp(min=_COVERED)
-            weight = torch.cat([torch.from_numpy(wanted) - blend.detach()[:, :-1], torch.ones_like(alpha)], 1)
+            weight = torch.cat([wanted - blend.detach()[:, :-1], torch.ones_like(alpha)], 1)
             (slope,) = torch.autograd.grad((blend * weight * (alpha > _COVERED)).sum(), columns)
             lack += slope[:, :-1]
             parts += slope[:, -1:]
