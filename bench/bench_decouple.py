@@ -22,7 +22,8 @@ from report import OUT, ROOT, processor_seconds, store_row, table, write_section
 
 from drgs_blender.core.asset import Mesh
 from drgs_blender.core.color import srgb_to_linear
-from drgs_blender.reconstruct.inverse_rendering.run import Decoupled, decouple
+from drgs_blender.reconstruct.inverse_rendering.decoupled import Decoupled
+from drgs_blender.reconstruct.inverse_rendering.run import decouple
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings
 
 FOLDER = OUT / "decouple"

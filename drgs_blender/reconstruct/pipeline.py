@@ -20,15 +20,15 @@ from ..core.errors import Cancelled, WriteError, first_of
 from ..core.frame import Camera
 from ..deform.binding import bind
 from ..deform.mesh_driven import MeshDriven
-from ..geometry.normals import VertexNormals
 from . import checkpoint
 from .backend import CPU
 from .capture.capture import Capture
 from .gpu.select_backend import select_backend
 from .held_out import held_out_metrics, preview
+from .inverse_rendering.decoupled import Decoupled
+from .inverse_rendering.decoupled import Progress as MaterialProgress
 from .inverse_rendering.joint import LearnedSurfels, decouple_jointly
-from .inverse_rendering.run import Decoupled, decouple
-from .inverse_rendering.run import Progress as MaterialProgress
+from .inverse_rendering.run import decouple
 from .inverse_rendering.surfel_tomography import blended_as, bounded
 from .jit_warmup import warm_up
 from .meshing.depth_fusion import MOST, fuse, grid, voxels_that_fit
@@ -160,21 +160,20 @@ def reconstruct(
     binding: Binding | None = None
     if settings.variant == "m":
         final, binding = _on_mesh(work, mesh, free, region, report)
-    found, shape, thin = None, None, False
+    found, own = None, None
     if settings.materials:
         # Surfels on the mesh have its normals.
-        thin = report["thin"] = settings.variant == "p" and is_thin(final, mesh, capture.training)
+        report["thin"] = settings.variant == "p" and is_thin(final, mesh, capture.training)
         fused = functools.partial(mesh_of, capture=capture, region=region, resolution=voxels)
-        found = _decoupled(work, mesh, LearnedSurfels(final, settings.schedule, region.radius, fused), thin, report)
-        if (shape := found.shape) is not None:
-            mesh, final, report["mesh"] = shape.mesh, shape.gaussians, shape.fusion
-    smooth = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
+        found = _decoupled(work, mesh, LearnedSurfels(final, settings.schedule, region.radius, fused), report)
+        if (own := found.surfels) is not None and own.mesh is not None:
+            mesh, final, report["mesh"] = own.mesh, own.gaussians, own.fusion
     report |= held_out_metrics(final, capture)
     visible = final.opacities().detach().numpy() >= UNSEEN
     surfels = _visible_surfels(final, visible)
     if found is not None:
         mesh = replace(mesh, albedo=found.albedo, roughness=found.roughness, metallic=found.metallic)
-        if settings.decoupling.normals:
+        if settings.decoupling.normals and found.normals is not None:
             mesh.vertices = follow_normals(mesh, found.normals)
     if binding is None:
         binding, report["binding"] = bind(mesh, surfels)
@@ -185,14 +184,12 @@ def reconstruct(
     if found is None:
         report["vertices_without_surfels"] = surfels_to_vertices(mesh, surfels, binding)
     else:
-        if thin or shape is not None:
-            turns = found.normals - smooth if shape is None else np.zeros_like(smooth)
-            binding = shaded_by_own(binding, mesh, surfels, turns)
-        if shape is None:
-            normals = found.normals if settings.decoupling.normals and not thin else None
+        if own is None:
+            normals = found.normals if settings.decoupling.normals else None
             binding = _show_the_mesh(work, final, visible, surfels, mesh, binding, normals)
         else:
-            surfels = replace(surfels, **{name: getattr(shape, name)[visible] for name in BASE_CHANNELS})
+            binding = shaded_by_own(binding, mesh, own.normals[visible])
+            surfels = replace(surfels, **{name: getattr(own, name)[visible] for name in BASE_CHANNELS})
         environment, origin = Environment(found.environment), "separated from the lighting"
         done, of = report["steps"]["materials"]
         if _are_few(done, of):
@@ -317,25 +314,26 @@ def _on_mesh(
     return final, bound(binding, final)  # type: ignore[arg-type]
 
 
-def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, thin: bool, report: dict[str, Any]) -> Decoupled:
-    """Materials, normals and light; the shape, too, where it is learned with them."""
-    settings, shown, start = work.settings.decoupling, normals_of(surfels.gaussians), None
-    if settings.normals and work.settings.variant == "p" and not thin:
-        start = with_surfel_normals(mesh, work.capture.training, shown)
+def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, report: dict[str, Any]) -> Decoupled:
+    """Materials, normals and light, of thin things on the surfels; the shape, too, where it is learned with them."""
+    settings, free, thin, start = work.settings.decoupling, work.settings.variant == "p", report["thin"], None
+    if settings.normals and free and not thin:
+        start = with_surfel_normals(mesh, work.capture.training, normals_of(surfels.gaussians))
     if (seconds := work.seconds(MATERIAL_TIME_FRACTION)) is not None:
         settings = replace(settings, seconds=seconds)
-    own, count = shown if thin else None, len(surfels.gaussians)
+    count = len(surfels.gaussians)
 
     def tell(at: MaterialProgress) -> None:
         work.on_progress(Progress("materials", 0.7 + _LEARNING * at.part, count, at.psnr))
 
     rest = tell, work.cancelled, work.file("materials")
-    if settings.joint and work.settings.variant == "p":
+    if settings.joint and free:
         if work.backend is not CPU:
             log.warning("decoupling.joint: surfels, materials and light are learned on the CPU, not on the card")
-        found = decouple_jointly(work.capture, mesh, surfels, settings, *rest, own, start)
+        found = decouple_jointly(work.capture, mesh, surfels, settings, *rest, thin, start)
     else:
-        found = decouple(work.capture, mesh, settings, *rest, work.backend, own, start)
+        own = surfels.gaussians if thin else None
+        found = decouple(work.capture, mesh, settings, *rest, work.backend, start, own)
     done, of = work.steps["materials"] = [found.report["iterations"], work.settings.decoupling.iterations]
     if _are_few(done, of):
         minutes = work.settings.minutes

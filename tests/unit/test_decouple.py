@@ -17,17 +17,19 @@ from drgs_blender.core.asset.model import PosedSurfels  # noqa: E402
 from drgs_blender.core.color import linear_to_srgb, srgb_to_linear  # noqa: E402
 from drgs_blender.core.errors import Cancelled, UsageError  # noqa: E402
 from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World  # noqa: E402
-from drgs_blender.geometry.normals import VertexNormals  # noqa: E402
+from drgs_blender.geometry.normals import VertexNormals, unit  # noqa: E402
 from drgs_blender.reconstruct.capture.capture import Capture, View  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.decoupled import Decoupled, Progress  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.domain import mesh_domain  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.environment import LearnedLight, colour_cast  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.estimator import Points  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.gatherer import Gatherer  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.losses import blotches, dullness, log_loss, unbiased_loss  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.materials import Materials, from_specular  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.pixels import foreground_pixels  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.pixels import pixels_of  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.radiance_cache import edges_of, radiance_cache  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.regularisers import Regularisers, fineness  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.run import Decoupled, Progress, _gain, decouple  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.run import _gain, decouple  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.surface import SurfaceSamples  # noqa: E402
 from drgs_blender.render.integrator.integrate import integrate as kernel_integrate  # noqa: E402
@@ -36,7 +38,6 @@ from drgs_blender.render.pipeline import render  # noqa: E402
 from drgs_blender.render.prepared_scene import PreparedScene  # noqa: E402
 from drgs_blender.render.reference.integrate import EmptyTracer, SurfacePoints, integrate_quadrature  # noqa: E402
 from drgs_blender.render.reference.light import Light  # noqa: E402
-from drgs_blender.render.reference.raster import camera_rays, pixel_centres  # noqa: E402
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene  # noqa: E402
 from drgs_blender.render.scene.triangle_bvh import TriangleBVH  # noqa: E402
 from drgs_blender.render.shading_points import ShadingPoints  # noqa: E402
@@ -284,7 +285,7 @@ def test_pixels_beside_clipped_ones_are_known_by_channel_and_count_less(ball, ca
     colour[np.asarray(view.mask) == 0] = 1.0
     tree = TriangleBVH()
     tree.build(ball.vertices, ball.faces)
-    pixels = foreground_pixels([replace(view, colour=colour)], ball, tree, 10**6)
+    pixels = pixels_of(0, replace(view, colour=colour), ball, tree)
     assert int((pixels.colour[:, 0] > 0.9).sum()) == 1
     assert pixels.next_to_clipped.sum(axis=0).tolist() == [12, 0, 0]  # the disc of radius 2, without its middle
     assert not pixels.next_to_clipped[pixels.colour[:, 0] > 0.9].any()
@@ -292,7 +293,7 @@ def test_pixels_beside_clipped_ones_are_known_by_channel_and_count_less(ball, ca
 
     # A picture that has values above white does not clip at it.
     above = np.where(colour == 1, np.float32(2.5), np.float32(0))
-    pixels = foreground_pixels([replace(view, colour=colour, above_white=above)], ball, tree, 10**6)
+    pixels = pixels_of(0, replace(view, colour=colour, above_white=above), ball, tree)
     assert not pixels.clipped.any() and not pixels.next_to_clipped.any()
     assert pixels.colour.max() == pytest.approx(3.5)
 
@@ -621,15 +622,14 @@ def test_a_damaged_or_foreign_checkpoint_is_not_used(ball, capture, tmp_path, ca
 
 
 def test_cache_shows_what_was_photographed(ball, capture):
-    tree = TriangleBVH()
-    tree.build(ball.vertices, ball.faces)
-    pixels = foreground_pixels(capture.views, ball, tree, 10**6)
+    domain = mesh_domain(capture, ball, SMALL)
+    pixels = domain.pixels
     constant = replace(pixels, colour=np.full((len(pixels), 3), 0.3, np.float32))
-    harmonics, weight = radiance_cache(constant, ball)
+    harmonics, weight = radiance_cache(constant, len(ball.vertices), domain.edges)
     assert harmonics[:, 0] * 0.28209479 == pytest.approx(0.3, abs=0.02)  # those that no photograph shows as well
     assert (weight == 0).any()
     assert abs(harmonics[weight > 3, 1:]).max() < 0.05
-    few = foreground_pixels(capture.views, ball, tree, 140)
+    few = mesh_domain(capture, ball, replace(SMALL, most_pixels=140)).pixels
     assert len(few) == 140 and set(few.view) == set(range(14))
 
 
@@ -655,41 +655,13 @@ def test_normals_are_turned_towards_the_true_ones_once_light_is_known(ball, capt
     assert decouple(capture, wrong, replace(settings, iterations=3)).normals == pytest.approx(smooth, abs=1e-6)
 
 
-@pytest.mark.slow
-def test_normals_that_others_tell_stand_in_for_those_of_a_poor_mesh(ball, capture):
-    """A ball with bumps that the photographed one has not; who tells knows the ball. Nonsense is not believed."""
-    bumps = 1 + 0.1 * np.sin(6 * ball.vertices).prod(axis=1, keepdims=True)
-    wrong = replace(ball, vertices=(ball.vertices * bumps).astype(np.float32))
-    settings = replace(SMALL, iterations=100, pixels=512, environment=16, coarse=3)
-
-    def of_ball(view: View) -> np.ndarray:
-        origin, rays = (a.numpy() for a in camera_rays(view.camera, pixel_centres(view.camera)))
-        rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        along = -(origin * rays).sum(1)
-        depth = along - np.sqrt(np.maximum(1 - (origin**2).sum(1) + along**2, 0))
-        return (3 * (origin + depth[:, None] * rays)).reshape(*view.colour.shape)
-
-    without = decouple(capture, wrong, settings)
-    told = decouple(capture, wrong, settings, normals=of_ball)
-    assert told.report["psnr"] > without.report["psnr"] + 0.3
-    assert np.array_equal(told.normals, without.normals)  # of the mesh
-    turned = replace(settings, iterations=30, normals=True)
-    plain = arrays(decouple(capture, wrong, turned))
-    for factor in (-1.0, 0.0):
-        nonsense = arrays(decouple(capture, wrong, turned, normals=lambda view, factor=factor: factor * of_ball(view)))
-        assert all(np.array_equal(a, b) for a, b in zip(nonsense, plain, strict=True)), factor
-    learned = decouple(capture, wrong, turned, normals=of_ball)
-    assert np.abs(learned.normals - told.normals).max() > 1e-3  # what is learned is added to them
-
-
 def test_a_checkpoint_of_other_normals_is_not_gone_on_from(ball, capture, tmp_path, caplog):
     steps = iter(range(9))
     with pytest.raises(Cancelled):
         decouple(capture, ball, SMALL, cancelled=lambda: next(steps) == 5, checkpoint=tmp_path / "a.state")
-    up = np.float32([0, 0, 1])
     with caplog.at_level("INFO"):
         decouple(
-            capture, ball, SMALL, checkpoint=tmp_path / "a.state", normals=lambda view: np.zeros_like(view.colour) + up
+            capture, ball, SMALL, checkpoint=tmp_path / "a.state", start=unit(ball.vertices + np.float32([0, 0, 1]))
         )
     assert "going on" not in caplog.text
 
@@ -707,7 +679,7 @@ def test_bad_input_is_named(ball, capture):
     with pytest.raises(UsageError, match="no training view"):
         decouple(Capture(Path("x"), []), ball, SMALL)
     away = [replace(view, mask=np.zeros_like(view.mask)) for view in capture.views]
-    with pytest.raises(UsageError, match="none of its 14 training views sees the mesh"):
+    with pytest.raises(UsageError, match="none of its 14 training views sees the object"):
         decouple(replace(capture, views=away), ball, SMALL)
     small = [replace(view, colour=view.colour[:-1]) for view in capture.views]
     with pytest.raises(UsageError, match="32 x 31 pixels"):

@@ -14,12 +14,15 @@ pytest.importorskip("skimage")
 
 from drgs_blender.core.errors import Cancelled  # noqa: E402
 from drgs_blender.geometry.normals import unit  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering import joint  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering import joint, surfel_domain  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.decoupled import Decoupled  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.domain import mesh_domain  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.joint import JointJob, LearnedSurfels, decouple_jointly  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.materials import levels  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.regularisers import fineness  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.run import Decoupled, decouple  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.run import decouple  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.surfel_domain import carried  # noqa: E402
 from drgs_blender.reconstruct.model.gaussians import Gaussians  # noqa: E402
 from drgs_blender.reconstruct.optim.schedule import Schedule  # noqa: E402
 from drgs_blender.reconstruct.settings import Settings as Run  # noqa: E402
@@ -47,12 +50,12 @@ def surfels(mesh) -> LearnedSurfels:
 
 
 def job_of(capture, mesh, settings: Settings) -> JointJob:
-    return JointJob(capture, mesh, surfels(mesh), settings, None, None, None, lambda: 0.0)
+    return JointJob(capture, mesh_domain(capture, mesh, settings), mesh, surfels(mesh), settings, None, lambda: 0.0)
 
 
 def arrays(found: Decoupled) -> list[np.ndarray]:
-    assert found.shape is not None
-    shape = found.shape
+    assert found.surfels is not None
+    shape = found.surfels
     own = [shape.albedo, shape.roughness, shape.metallic, *shape.gaussians.arrays().values()]
     return [found.albedo, found.roughness, found.metallic, found.environment, found.normals, *own]
 
@@ -72,15 +75,15 @@ def test_what_is_blended_beside_colours_is_the_mean_of_the_surfels(mesh, capture
 def test_surfels_are_learned_in_the_last_part_alone(mesh, capture):
     start = {name: values.copy() for name, values in surfels(mesh).gaussians.arrays().items()}
     frozen = decouple(capture, mesh, replace(SMALL, joint=0.0))
-    assert frozen.shape is None
+    assert frozen.surfels is None
     found = decouple_jointly(capture, mesh, surfels(mesh), SMALL)
-    moved = found.shape.gaussians.arrays()
+    moved = found.surfels.gaussians.arrays()
     assert all(np.abs(moved[name] - start[name]).max() > 1e-5 for name in ("centre", "rotation", "scale", "opacity"))
     assert np.linalg.norm(moved["centre"] - start["centre"], axis=1).max() < 0.02
     assert found.report["iterations"] == 8 and found.albedo.shape == mesh.vertices.shape
-    assert len(found.shape.albedo) == len(found.shape.gaussians) and found.shape.albedo.std() > 0.01
+    assert len(found.surfels.albedo) == len(found.surfels.gaussians) and found.surfels.albedo.std() > 0.01
     never = decouple_jointly(capture, mesh, surfels(mesh), replace(SMALL, iterations=1, joint=0.1))
-    assert never.shape is None
+    assert never.surfels is None
 
 
 def test_surfels_begin_with_the_materials_of_the_mesh(mesh, capture):
@@ -88,7 +91,7 @@ def test_surfels_begin_with_the_materials_of_the_mesh(mesh, capture):
     settings = replace(SMALL, iterations=30, joint=0.05)
     found = decouple_jointly(capture, mesh, surfels(mesh), settings)
     before = decouple(capture, mesh, replace(settings, joint=0.0))
-    assert np.abs(found.shape.albedo - before.albedo).mean() < 0.02 < before.albedo.std()
+    assert np.abs(found.surfels.albedo - before.albedo).mean() < 0.02 < before.albedo.std()
 
 
 def test_the_loss_of_lit_pixels_turns_surfels(mesh, capture):
@@ -97,7 +100,7 @@ def test_the_loss_of_lit_pixels_turns_surfels(mesh, capture):
     for count in (4, 8):
         settings = replace(SMALL, joint=1.0, iterations=3, cosine=count)
         found = decouple_jointly(capture, mesh, surfels(mesh), settings)
-        turned.append(found.shape.gaussians.arrays()["rotation"])
+        turned.append(found.surfels.gaussians.arrays()["rotation"])
     assert not np.array_equal(*turned)
 
 
@@ -187,10 +190,11 @@ def test_materials_are_carried_by_parts_of_the_photographs(mesh, capture, monkey
     monkeypatch.setattr(Gaussians, "render", lambda self, camera, *rest, **named: (
         drawn.append(camera.width * camera.height) or render(self, camera, *rest, **named)))  # fmt: skip
     with torch.no_grad():
-        parts = job._carried(mesh, gaussians)
+        columns = job._columns().numpy()
+        parts = carried(columns, mesh, gaussians, capture.training)
         fewer = sum(drawn)
-        monkeypatch.setattr(joint, "cropped_views", lambda views, _: views)
-        whole = job._carried(mesh, gaussians)
+        monkeypatch.setattr(surfel_domain, "cropped_views", lambda views, _: views)
+        whole = carried(columns, mesh, gaussians, capture.training)
     assert fewer < 0.6 * (sum(drawn) - fewer)
     for a, b in zip(parts, whole, strict=True):
         assert a == pytest.approx(b, abs=1e-4)

@@ -54,7 +54,7 @@ def lacking(gaussians: Gaussians, columns: np.ndarray, mesh, values: np.ndarray,
             drawn = gaussians.render(view.camera, torch.zeros(3), 0, reflections=False, materials=torch.tensor(columns))
         alpha = drawn.maps.alpha.flatten()[pixels.place].numpy()
         shown = drawn.materials.flatten(0, 1)[pixels.place].numpy() / alpha[:, None]
-        true = np.einsum("nk,nkc->nc", pixels.corners, values[mesh.faces[pixels.face]])
+        true = pixels.blended(values)
         squares.append(((shown - true) ** 2)[alpha > 0.5])
     return float(np.sqrt(np.concatenate(squares).mean()))
 

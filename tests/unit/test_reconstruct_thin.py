@@ -72,15 +72,9 @@ def test_what_surfels_show_faces_the_viewer(views):
 
 @pytest.mark.parametrize("thin", [True, False])
 def test_surfels_of_thin_things_are_shaded_by_their_own_normals(thin, monkeypatch):
-    told = []
-    learn = pipeline.decouple
     monkeypatch.setattr(pipeline, "is_thin", lambda *_: thin)
-    monkeypatch.setattr(pipeline, "decouple", lambda *given: told.append(given[-2:]) or learn(*given))
     asset = reconstruct(balls(), QUICK)
     assert asset.provenance["report"]["thin"] is thin
-    [(normals, start)] = told
-    assert (normals is not None) is thin  # learned with them, too
-    assert (start is None) is thin  # else with the mean of theirs and the mesh's
     own = rotation_matrices(asset.surfels.rotation.astype(np.float64))[..., 2]
     driven = pipeline.MeshDriven(asset.mesh, asset.surfels, asset.binding).pose(asset.mesh.vertices)
     cosine = np.abs((own * driven.normal).sum(axis=1))
@@ -93,7 +87,7 @@ def test_surfels_of_thin_things_are_learned_with_materials_of_their_own_where_as
 
     def learn(*given):
         found = together(*given)
-        shapes.append(found.shape)
+        shapes.append(found.surfels)
         return found
 
     monkeypatch.setattr(pipeline, "is_thin", lambda *_: True)

@@ -1,9 +1,9 @@
 """Joint learning, the paper's inverse rendering: surfels, materials of their own and light are learned together.
 
-After a first part on the mesh (`run.Job`), each step renders one photograph's view. The surfels' radiance is held to
-the photograph as in stage (i), with its losses of shape; of some pixels the blended normals and materials of the
-surfels are lit as the mesh was before, and that loss moves surfels, materials and light. Rays meet the mesh of stage
-(i); a last one is fused from the surfels as they are at the end.
+After a first part on the mesh, or on the surfels as they are (`run.Job`), each step renders one photograph's view. The
+surfels' radiance is held to the photograph as in stage (i), with its losses of shape; of some pixels the blended
+normals and materials of the surfels are lit as before, and that loss moves surfels, materials and light. Rays meet the
+mesh of stage (i), of thin things the sheets of its surfels; a last mesh is fused from the surfels at the end.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ...core.asset.model import Mesh
@@ -26,11 +25,10 @@ from ...core.errors import UsageError
 from ...deform.binding import bind, clamp_weights
 from ...render.gbuffer.surfels import ALIKE
 from ...render.reference.brdf import dot, normalise
-from ...render.scene.triangle_bvh import TriangleBVH
 from ..backend import CPU
 from ..capture.capture import Capture
 from ..capture.training_views import background_of, full_targets
-from ..meshing.crops import corner_of, cropped_views
+from ..meshing.crops import corner_of
 from ..meshing.surfel_normals import with_surfel_normals
 from ..model.gaussians import SH0, Gaussians, RenderedView
 from ..model.thin_structures import normals_of
@@ -38,20 +36,20 @@ from ..optim.adam import Adam
 from ..optim.learner import Learner
 from ..optim.schedule import Schedule as SurfelSchedule
 from .blend import blend
+from .decoupled import Decoupled, DecoupledSurfels, Progress
+from .domain import Domain
 from .likeness import LikePoints
 from .materials import Materials, levels
-from .pixels import Normals, Pixels, pixels_of
-from .radiance_cache import filled
+from .pixels import Pixels
 from .regularisers import Regularisers, fineness
-from .run import Decoupled, Job, Progress, Shape, learned
+from .run import Job, domain_of, learned
 from .settings import Settings
 from .surface import Pairs, SurfaceSamples
+from .surfel_domain import carried, neighbours
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
 
-#: Neighbours of a surfel along which its materials are smooth, and the least cosine between their planes.
-_NEIGHBOURS, _COPLANAR = 6, 0.5
 #: What is learned on the mesh and with surfels alike.
 _SHARED = ("exposure", "light")
 #: Part of the schedule of stage (i) at which surfels go on: its step sizes at the end.
@@ -90,7 +88,7 @@ def decouple_jointly(
     on_progress: Callable[[Progress], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
     checkpoint: Path | None = None,
-    normals: Normals | None = None,
+    thin: bool = False,
     start: Array | None = None,
     now: Callable[[], float] = time.monotonic,
 ) -> Decoupled:
@@ -105,16 +103,18 @@ def decouple_jointly(
     on_progress : callable, optional
     cancelled : callable, optional
     checkpoint : Path, optional
-    normals : callable, optional
+    thin : bool
+        The first part is on the surfels as they are.
     start : (v, 3) float32 array, optional
     now : callable
 
     Returns
     -------
     Decoupled
-        Of `Decoupled.shape`, the surfels and the mesh as they came out.
+        With `Decoupled.surfels`, its mesh among them.
     """
-    job = JointJob(capture, mesh, surfels, settings, checkpoint, normals, start, now)
+    domain = domain_of(capture, mesh, settings, start, surfels.gaussians if thin else None)
+    job = JointJob(capture, domain, mesh, surfels, settings, checkpoint, now)
     return learned(job, on_progress, cancelled)
 
 
@@ -128,12 +128,12 @@ class JointJob(Job):
     """
 
     def __init__(
-        self, capture: Capture, mesh: Mesh, surfels: LearnedSurfels, settings: Settings, checkpoint: Path | None,
-        normals: Normals | None, start: Array | None, now: Callable[[], float],
+        self, capture: Capture, domain: Domain, mesh: Mesh, surfels: LearnedSurfels, settings: Settings,
+        checkpoint: Path | None, now: Callable[[], float],
     ) -> None:  # fmt: skip
         #: Materials of the surfels, once they are learned.
         self._own: Materials | None = None
-        super().__init__(capture, mesh, settings, checkpoint, CPU, normals, start, now)
+        super().__init__(capture, domain, mesh, settings, checkpoint, CPU, now)
         self._fused = surfels.fused
         background = torch.tensor(background_of(capture), dtype=torch.float32)
         self.learner = Learner(surfels.gaussians, surfels.schedule, surfels.radius, background, CPU)
@@ -149,18 +149,21 @@ class JointJob(Job):
         gaussians, settings = self.learner.gaussians, self._settings
         surfels = gaussians.surfels()
         assert surfels.sh is not None
-        edges = _neighbours(surfels.centre, gaussians.frames()[2])
+        edges = neighbours(surfels.centre, gaussians.frames()[2])
         finer = fineness(surfels.centre, edges)
         own = Materials(surfels.centre, settings.parametrisation, levels(settings.coarse, finer))
-        binding, _ = bind(self._mesh, surfels)
         with torch.no_grad():
-            known = self.surface.materials.at(torch.arange(len(self._mesh.vertices)))
-            corners = torch.from_numpy(self._mesh.faces[binding.face].astype(np.int64))
-            shares = torch.from_numpy(clamp_weights(binding.barycentric).astype(np.float32))
-            own.begin(blend(known, corners, shares))
-            if self._shown is not None:
-                shown = blend(torch.from_numpy(self._shown), corners, shares).numpy()
-                self._like = LikePoints(shown, surfels.centre, settings.seed)
+            known = self.surface.materials.at(torch.arange(len(self._domain.points)))
+            if self._domain.surfels is not None:
+                own.begin(known)
+            else:
+                binding, _ = bind(self._mesh, surfels)
+                corners = torch.from_numpy(self._mesh.faces[binding.face].astype(np.int64))
+                shares = torch.from_numpy(clamp_weights(binding.barycentric).astype(np.float32))
+                own.begin(blend(known, corners, shares))
+                if self._shown is not None:
+                    shown = blend(torch.from_numpy(self._shown), corners, shares).numpy()
+                    self._like = LikePoints(shown, surfels.centre, settings.seed)
         colours = srgb_to_linear(np.clip(0.5 + SH0 * surfels.sh[:, 0], 0, 1))
         self._regularisers = Regularisers(edges, colours, settings, finer)
         # Light and exposures go on; moments that begin at 0 need a count of steps that does, too.
@@ -259,27 +262,12 @@ class JointJob(Job):
         gaussians, views = self.learner.gaussians, self._capture.training
         mesh, fusion = self._fused(gaussians)
         with torch.no_grad():
-            columns, weight = self._carried(mesh, gaussians)
-            known = weight > 1e-3
-            own = np.column_stack(self._own.described(torch.from_numpy(columns)))
-            values = np.clip(filled(own, known, mesh), 0, 1)
-        found = self._found(values, with_surfel_normals(mesh, views, normals_of(gaussians)), known)
-        found.shape = Shape(mesh, fusion, gaussians, *self._own.values())
+            columns, known = carried(self._columns().numpy(), mesh, gaussians, views)
+            values = np.column_stack(self._own.described(torch.from_numpy(columns)))
+        found = self._found(values, known, with_surfel_normals(mesh, views, normals_of(gaussians)))
+        normals = gaussians.frames()[2].astype(np.float32)
+        found.surfels = DecoupledSurfels(gaussians, *self._own.values(), normals, mesh, fusion)
         return found
-
-    def _carried(self, mesh: Mesh, gaussians: Gaussians) -> tuple[Array, Array]:
-        """Columns (v, c) of the vertices of `mesh`, means of what the views show of surfels, and their weight (v,)."""
-        tree = TriangleBVH()
-        tree.build(mesh.vertices, mesh.faces)
-        columns = self._columns()
-        total = np.zeros((len(mesh.vertices), columns.shape[1] + 1))
-        for k, view in enumerate(cropped_views(self._capture.training, mesh.vertices)):
-            pixels = pixels_of(k, view, mesh, tree)
-            shown = gaussians.render(view.camera, torch.zeros(3), 0, reflections=False, materials=columns)
-            assert shown.materials is not None
-            maps = torch.cat([shown.materials, shown.maps.alpha[..., None]], 2)
-            total += pixels.onto_vertices(maps.flatten(0, 1).numpy()[pixels.place], mesh.faces, len(total))
-        return (total[:, :-1] / np.maximum(total[:, -1:], 1e-9)).astype(np.float32), total[:, -1]
 
     def _state(self) -> dict[str, Array]:
         state = super()._state()
@@ -298,11 +286,3 @@ class JointJob(Job):
             # Both were made for the first of these steps.
             self.learner.iteration = self._adam_of_own.steps = int(iteration)
         super()._restore(state)
-
-
-def _neighbours(centres: Array, normals: Array) -> Array:
-    """Pairs (e, 2) of surfels that lie side by side on one surface, each once."""
-    _, near = cKDTree(centres).query(centres, min(_NEIGHBOURS + 1, len(centres)))
-    pairs = np.stack([np.repeat(np.arange(len(centres)), near.shape[1] - 1), near[:, 1:].ravel()], 1)
-    coplanar = np.abs(np.einsum("nc,nc->n", normals[pairs[:, 0]], normals[pairs[:, 1]])) > _COPLANAR
-    return np.unique(np.sort(pairs[coplanar], axis=1), axis=0).astype(np.int64)

@@ -11,7 +11,6 @@ import torch
 from scipy.spatial import cKDTree
 
 from ...core.arrays import Array
-from ...core.asset.model import Mesh
 from .pixels import Pixels
 from .radiance_cache import filled
 from .surface import Pairs
@@ -26,21 +25,20 @@ _KNEE = 0.02
 _ANCHORS, _NEAREST, _PAIRS = 4096, 12, 4096
 
 
-def features(pixels: Pixels, mesh: Mesh) -> Array:
-    """Features of the vertices in units of differences that count.
+def features(pixels: Pixels, count: int, edges: Array) -> Array:
+    """Features of `count` points in units of differences that count.
 
     Returns
     -------
     (v, 4) float32 array
-        Chromaticity (two), log brightness, score; vertices that no photograph shows take the mean of their
-        neighbours', in turn.
+        Chromaticity (two), log brightness, score; points that no photograph shows take the mean of their
+        neighbours along `edges` (e, 2), in turn.
     """
-    count = len(mesh.vertices)
-    corner, share = mesh.faces[pixels.face].reshape(-1), pixels.corners.reshape(-1)
-    log = np.repeat(np.log(pixels.colour.mean(axis=1) + _KNEE), 3)
+    corner, share, each = pixels.index.reshape(-1), pixels.share.reshape(-1), pixels.index.shape[1]
+    log = np.repeat(np.log(pixels.colour.mean(axis=1) + _KNEE), each)
     order = np.lexsort((log, corner))
     corner, share, log = corner[order], share[order].clip(1e-6), log[order, None]
-    colour = np.repeat(pixels.colour, 3, axis=0)[order]
+    colour = np.repeat(pixels.colour, each, axis=0)[order]
     total = np.bincount(corner, share, count)
     before = np.cumsum(share, dtype=np.float64) - 0.5 * share - (np.cumsum(total) - total)[corner]
     place = before / total[corner]
@@ -55,7 +53,7 @@ def features(pixels: Pixels, mesh: Mesh) -> Array:
     chroma = dark / np.maximum(dark.sum(axis=1, keepdims=True), 1e-4)
     score = at(_HIGH, log) - at(_LOW, log)
     found = np.column_stack([chroma[:, :2] / _CHROMA, at(_DARK, log) / _BRIGHTNESS, score / _SCORE])
-    return filled(found, total > 1e-3, mesh)
+    return filled(found, total > 1e-3, edges)
 
 
 class LikePoints:

@@ -12,11 +12,11 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from ...core.asset.model import Mesh
 from ...core.color import srgb_to_linear
 from ...core.errors import UsageError
-from ...geometry.normals import unit
 from ...render.reference.raster import camera_rays, pixel_centres
 from ...render.scene.triangle_bvh import TriangleBVH
-from ..capture.capture import View
+from ..capture.capture import Capture, View
 from .losses import CLIPPED
+from .settings import Settings
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
@@ -42,13 +42,14 @@ class Pixels:
         Index among the training views.
     place : (n,) int32 array
         Index in the view's picture, row by row.
-    face : (n,) int32 array
-    corners : (n, 3) float32 array
-        Barycentric coordinates on the face.
+    index : (n, k) int32 array
+        What carries materials there: the vertices of a face, or the surfels that are seen.
+    share : (n, k) float32 array
+        Of each of them, together 1: barycentric coordinates, or how much of the pixel it covers.
     origin : (n, 3) float32 array
-        World: the point on the mesh.
+        World: where rays start.
     flat : (n, 3) float32 array
-        Unit: normal of the face.
+        Unit: geometric normal.
     towards : (n, 3) float32 array
         Unit: to the viewer.
     colour : (n, 3) float32 array
@@ -57,21 +58,18 @@ class Pixels:
         The light may have been any stronger.
     next_to_clipped : (n, 3) bool array
         Not clipped, but a pixel of the object `_BESIDE` away or nearer is, in this channel.
-    detail_normal : (n, 3) float32 array
-        Unit normal of finer detail than the mesh, facing the viewer; 0 where there is none.
     """
 
     view: Array
     place: Array
-    face: Array
-    corners: Array
+    index: Array
+    share: Array
     origin: Array
     flat: Array
     towards: Array
     colour: Array
     clipped: Array
     next_to_clipped: Array
-    detail_normal: Array
 
     def __len__(self) -> int:
         return len(self.view)
@@ -80,59 +78,92 @@ class Pixels:
         """The pixels at `index`."""
         return Pixels(**{f.name: np.ascontiguousarray(getattr(self, f.name)[index]) for f in fields(self)})
 
-    def onto_vertices(self, values: Array, faces: Array, count: int) -> Array:
-        """Sums (count, c) at vertices of what the pixels show (n, c), by share and by how squarely they see it."""
-        weight = self.corners * (self.flat * self.towards).sum(axis=1, keepdims=True)
-        corner = faces[self.face].ravel()
-        return np.stack([np.bincount(corner, (weight * column[:, None]).ravel(), count) for column in values.T], 1)
+    def usable(self) -> Array:
+        """Rows of those that face the viewer and have a colour."""
+        return np.flatnonzero(((self.flat * self.towards).sum(1) > _GRAZING) & np.isfinite(self.colour).all(1))
+
+    def blended(self, values: Array) -> Array:
+        """(n, c) of the pixels, from `values` (v, c) of what they show."""
+        return np.einsum("nk,nkc->nc", self.share, values[self.index])
+
+    def onto(self, values: Array, count: int) -> Array:
+        """Sums (count, c) at what the pixels show of `values` (n, c), by share and by how squarely they see it."""
+        weight = self.share * (self.flat * self.towards).sum(axis=1, keepdims=True)
+        row = self.index.ravel()
+        return np.stack([np.bincount(row, (weight * column[:, None]).ravel(), count) for column in values.T], 1)
 
 
-def foreground_pixels(
-    views: list[View], mesh: Mesh, tree: TriangleBVH, most: int, seed: int = 0, normals: Normals | None = None
-) -> Pixels:
-    """The pixels of `views` that see the mesh, a pixel away from its outline and the mask's.
+def of_training_views(capture: Capture, settings: Settings, of: Callable[[int, View], Pixels]) -> Pixels:
+    """The foreground pixels of all training views, evenly chosen where there are more than settings allow.
 
     Parameters
     ----------
-    views : list of View
-    mesh : Mesh
-    tree : TriangleBVH
-        Of the mesh's triangles.
-    most : int
-        Keep this many, evenly chosen.
-    seed : int
-    normals : callable, optional
-        Normals other than the mesh's; see `Pixels.detail_normal`.
+    capture : Capture
+    settings : Settings
+    of : callable
+        Gives those of one view and its number.
 
     Raises
     ------
     UsageError
-        When no pixel sees the mesh.
+        Settings out of range; no training view; no pixel sees the object.
     """
-    generator = np.random.default_rng(seed)
-    share = max(1, most // max(1, len(views)))
+    settings.check()
+    views = capture.training
+    if not views:
+        raise UsageError(str(capture.source), "has no training view", "Leave fewer views out for the test")
+    generator = np.random.default_rng(settings.seed)
+    share = max(1, settings.most_pixels // len(views))
     parts, empty = [], []
     for index, view in enumerate(views):
-        part = pixels_of(index, view, mesh, tree, normals)
+        part = of(index, view)
         if not len(part):
             empty.append(view.name)
         elif len(part) > share:
             part = part.select(np.sort(generator.choice(len(part), share, replace=False)))
         parts.append(part)
     if empty and len(empty) < len(views):
-        log.warning("%d of %d views do not see the mesh, such as %s", len(empty), len(views), empty[0])
+        log.warning("%d of %d views do not see the object, such as %s", len(empty), len(views), empty[0])
     pixels = Pixels(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Pixels)})
     if not len(pixels):
         raise UsageError(
             "capture",
-            f"none of its {len(views)} training views sees the mesh",
+            f"none of its {len(views)} training views sees the object",
             "Check that cameras and mesh share one space, and that the masks are not empty",
         )
     return pixels
 
 
-def pixels_of(index: int, view: View, mesh: Mesh, tree: TriangleBVH, normals: Normals | None = None) -> Pixels:
-    """The foreground pixels of one view, the `index`-th; see `foreground_pixels`."""
+def pixels_of(index: int, view: View, mesh: Mesh, tree: TriangleBVH) -> Pixels:
+    """The pixels of one view, the `index`-th, that see the mesh, a pixel away from its outline and the mask's."""
+    check_size(view)
+    height, width = view.colour.shape[:2]
+    origin, direction = (a.numpy().astype(np.float32) for a in camera_rays(view.camera, pixel_centres(view.camera)))
+    t, face, u, v = tree.intersect(origin, direction, tnear=view.camera.clip_start, tfar=view.camera.clip_end)
+    seen = (face >= 0).reshape(height, width) & within_mask(view)
+    row = np.flatnonzero(binary_erosion(seen, border_value=1) if min(seen.shape) > 2 else seen)
+    t, face, u, v, origin, direction = t[row], face[row], u[row], v[row], origin[row], direction[row]
+
+    corners = mesh.vertices[mesh.faces[face]]
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
+    towards = -direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    part = Pixels(
+        np.full(len(row), index, np.int32),
+        row.astype(np.int32),
+        mesh.faces[face].astype(np.int32),
+        np.stack([1 - u - v, u, v], -1),
+        origin + t[:, None] * direction,
+        flat,
+        towards,
+        *photographed(view, seen, row),
+    )
+    # A face seen from behind is an error of the mesh, or of its orientation: nothing can be learned there.
+    return part.select(part.usable())
+
+
+def check_size(view: View) -> None:
+    """Raise UsageError where the picture of a view is not of its camera's size."""
     height, width = view.colour.shape[:2]
     x0, y0, x1, y1 = view.camera.window
     if (height, width) != (y1 - y0, x1 - x0):
@@ -141,39 +172,22 @@ def pixels_of(index: int, view: View, mesh: Mesh, tree: TriangleBVH, normals: No
             f"its picture has {width} x {height} pixels, its camera {x1 - x0} x {y1 - y0}",
             "Give each picture the camera of its own size",
         )
-    origin, direction = (a.numpy().astype(np.float32) for a in camera_rays(view.camera, pixel_centres(view.camera)))
-    t, face, u, v = tree.intersect(origin, direction, tnear=view.camera.clip_start, tfar=view.camera.clip_end)
-    seen = (face >= 0).reshape(height, width)
-    if view.mask is not None:
-        seen &= np.asarray(view.mask).reshape(height, width) >= _INSIDE
-    row = np.flatnonzero(binary_erosion(seen, border_value=1) if min(seen.shape) > 2 else seen)
-    t, face, u, v, origin, direction = t[row], face[row], u[row], v[row], origin[row], direction[row]
 
-    corners = mesh.vertices[mesh.faces[face]]
-    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
-    towards = -direction / np.linalg.norm(direction, axis=1, keepdims=True)
+
+def within_mask(view: View) -> Array:
+    """(h, w) bool: pixels that show nothing but the object."""
+    size = view.colour.shape[:2]
+    return np.ones(size, bool) if view.mask is None else np.asarray(view.mask).reshape(size) >= _INSIDE
+
+
+def photographed(view: View, seen: Array, row: Array) -> tuple[Array, Array, Array]:
+    """`Pixels.colour`, `clipped` and `next_to_clipped` of the pixels `row` (n,), those of the object `seen` (h, w)."""
     colour = srgb_to_linear(view.colour)
     clipped = colour >= CLIPPED if view.above_white is None else np.zeros(colour.shape, bool)
     if view.above_white is not None:
         colour = colour + view.above_white
-    given = None if normals is None else np.asarray(normals(view), np.float32)
-    part = Pixels(
-        np.full(len(row), index, np.int32),
-        row.astype(np.int32),
-        face,
-        np.stack([1 - u - v, u, v], -1),
-        origin + t[:, None] * direction,
-        flat,
-        towards,
-        colour.reshape(-1, 3)[row],
-        clipped.reshape(-1, 3)[row],
-        _beside(seen[..., None] & clipped)[row],
-        np.zeros_like(flat) if given is None else unit(given.reshape(-1, 3)[row], (0, 0, 0)),
-    )
-    # A face seen from behind is an error of the mesh, or of its orientation: nothing can be learned there.
-    usable = ((flat * towards).sum(1) > _GRAZING) & np.isfinite(part.colour).all(1)
-    return part.select(np.flatnonzero(usable))
+    beside = _beside(seen[..., None] & clipped)
+    return colour.reshape(-1, 3)[row], clipped.reshape(-1, 3)[row], beside[row]
 
 
 def _beside(clipped: Array) -> Array:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 
-from ...core.asset.model import Mesh
 from ...formats.harmonics import basis
 from .pixels import Pixels
 
@@ -26,25 +25,24 @@ def edges_of(faces: Array) -> Array:
     return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
 
 
-def adjacency(faces: Array, count: int) -> csr_matrix:
-    """(count, count) ones where an edge connects two vertices."""
-    edges = edges_of(faces)
+def adjacency(edges: Array, count: int) -> csr_matrix:
+    """(count, count) ones where one of `edges` (e, 2) connects two points."""
     both = np.concatenate([edges, edges[:, ::-1]])
     return coo_matrix((np.ones(len(both), np.float32), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
 
 
-def radiance_cache(pixels: Pixels, mesh: Mesh) -> tuple[Array, Array]:
-    """Outgoing radiance of each vertex by least squares over the pixels around it.
+def radiance_cache(pixels: Pixels, count: int, edges: Array) -> tuple[Array, Array]:
+    """Outgoing radiance of `count` points by least squares over the pixels that show them.
 
     Returns
     -------
     harmonics : (v, 4, 3) float32 array
-        Linear Rec.709: coefficients of ``formats.harmonics.basis``; vertices that no photograph shows take the mean of
-        their neighbours, in turn.
+        Linear Rec.709: coefficients of ``formats.harmonics.basis``; points that no photograph shows take the mean of
+        their neighbours along `edges` (e, 2), in turn.
     weight : (v,) float32 array
-        How many pixels show a vertex.
+        How many pixels show a point.
     """
-    count, terms = len(mesh.vertices), (DEGREE + 1) ** 2
+    terms = (DEGREE + 1) ** 2
     upper = [(i, j) for i in range(terms) for j in range(i, terms)]
     total = np.zeros((count, len(upper) + 3 * terms + 1))
     for first in range(0, len(pixels), _BLOCK):
@@ -52,26 +50,26 @@ def radiance_cache(pixels: Pixels, mesh: Mesh) -> tuple[Array, Array]:
         y = basis(pixels.towards[part], DEGREE)
         products = [y[:, i] * y[:, j] for i, j in upper]
         values = (y[:, :, None] * pixels.colour[part, None, :]).reshape(len(y), -1)
-        corner = mesh.faces[pixels.face[part]].reshape(-1)
-        row = np.repeat(np.arange(len(y)), 3)
-        spread = coo_matrix((pixels.corners[part].reshape(-1), (corner, row)), shape=(count, len(y))).tocsr()
+        point = pixels.index[part].reshape(-1)
+        row = np.repeat(np.arange(len(y)), pixels.index.shape[1])
+        spread = coo_matrix((pixels.share[part].reshape(-1), (point, row)), shape=(count, len(y))).tocsr()
         total += spread @ np.column_stack([*products, values, np.ones(len(y))])
     matrix = np.zeros((count, terms, terms))
     for column, (i, j) in enumerate(upper):
         matrix[:, i, j] = matrix[:, j, i] = total[:, column]
     target = total[:, len(upper) : -1].reshape(count, terms, 3)
     weight = total[:, -1]
-    # A vertex that few pixels show has little more than a mean.
+    # A point that few pixels show has little more than a mean.
     held = np.diag([1e-9] + [_RIDGE] * (terms - 1)) / (4 * np.pi)
     harmonics = np.linalg.solve(matrix + held * (1 + 0.2 * weight[:, None, None]), target)
     harmonics[weight < 1e-3] = 0
-    harmonics = filled(harmonics.reshape(count, -1), weight > 1e-3, mesh).reshape(count, terms, 3)
+    harmonics = filled(harmonics.reshape(count, -1), weight > 1e-3, edges).reshape(count, terms, 3)
     return harmonics, weight.astype(np.float32)
 
 
-def filled(values: Array, known: Array, mesh: Mesh, rounds: int = 200) -> Array:
-    """`values` (v, c) with the unknown rows filled from their neighbours, outwards from the known ones; float32."""
-    near = adjacency(mesh.faces, len(values))
+def filled(values: Array, known: Array, edges: Array, rounds: int = 200) -> Array:
+    """`values` (v, c) with the unknown rows filled from neighbours, outwards from the known ones; float32."""
+    near = adjacency(edges, len(values))
     values = np.where(known[:, None], values, 0.0)
     filled = known.copy()
     for _ in range(rounds):

@@ -100,7 +100,8 @@ class Regularisers:
         if samples.offsets is None:
             return torch.zeros(())
         turned = samples.at_ends(samples.offsets)
-        alike = ((turned[:, 0] - turned[:, 1]) ** 2).sum(1).mean()
+        other = turned[:, 1] if samples.sides is None else samples.sides * turned[:, 1]
+        alike = ((turned[:, 0] - other) ** 2).sum(1).mean()
         return self._settings.normal_smoothness * (self._finer * alike + 0.02 * (samples.offsets**2).sum(1).mean())
 
 

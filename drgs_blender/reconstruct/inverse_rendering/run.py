@@ -6,7 +6,7 @@ import hashlib
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +15,27 @@ import torch
 from torch import Tensor
 
 from ...core.asset.model import Mesh
-from ...core.errors import AssetError, Cancelled, UsageError
+from ...core.errors import Cancelled
 from ...render.reference.brdf import MIN_GGX_ALPHA, dot
-from ...render.scene.triangle_bvh import TriangleBVH
 from .. import checkpoint as states
 from ..backend import CPU, LearningBackend
 from ..capture.capture import Capture
 from ..model.gaussians import Gaussians
 from ..optim.adam import Adam
+from .decoupled import Decoupled, DecoupledSurfels, Progress
+from .domain import Domain, mesh_domain
 from .lighting import Lighting
 from .likeness import LikePoints, features
 from .losses import log_loss, unbiased_loss
 from .materials import levels
-from .pixels import Normals, Pixels, foreground_pixels
-from .radiance_cache import edges_of, filled, radiance_cache
+from .pixels import Pixels
+from .radiance_cache import filled, radiance_cache
 from .regularisers import Regularisers, fineness
 from .schedule import Schedule
 from .score import Score
 from .settings import Settings
 from .surface import Pairs, Surface, SurfaceSamples
+from .surfel_domain import carried, surfel_domain
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
@@ -45,72 +47,6 @@ _AIM, _REPORT, _SAVE = 25, 25, 20.0
 _DARKEST = 0.2
 
 
-@dataclass(slots=True)
-class Decoupled:
-    """Materials and light of a captured object.
-
-    Attributes
-    ----------
-    albedo : (v, 3) float32 array
-        In [0, 1], of the mesh's vertices; linear Rec.709.
-    roughness, metallic : (v,) float32 array
-        In [0, 1], of the mesh's vertices; linear Rec.709.
-    environment : (h, 2 h, 3) float32 array
-        Radiance in the mapping of `asset.Environment`, Z up, as it was around the first view where the object was
-        turned (`View.turn`). What cannot be seen apart is its scale against that of the albedo.
-    normals : (v, 3) float32 array
-        Unit: smooth vertex normals, with what was learned on top.
-    report : dict
-        JSON-able: "views", "pixels", "iterations", "seconds", "psnr" (of the pixels of the last steps, dB in sRGB),
-        "loss", "unseen_vertices", "exposures" (factors of the views, when learned).
-    shape : Shape, optional
-        Where the shape was learned, too; the arrays above are of its mesh then.
-    """
-
-    albedo: Array
-    roughness: Array
-    metallic: Array
-    environment: Array
-    normals: Array
-    report: dict[str, Any] = field(default_factory=dict)
-    shape: Shape | None = None
-
-
-@dataclass(slots=True)
-class Shape:
-    """Surfels that were learned with materials and light.
-
-    Attributes
-    ----------
-    mesh : Mesh
-        Fused from them; its materials mean nothing.
-    fusion : dict
-        Report of that, see `depth_fusion.fuse`.
-    gaussians : Gaussians
-    albedo : (n, 3) float32 array
-    roughness, metallic : (n,) float32 array
-        The surfels' own, as of `Decoupled`.
-    """
-
-    mesh: Mesh
-    fusion: dict[str, Any]
-    gaussians: Gaussians
-    albedo: Array
-    roughness: Array
-    metallic: Array
-
-
-@dataclass(slots=True)
-class Progress:
-    """Progress of a run: `part` of it is done, 0..1; `result` makes the present result."""
-
-    iteration: int
-    part: float
-    loss: float
-    psnr: float
-    result: Callable[[], Decoupled]
-
-
 def decouple(
     capture: Capture,
     mesh: Mesh,
@@ -119,8 +55,8 @@ def decouple(
     cancelled: Callable[[], bool] | None = None,
     checkpoint: Path | None = None,
     backend: LearningBackend = CPU,
-    normals: Normals | None = None,
     start: Array | None = None,
+    surfels: Gaussians | None = None,
     now: Callable[[], float] = time.monotonic,
 ) -> Decoupled:
     """Learn materials and light of an object from photographs and its geometry.
@@ -141,11 +77,11 @@ def decouple(
         File to go on from when it lies there and fits, written every few seconds and at the end.
     backend : LearningBackend
         Backend that traces rays; the rest runs on the CPU.
-    normals : callable, optional
-        Gives the normals behind pixels in place of the mesh. They count where they are within 60 degrees of the
-        face, as for surfels that are rendered; what is learned of normals is added to them.
     start : (v, 3) float32 array, optional
         Unit normals of the vertices to begin with, in place of the mesh's smooth ones.
+    surfels : Gaussians, optional
+        On the CPU. Materials and normals are learned of them, as they are, in place of the mesh, which takes what views
+        show; rays meet their sheets. For things thinner than the mesh can be.
     now : callable
         Monotonic clock, seconds.
 
@@ -157,8 +93,15 @@ def decouple(
         The mesh has no faces.
     Cancelled
     """
-    job = Job(capture, mesh, settings, checkpoint, backend, normals, start, now)
+    job = Job(capture, domain_of(capture, mesh, settings, start, surfels), mesh, settings, checkpoint, backend, now)
     return learned(job, on_progress, cancelled)
+
+
+def domain_of(
+    capture: Capture, mesh: Mesh, settings: Settings, start: Array | None, surfels: Gaussians | None
+) -> Domain:
+    """The vertices of the mesh, or surfels; see `decouple`."""
+    return mesh_domain(capture, mesh, settings, start) if surfels is None else surfel_domain(capture, surfels, settings)
 
 
 def learned(
@@ -194,48 +137,45 @@ class Job:
     """
 
     def __init__(
-        self, capture: Capture, mesh: Mesh, settings: Settings, checkpoint: Path | None, backend: LearningBackend,
-        normals: Normals | None, start: Array | None, now: Callable[[], float],
-    ) -> None:  # fmt: skip
-        settings.check()
-        if not len(mesh.faces):
-            raise AssetError("mesh", "has no faces", "Decoupling needs the surface")
-        if not capture.training:
-            raise UsageError(str(capture.source), "has no training view", "Leave fewer views out for the test")
-        self._mesh, self._settings, self._capture = mesh, settings, capture
+        self,
+        capture: Capture,
+        domain: Domain,
+        mesh: Mesh,
+        settings: Settings,
+        checkpoint: Path | None,
+        backend: LearningBackend,
+        now: Callable[[], float],
+    ) -> None:
+        self._domain, self._mesh, self._settings, self._capture = domain, mesh, settings, capture
         self.schedule, self.score = Schedule(settings, now), Score()
-        tree = TriangleBVH()
-        tree.build(mesh.vertices, mesh.faces)
-        self._pixels = foreground_pixels(capture.training, mesh, tree, settings.most_pixels, settings.seed, normals)
+        self._pixels, points, edges = domain.pixels, domain.points, domain.edges
         self._gain = _gain(capture, float(self._pixels.colour.mean()), settings.brightness)
         self._pixels.colour *= np.float32(self._gain)
-        cache, self._weight = radiance_cache(self._pixels, mesh)
+        cache, self._weight = radiance_cache(self._pixels, len(points), edges)
         counts = (settings.cosine, settings.ggx, settings.light)
-        if not settings.shadows:
-            tree = TriangleBVH()
-            tree.build(mesh.vertices, mesh.faces[:0])
-        gatherer = backend.gatherer(mesh, tree, cache if settings.indirect else None, counts, settings.normals)
+        sent = cache[domain.owner] if settings.indirect else None
+        gatherer = backend.gatherer(domain.occluder, domain.tree(settings.shadows), sent, counts, settings.normals)
 
         # Grey light that shows a surface of albedo .4 as bright as the photographs, which has their hue. Colours begin
         # without any detail: light is to explain shading before albedo can.
         mean = self._pixels.colour.mean(axis=0)
         turns = [view.turn for view in capture.training if view.turn is not None]
         self.lighting = Lighting(gatherer, settings, 2.5 * float(mean.mean()), turns)
-        finer = fineness(mesh.vertices, mesh.faces[:, :2])
+        finer = fineness(points, edges)
         grids = replace(settings, coarse=levels(settings.coarse, finer))
-        self.surface = Surface(mesh, grids, mean, normals is not None, start)
+        self.surface = Surface(points, domain.normals, grids, mean, domain.surfels is not None)
         #: What photographs show of the vertices, where it is wanted.
         self._shown: Array | None = None
         self._like: LikePoints | None = None
         if settings.same_material > 0:
-            self._shown = features(self._pixels, mesh)
-            self._like = LikePoints(self._shown, mesh.vertices, settings.seed)
+            self._shown = features(self._pixels, len(points), edges)
+            self._like = LikePoints(self._shown, points, settings.seed)
         colours = np.maximum(cache[:, 0] * 0.28209479, 0)
-        self._regularisers = Regularisers(edges_of(mesh.faces), colours, settings, finer)
+        self._regularisers = Regularisers(edges, colours, settings, finer)
         #: Logarithm of the brightness of the photographs, one each.
         self._exposure = torch.zeros(len(capture.training)) if settings.exposure else None
         self._adam = Adam(self._learned())
-        shape = _digest(mesh.vertices, mesh.faces, self._pixels.detail_normal, self.surface.normals())
+        shape = _digest(domain.occluder.vertices, domain.occluder.faces, domain.normals)
         key = states.fingerprint(capture, mesh=shape, **asdict(settings))
         self.checkpoint = states.Checkpoint(checkpoint, key, _SAVE, now)
 
@@ -328,11 +268,15 @@ class Job:
         """Materials and light as learned so far."""
         known = self._weight > 1e-3
         values = np.column_stack(self.surface.materials.values())
-        values = np.clip(filled(values, known, self._mesh), 0, 1)
-        return self._found(values, self.surface.normals(), known)
+        values = np.clip(filled(values, known, self._domain.edges), 0, 1)
+        if (surfels := self._domain.surfels) is None:
+            return self._found(values, known, self.surface.normals())
+        found = self._found(*carried(values, self._mesh, surfels, self._capture.training))
+        found.surfels = DecoupledSurfels(surfels, values[:, :3], values[:, 3], values[:, 4], self.surface.normals())
+        return found
 
-    def _found(self, values: Array, normals: Array, known: Array) -> Decoupled:
-        """The result: materials (v, 5) and normals of vertices, and which of them (v,) photographs show."""
+    def _found(self, values: Array, known: Array, normals: Array | None = None) -> Decoupled:
+        """The result: materials (v, 5) of vertices, which of them (v,) photographs show, and their normals."""
         report: dict[str, Any] = {
             "views": len(self._capture.training),
             "pixels": len(self._pixels),

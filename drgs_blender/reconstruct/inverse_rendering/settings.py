@@ -111,7 +111,7 @@ class Settings:
     binary_metallic_prior: Weight = 0.0
     metal_albedo_prior: Weight = 0.05
     metal_smoothness: Weight = 5.0
-    same_material: Weight = 0.003
+    same_material: Weight = 0.01
     unbiased: bool = True
     weight_by_prediction: bool = True
     clipped_neighbour_weight: Part = 0.5

@@ -9,9 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...core.asset.model import Mesh
-from ...geometry.normals import VertexNormals
-from ...render.gbuffer.surfels import ALIKE
 from ...render.reference.brdf import dot, normalise
 from .blend import blend
 from .materials import Materials
@@ -53,6 +50,8 @@ class SurfaceSamples:
         The ends of the edges among those vertices.
     pairs : Pairs, optional
         Of like ones among them.
+    sides : (e, 1) float32 tensor, optional
+        -1 where the normals of an edge's ends are on different sides of one surface.
     """
 
     materials: Tensor
@@ -61,6 +60,7 @@ class SurfaceSamples:
     offsets: Tensor | None
     ends: Tensor
     pairs: Pairs | None = None
+    sides: Tensor | None = None
 
     def at_ends(self, values: Tensor) -> Tensor:
         """Values (u, k) of the vertices at the ends of the edges, (e, 2, k)."""
@@ -73,18 +73,19 @@ def at_both(values: Tensor, pairs: Tensor) -> Tensor:
 
 
 class Surface:
-    """Materials and normals of a mesh as something to learn.
+    """Materials and normals of a mesh or of surfels as something to learn.
 
     Parameters
     ----------
-    mesh : Mesh
+    points : (v, 3) float32 array
+        Places of what carries materials: vertices, or surfels.
+    normals : (v, 3) float32 array
+        Their unit normals to begin with.
     settings : Settings
     mean : (3,) float array
         Colour of the photographs.
-    given_normals : bool
-        Whether pixels have normals from elsewhere than the mesh.
-    start : (v, 3) float32 array, optional
-        Unit normals of the vertices to begin with, in place of the mesh's smooth ones.
+    two_sided : bool
+        See `Domain`.
 
     Attributes
     ----------
@@ -93,40 +94,36 @@ class Surface:
         Name to tensor: those of the materials, and "normals" (v, 3) where they are learned.
     """
 
-    def __init__(
-        self, mesh: Mesh, settings: Settings, mean: Array, given_normals: bool, start: Array | None = None
-    ) -> None:
-        if start is None:
-            start = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
-        self._normals = torch.from_numpy(start)
-        self._faces = torch.from_numpy(mesh.faces.astype(np.int64))
-        self._given_normals = given_normals
-        self.materials = Materials(mesh.vertices, settings.parametrisation, settings.coarse, mean)
+    def __init__(self, points: Array, normals: Array, settings: Settings, mean: Array, two_sided: bool) -> None:
+        self._normals, self._two_sided = torch.from_numpy(normals), two_sided
+        self.materials = Materials(points, settings.parametrisation, settings.coarse, mean)
         self.parameters = dict(self.materials.parameters)
         if settings.normals:
-            self.parameters["normals"] = torch.zeros(len(mesh.vertices), 3)
+            self.parameters["normals"] = torch.zeros(len(points), 3)
 
     def at(self, pixels: Pixels, edges: Array, pairs: Pairs | None = None) -> SurfaceSamples:
         """The surface at pixels, at edges (e, 2) of vertices, and at pairs of like ones."""
-        corner = self._faces[torch.from_numpy(pixels.face)]
+        corner = torch.from_numpy(pixels.index).long()
         ends = torch.from_numpy(edges)
         if pairs is not None:
             ends = torch.cat([ends, pairs.ends])
         used, index = torch.unique(torch.cat([corner.flatten(), ends.flatten()]), return_inverse=True)
-        corner_index, end_index = index[: corner.numel()].view(-1, 3), index[corner.numel() :].view(-1, 2)
-        shares = torch.from_numpy(pixels.corners)
+        corner_index, end_index = index[: corner.numel()].view(corner.shape), index[corner.numel() :].view(-1, 2)
+        shares = torch.from_numpy(pixels.share)
 
         columns = self.materials.at(used)
         materials = blend(columns, corner_index, shares)
-        smooth = self._normals[used]
+        normals = self._normals[used]
         offsets = self.parameters["normals"].index_select(0, used) if "normals" in self.parameters else None
         if offsets is not None:
-            smooth = smooth + offsets
-        normal = normalise(blend(smooth, corner_index, shares))
-        if self._given_normals:
-            normal = _with_detail(pixels, normal, None if offsets is None else blend(offsets, corner_index, shares))
+            normals = normals + offsets
+        facing, sides = shares, None
+        if self._two_sided:
+            facing = shares * dot(self._normals[corner], torch.from_numpy(pixels.towards)[:, None]).sign()
+            sides = dot(*self._normals[torch.from_numpy(edges)].unbind(1)).sign()[:, None]
+        normal = normalise(blend(normals, corner_index, facing))
         like = None if pairs is None else Pairs(end_index[len(edges) :], pairs.weight)
-        return SurfaceSamples(materials, normal, columns, offsets, end_index[: len(edges)], like)
+        return SurfaceSamples(materials, normal, columns, offsets, end_index[: len(edges)], like, sides)
 
     def normals(self) -> Array:
         """(v, 3) float32 unit: those that learning began with, and what was learned on top."""
@@ -134,12 +131,3 @@ class Surface:
         if "normals" in self.parameters:
             normals = normalise(normals + self.parameters["normals"])
         return normals.numpy().astype(np.float32)
-
-
-def _with_detail(pixels: Pixels, normal: Tensor, offsets: Tensor | None) -> Tensor:
-    """Normals (n, 3) from elsewhere than the mesh, with what is learned; its `normal` where they are far off."""
-    detail, flat = torch.from_numpy(pixels.detail_normal), torch.from_numpy(pixels.flat)
-    believed = dot(detail, flat)[:, None] >= ALIKE
-    # The face's where they are not: nothing has no direction, and its derivative would spoil that of its vertices.
-    own = torch.where(believed, detail, flat)
-    return torch.where(believed, own if offsets is None else normalise(own + offsets), normal)

@@ -84,7 +84,7 @@ def blended_as(
     def wanted_of(k: int) -> tuple[Tensor, Tensor]:
         """Pixels of a view that see the mesh, and what they see."""
         pixels = pixels_of(k, cut[k], mesh, tree)
-        shown = np.einsum("nk,nkc->nc", pixels.corners, values[mesh.faces[pixels.face]]).astype(np.float32)
+        shown = pixels.blended(values).astype(np.float32)
         return torch.from_numpy(pixels.place.astype(np.int64)), torch.from_numpy(shown)
 
     generator = np.random.default_rng(0)

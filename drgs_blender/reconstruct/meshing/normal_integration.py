@@ -14,10 +14,10 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import cg
 
 from ...core.arrays import Array
-from ...core.asset.model import Binding, Mesh, Surfels
+from ...core.asset.model import Binding, Mesh
 from ...deform.binding import clamp_weights
 from ...deform.face_frames import Faces, dot, shading_frames
-from ...geometry.normals import VertexNormals, rotation_matrices, unit
+from ...geometry.normals import VertexNormals, unit
 from ..inverse_rendering.radiance_cache import edges_of
 
 #: Weight of the positions against the slopes of edges.
@@ -85,15 +85,10 @@ def shaded_by(binding: Binding, mesh: Mesh, normals: Array) -> Binding:
     return _shaded(binding, mesh, Faces.of(mesh.vertices, mesh.faces), normals)
 
 
-def shaded_by_own(binding: Binding, mesh: Mesh, surfels: Surfels, turns: Array) -> Binding:
-    """`binding` with the surfels' own normals, on the side of their faces.
-
-    `turns` (v, 3) of the mesh's vertices are added to them.
-    """
+def shaded_by_own(binding: Binding, mesh: Mesh, own: Array) -> Binding:
+    """`binding` with the surfels' own normals (n, 3), on the side of their faces."""
     faces = Faces.of(mesh.vertices, mesh.faces)
-    own = rotation_matrices(surfels.rotation.astype(np.float64))[..., 2]
-    own = np.where(dot(own, faces.normal[binding.face])[:, None] < 0, -own, own)
-    return _shaded(binding, mesh, faces, own + blended(binding, mesh, turns))
+    return _shaded(binding, mesh, faces, np.where(dot(own, faces.normal[binding.face])[:, None] < 0, -own, own))
 
 
 def blended(binding: Binding, mesh: Mesh, values: Array) -> Array:

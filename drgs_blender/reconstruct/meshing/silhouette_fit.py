@@ -20,7 +20,7 @@ from ...core.frame import Camera
 from ...geometry.normals import VertexNormals
 from ...render.scene.triangle_bvh import TriangleBVH
 from ..capture.training_views import pixel_rays
-from ..inverse_rendering.radiance_cache import adjacency
+from ..inverse_rendering.radiance_cache import adjacency, edges_of
 from .visual_hull import world_to_pixel
 
 log = logging.getLogger(__name__)
@@ -57,7 +57,7 @@ def fill_silhouettes(mesh: Mesh, cameras: list[Camera], masks: list[Array], roun
         Those of `mesh` where no outline is seen.
     """
     matrices = [world_to_pixel(camera) for camera in cameras]
-    near = adjacency(mesh.faces, len(mesh.vertices))
+    near = adjacency(edges_of(mesh.faces), len(mesh.vertices))
     spread = SMOOTH * (diags(np.asarray(near.sum(axis=1)).ravel()) - near)
     normals = VertexNormals(mesh.faces, len(mesh.vertices))
     tree = TriangleBVH()

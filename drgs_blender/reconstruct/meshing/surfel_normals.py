@@ -40,8 +40,8 @@ def with_surfel_normals(mesh: Mesh, views: list[View], normals: Normals) -> Arra
     own = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
     total = np.zeros((len(own), 3))
     for index, view in enumerate(cropped_views(views, mesh.vertices)):
-        pixels = pixels_of(index, view, mesh, tree, normals)
-        total += pixels.onto_vertices(pixels.detail_normal, mesh.faces, len(own))
+        pixels = pixels_of(index, view, mesh, tree)
+        total += pixels.onto(unit(normals(view).reshape(-1, 3)[pixels.place], (0, 0, 0)), len(own))
     shown = unit(total, (0, 0, 0))
     alike = (shown * own).sum(axis=1, keepdims=True) > ALIKE
     return unit(own + np.where(alike, shown, 0)).astype(np.float32)

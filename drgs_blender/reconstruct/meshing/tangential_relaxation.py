@@ -10,7 +10,7 @@ import numpy as np
 
 from ...core.arrays import Array
 from ...geometry.normals import VertexNormals
-from ..inverse_rendering.radiance_cache import adjacency
+from ..inverse_rendering.radiance_cache import adjacency, edges_of
 
 #: Part of the way to the middle of its neighbours that a vertex goes in a round; rounds.
 STEP, ROUNDS = 0.5, 3
@@ -30,7 +30,7 @@ def relaxed(vertices: Array, faces: Array, rounds: int = ROUNDS) -> Array:
     -------
     (n, 3) float32 array
     """
-    near, normals = adjacency(faces, len(vertices)), VertexNormals(faces, len(vertices))
+    near, normals = adjacency(edges_of(faces), len(vertices)), VertexNormals(faces, len(vertices))
     share = STEP / np.maximum(np.asarray(near.sum(axis=1)), 1)
     moved = vertices.astype(np.float64)
     for _ in range(rounds):

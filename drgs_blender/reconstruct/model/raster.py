@@ -104,6 +104,31 @@ def view_of(camera: Camera) -> tuple[Array, tuple[int, int]]:
     return camera_parameters(camera, RenderSettings(subpixel_samples=1), 0), (camera.width, camera.height)
 
 
+def arranged(
+    surfels: WorldSurfels, features: Array, parameters: Array, size: tuple[int, int]
+) -> tuple[Array, Splats, Tiles]:
+    """Surfels as a view shows them: their rows in the order of the centres, the splats, and which each tile lists.
+
+    Parameters
+    ----------
+    surfels : WorldSurfels
+    features : (n, c) float array
+    parameters : array
+    size : tuple of int
+        Both as of `view_of`.
+    """
+    n, (width, height) = len(surfels.opacity), size
+    seen = Projected(np.empty((n, RECORD), np.float32), np.empty(n, np.float32), np.empty((n, 4), np.int32))
+    project(surfels, parameters, size, seen)
+    order = depth_order(seen.depth, seen.box)
+    values = np.ascontiguousarray(features[order], np.float32)
+    near, far = np.float32(parameters[CLIP_START]), np.float32(parameters[CLIP_END])
+    splats = Splats(seen.record[order], values, seen.box[order], near, far)
+    tiles_x, tiles_y = (width - 1) // TILE + 1, (height - 1) // TILE + 1
+    start, listed = list_by_tile(splats.box, 0, 0, tiles_x, tiles_y)
+    return order, splats, Tiles(start, listed, tiles_x)
+
+
 class _Rasterise(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -112,18 +137,9 @@ class _Rasterise(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:  # fmt: skip
         given = centre, tangent_u, tangent_v, opacity
         surfels = WorldSurfels(*(np.ascontiguousarray(t.detach().numpy(), np.float32) for t in given))
+        order, splats, tiles = arranged(surfels, features.detach().numpy(), parameters, size)
         width, height = size
-        n = len(opacity)
-        seen = Projected(np.empty((n, RECORD), np.float32), np.empty(n, np.float32), np.empty((n, 4), np.int32))
-        project(surfels, parameters, size, seen)
-        order = depth_order(seen.depth, seen.box)
-        values = np.ascontiguousarray(features.detach().numpy()[order], np.float32)
-        near, far = np.float32(parameters[CLIP_START]), np.float32(parameters[CLIP_END])
-        splats = Splats(seen.record[order], values, seen.box[order], near, far)
-        tiles_x, tiles_y = (width - 1) // TILE + 1, (height - 1) // TILE + 1
-        start, listed = list_by_tile(splats.box, 0, 0, tiles_x, tiles_y)
-        tiles = Tiles(start, listed, tiles_x)
-        maps = np.zeros((height, width, FEATURES + values.shape[1]), np.float32)
+        maps = np.zeros((height, width, FEATURES + splats.values.shape[1]), np.float32)
         blend(splats, tiles, maps)
         ctx.save = (surfels, parameters, order, splats, tiles, maps, statistics)
         ctx.set_materialize_grads(False)

@@ -46,13 +46,14 @@ def is_thin(gaussians: Gaussians, mesh: Mesh, views: list[View]) -> bool:
     tree = TriangleBVH()
     tree.build(mesh.vertices, mesh.faces)
     smooth = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
-    cosines = []
+    cosines, shown = [], normals_of(gaussians)
     sampled = cropped_views(views[:: math.ceil(len(views) / SAMPLED_VIEWS)], mesh.vertices)
     for index, view in enumerate(sampled):
-        pixels = pixels_of(index, view, mesh, tree, normals_of(gaussians))
-        by_mesh = unit(np.einsum("nk,nkc->nc", pixels.corners, smooth[mesh.faces[pixels.face]]))
-        known = (pixels.detail_normal != 0).any(axis=1)
-        cosines.append(np.einsum("nc,nc->n", pixels.detail_normal, by_mesh)[known])
+        pixels = pixels_of(index, view, mesh, tree)
+        own = unit(shown(view).reshape(-1, 3)[pixels.place], (0, 0, 0))
+        by_mesh = unit(pixels.blended(smooth))
+        known = (own != 0).any(axis=1)
+        cosines.append(np.einsum("nc,nc->n", own, by_mesh)[known])
     different = float((np.concatenate([*cosines, [1.0]]) < math.cos(math.radians(MIN_ANGLE))).mean())
     thin = different > THIN_FRACTION
     log.info("normals of surfels and mesh differ in %.1f %% of pixels%s", 100 * different, ": thin" if thin else "")

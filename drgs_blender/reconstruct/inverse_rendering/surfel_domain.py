@@ -1,0 +1,114 @@
+"""Surfels as the domain of materials: of thin things, of which a mesh makes tubes.
+
+A pixel shows the blend of the surfels that cover most of it. Rays meet their sheets (`render.surfels.sheets`), and
+start above them, as when the asset is rendered.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from ...core.arrays import Array
+from ...core.asset.model import Mesh
+from ...geometry.normals import unit
+from ...render.gbuffer.surfels import WINDOW_SCALES
+from ...render.reference.raster import camera_rays, pixel_centres
+from ...render.scene.triangle_bvh import TriangleBVH
+from ...render.surfels.sheets import sheets
+from ..capture.capture import Capture, View
+from ..meshing.crops import cropped_views
+from ..model.contributors import strongest
+from ..model.gaussians import Gaussians
+from .domain import Domain
+from .pixels import Pixels, check_size, of_training_views, photographed, pixels_of, within_mask
+from .radiance_cache import edges_of, filled
+from .settings import Settings
+
+#: Neighbours of a surfel along which its materials are smooth, and the least cosine between their planes.
+_NEIGHBOURS, _COPLANAR = 6, 0.5
+#: Surfels that a pixel shows, at most, and how much of it all surfels cover, at least.
+_MOST, _COVERED = 8, 0.9
+
+
+def surfel_domain(capture: Capture, gaussians: Gaussians, settings: Settings) -> Domain:
+    """Surfels that stay as they are.
+
+    Parameters
+    ----------
+    capture : Capture
+    gaussians : Gaussians
+        On the CPU.
+    settings : Settings
+
+    Raises
+    ------
+    UsageError
+        As of `pixels.of_training_views`; a picture and its camera of different sizes.
+    """
+    centres, opacities = (x.numpy(force=True) for x in (gaussians.centres(), gaussians.opacities()))
+    u, v, normals = gaussians.frames()
+    vertices, faces = sheets(centres, u, v, opacities)
+    blank = np.zeros(len(vertices), np.float32)
+    occluder = Mesh(vertices, faces, np.zeros_like(vertices), blank, blank)
+    scale = np.sqrt(np.maximum((u * u).sum(1), (v * v).sum(1)))
+    pixels = of_training_views(capture, settings, lambda k, view: _pixels_of(k, view, gaussians, scale))
+    owner = np.repeat(np.arange(len(centres)), len(vertices) // max(len(centres), 1))
+    edges = neighbours(centres, normals)
+    return Domain(centres, normals.astype(np.float32), edges, pixels, occluder, owner, gaussians)
+
+
+def carried(values: Array, mesh: Mesh, gaussians: Gaussians, views: list[View]) -> tuple[Array, Array]:
+    """Values (v, c) in [0, 1] of a mesh's vertices, means of what views show of the surfels', and who is seen (v,)."""
+    tree = TriangleBVH()
+    tree.build(mesh.vertices, mesh.faces)
+    columns = torch.from_numpy(np.asarray(values, np.float32))
+    total = np.zeros((len(mesh.vertices), columns.shape[1] + 1))
+    for k, view in enumerate(cropped_views(views, mesh.vertices)):
+        pixels = pixels_of(k, view, mesh, tree)
+        with torch.no_grad():
+            shown = gaussians.render(view.camera, torch.zeros(3), 0, reflections=False, materials=columns)
+        assert shown.materials is not None
+        maps = torch.cat([shown.materials, shown.maps.alpha[..., None]], 2)
+        total += pixels.onto(maps.flatten(0, 1).numpy()[pixels.place], len(total))
+    seen = total[:, -1] > 1e-3
+    return np.clip(filled(total[:, :-1] / np.maximum(total[:, -1:], 1e-9), seen, edges_of(mesh.faces)), 0, 1), seen
+
+
+def neighbours(centres: Array, normals: Array) -> Array:
+    """Pairs (e, 2) of surfels that lie side by side on one surface, each once."""
+    _, near = cKDTree(centres).query(centres, min(_NEIGHBOURS + 1, len(centres)))
+    pairs = np.stack([np.repeat(np.arange(len(centres)), near.shape[1] - 1), near[:, 1:].ravel()], 1)
+    coplanar = np.abs(np.einsum("nc,nc->n", normals[pairs[:, 0]], normals[pairs[:, 1]])) > _COPLANAR
+    return np.unique(np.sort(pairs[coplanar], axis=1), axis=0).astype(np.int64)
+
+
+def _pixels_of(number: int, view: View, gaussians: Gaussians, scale: Array) -> Pixels:
+    """The pixels of the view `number` that show surfels, whose larger standard deviations `scale` (n,) are."""
+    check_size(view)
+    camera = view.camera
+    with torch.no_grad():
+        shown = gaussians.render(camera, torch.zeros(3), 0, reflections=False)
+    index, weight = strongest(gaussians, camera, _MOST)
+    alpha = shown.maps.alpha.numpy()
+    seen = (alpha > _COVERED) & within_mask(view)
+    row = np.flatnonzero(seen)
+    origin, direction = (a.numpy().astype(np.float32)[row] for a in camera_rays(camera, pixel_centres(camera)))
+    index, weight = index.reshape(-1, _MOST)[row], weight.reshape(-1, _MOST)[row]
+    share = weight / weight.sum(axis=1, keepdims=True)
+    normal = unit(shown.normal.numpy().reshape(-1, 3)[row], (0, 0, 0)).astype(np.float32)
+    depth = (shown.maps.depth.numpy()[seen] / alpha[seen])[:, None]
+    along = direction @ -np.asarray(camera.matrix_world, np.float32)[:3, 2]
+    lift = WINDOW_SCALES * (share * scale[index]).sum(axis=1, keepdims=True)
+    part = Pixels(
+        np.full(len(row), number, np.int32),
+        row.astype(np.int32),
+        index,
+        share,
+        (origin + depth * direction / along[:, None] + lift * normal).astype(np.float32),
+        normal,
+        -direction / np.linalg.norm(direction, axis=1, keepdims=True),
+        *photographed(view, seen, row),
+    )
+    return part.select(part.usable())
