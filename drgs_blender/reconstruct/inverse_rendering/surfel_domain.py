@@ -29,7 +29,7 @@ from .settings import Settings
 #: Neighbours of a surfel along which its materials are smooth, and the least cosine between their planes.
 _NEIGHBOURS, _COPLANAR = 6, 0.5
 #: Surfels that a pixel shows, at most, and how much of it all surfels cover, at least.
-_MOST, _COVERED = 8, 0.9
+_MOST, _COVERED = 16, 0.9
 
 
 def surfel_domain(capture: Capture, gaussians: Gaussians, settings: Settings) -> Domain:
