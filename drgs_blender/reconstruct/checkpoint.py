@@ -21,13 +21,19 @@ from .capture.capture import Capture
 
 log = logging.getLogger(__name__)
 
+#: What states mean. To be raised with every change after which an older one would go on to something else: versions of
+#: the package change less often.
+MEANING = 2
+
 
 def fingerprint(capture: Capture, **settings: Any) -> str:
     """Digest of what a state depends on.
 
-    Photographs, masks, normals, cameras, settings that JSON can hold, and this version.
+    Photographs, masks, normals, cameras, settings that JSON can hold, this version, and `MEANING`.
     """
-    digest = hashlib.sha256(__version__.encode() + json.dumps(settings, sort_keys=True, default=str).encode())
+    digest = hashlib.sha256(
+        f"{__version__} {MEANING} ".encode() + json.dumps(settings, sort_keys=True, default=str).encode()
+    )
     for view in capture.views:
         camera = view.camera
         digest.update(f"{view.name} {view.test} {camera.width} {camera.height}".encode())

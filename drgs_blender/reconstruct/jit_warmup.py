@@ -13,7 +13,7 @@ import numpy as np
 from ..core.asset.model import Mesh
 from ..core.errors import Cancelled
 from ..core.frame import Camera
-from .backend import LearningBackend
+from .backend import CPU, LearningBackend
 from .capture.capture import Capture, View
 from .inverse_rendering.run import decouple
 from .meshing.visual_hull import find_region
@@ -57,7 +57,8 @@ def warm_up(settings: Settings, masked: bool, backend: LearningBackend, cancelle
         _all_steps(Training(capture, region, schedule.on_mesh(1.0), attached, backend=backend), cancelled)
     if settings.materials:
         quick = replace(settings.decoupling, iterations=_STEPS_OF_MATERIALS, seconds=0.0, pixels=64)
-        decouple(capture, mesh, quick, None, cancelled, backend=backend)
+        for surfels in (None, training.gaussians.on(CPU)):  # as of thin things
+            decouple(capture, mesh, quick, None, cancelled, backend=backend, surfels=surfels)
 
 
 def _all_steps(training: Training, cancelled: Callable[[], bool]) -> None:

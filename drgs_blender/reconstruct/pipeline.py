@@ -316,8 +316,9 @@ def _on_mesh(
 
 def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, report: dict[str, Any]) -> Decoupled:
     """Materials, normals and light, of thin things on the surfels; the shape, too, where it is learned with them."""
-    settings, free, thin, start = work.settings.decoupling, work.settings.variant == "p", report["thin"], None
-    if settings.normals and free and not thin:
+    settings, free, start = work.settings.decoupling, work.settings.variant == "p", None
+    on_surfels = free and (settings.domain == "surfels" or (settings.domain == "auto" and report["thin"]))
+    if settings.normals and free and not on_surfels:
         start = with_surfel_normals(mesh, work.capture.training, normals_of(surfels.gaussians))
     if (seconds := work.seconds(MATERIAL_TIME_FRACTION)) is not None:
         settings = replace(settings, seconds=seconds)
@@ -330,9 +331,9 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: LearnedSurfels, report: dict[st
     if settings.joint and free:
         if work.backend is not CPU:
             log.warning("decoupling.joint: surfels, materials and light are learned on the CPU, not on the card")
-        found = decouple_jointly(work.capture, mesh, surfels, settings, *rest, thin, start)
+        found = decouple_jointly(work.capture, mesh, surfels, settings, *rest, on_surfels, start)
     else:
-        own = surfels.gaussians if thin else None
+        own = surfels.gaussians if on_surfels else None
         found = decouple(work.capture, mesh, settings, *rest, work.backend, start, own)
     done, of = work.steps["materials"] = [found.report["iterations"], work.settings.decoupling.iterations]
     if _are_few(done, of):

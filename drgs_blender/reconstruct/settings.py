@@ -117,6 +117,8 @@ class Settings:
         )
         if self.materials and self.decoupling.joint and self.variant == "m":
             names += ["decoupling.joint"]
+        if self.materials and self.decoupling.domain == "surfels" and self.variant == "m":
+            names += ["decoupling.domain"]
         return names + (["fixed"] if self.fixed and self.variant == "p" else [])
 
 

@@ -21,7 +21,7 @@ from drgs_blender.reconstruct.inverse_rendering.regularisers import Regularisers
 from drgs_blender.reconstruct.inverse_rendering.run import decouple  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.surface import Surface  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.surfel_domain import surfel_domain  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.surfel_domain import neighbours, surfel_domain  # noqa: E402
 from drgs_blender.reconstruct.model.contributors import strongest  # noqa: E402
 from drgs_blender.reconstruct.model.gaussians import Gaussians  # noqa: E402
 
@@ -87,13 +87,14 @@ def test_the_strongest_surfels_of_a_pixel_are_those_that_its_colour_blends(captu
     for view in capture.views[:3]:
         with torch.no_grad():
             shown = leaf.render(view.camera, torch.zeros(3), 0, reflections=False, materials=values)
-        index, weight = strongest(leaf, view.camera, 64)
+        index, weight, depth = strongest(leaf, view.camera, 64)
         assert (np.diff(weight, axis=-1) <= 0).all()
         assert weight.sum(-1) == pytest.approx(shown.maps.alpha.numpy(), abs=1e-5)
         blended = (weight[..., None] * values.numpy()[index]).sum(2)
         assert blended == pytest.approx(shown.materials.numpy(), abs=1e-5)
-        few, most = strongest(leaf, view.camera, 4)
-        assert np.array_equal(most, weight[..., :4]) and np.array_equal(few, index[..., :4])
+        assert (weight * depth).sum(-1) == pytest.approx(shown.maps.depth.numpy(), abs=1e-4)
+        for few, all_ in zip(strongest(leaf, view.camera, 4), (index, weight, depth), strict=True):
+            assert np.array_equal(few, all_[..., :4])
 
 
 def test_a_leaf_is_learned_with_the_light_of_either_side(capture, leaf):
@@ -116,6 +117,42 @@ def test_rays_of_a_leaf_start_on_the_side_that_is_seen(capture, leaf):
     assert pixels.share.sum(axis=1) == pytest.approx(1, abs=1e-5)
     facing = Surface(domain.points, domain.normals, SMALL, np.ones(3), True).at(pixels, domain.edges[:5])
     assert (facing.normal.numpy() * pixels.towards).sum(1).min() > 0
+
+
+def leaves(share: float) -> Gaussians:
+    """Two leaves, .3 apart, the upper one of some opacity."""
+    step = np.linspace(-HALF, HALF, 17)
+    sheet = np.stack([*np.meshgrid(step, step), np.zeros((17, 17))], -1).reshape(-1, 3)
+    points = np.concatenate([sheet, sheet - (0, 0, 0.3)])
+    found = Gaussians.on_surface(points, np.tile((0.0, 0, 1), (len(points), 1)), np.full(points.shape, 0.5), 0.06)
+    opacity = torch.full((len(points),), 6.0)
+    opacity[: len(sheet)] = float(np.log(share / (1 - share)))
+    return found.like(found.parameters | {"opacity": opacity})
+
+
+@pytest.mark.parametrize("share", [0.9, 0.3, 0.03])
+def test_pixels_show_the_heaviest_of_two_leaves_and_nothing_in_between(capture, share):
+    domain = surfel_domain(capture, leaves(share), SMALL)
+    above = [k for k, view in enumerate(capture.training) if view.camera.matrix_world[2, 3] > 3]
+    pixels = domain.pixels.select(np.flatnonzero(np.isin(domain.pixels.view, above)))
+    upper = pixels.index < len(domain.points) // 2
+    counts = pixels.share > 0
+    assert (counts & upper).any(1).mean() > 0.95 if share > 0.2 else (counts & upper).any(1).mean() < 0.05
+    # Either leaf alone, and rays start above it: 4 standard deviations of .06.
+    assert not ((counts & upper).any(1) & (counts & ~upper).any(1)).any()
+    height = np.where((counts & upper).any(1), 0.0, -0.3) + 0.24
+    assert pixels.origin[:, 2] == pytest.approx(height, abs=0.02)
+
+
+def test_surfels_that_cover_nothing_whole_are_learned_from_all_the_same(capture, leaf):
+    faint = leaf.like(leaf.parameters | {"opacity": torch.full((len(leaf),), -1.5)})
+    assert len(surfel_domain(capture, faint, SMALL).pixels) > 100
+
+
+def test_a_single_surfel_and_two_in_one_place_have_no_neighbours():
+    up = np.array([[0.0, 0, 1], [0, 0, 1]])
+    assert len(neighbours(np.zeros((1, 3)), up[:1])) == 0
+    assert neighbours(np.zeros((2, 3)), up).tolist() in ([[0, 1]], [])
 
 
 def test_normals_of_neighbours_on_either_side_are_alike_when_they_turn_alike(capture, leaf):

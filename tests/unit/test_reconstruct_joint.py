@@ -214,3 +214,6 @@ def test_photographs_are_cut_when_surfels_are_learned(mesh, capture, monkeypatch
 def test_surfels_on_the_mesh_are_not_learned_again():
     assert "decoupling.joint" in Run(variant="m", decoupling=SMALL).without_effect()
     assert "decoupling.joint" not in Run(decoupling=SMALL).without_effect()
+    for variant, told in (("m", True), ("p", False)):
+        run = Run(variant=variant, decoupling=Settings(domain="surfels"))
+        assert ("decoupling.domain" in run.without_effect()) is told

@@ -81,26 +81,47 @@ def test_surfels_of_thin_things_are_shaded_by_their_own_normals(thin, monkeypatc
     assert (np.quantile(cosine, 0.02) > 0.999) == thin
 
 
-@pytest.mark.parametrize("asked", [True, False])
-def test_surfels_of_thin_things_are_learned_with_materials_of_their_own_where_asked_for(asked, monkeypatch):
-    together, shapes = pipeline.decouple_jointly, []
-
-    def learn(*given):
-        found = together(*given)
-        shapes.append(found.surfels)
-        return found
-
+@pytest.mark.parametrize("joint", [0.0, 0.5])
+def test_assets_of_thin_things_have_the_materials_of_their_surfels(joint, monkeypatch):
+    """Learned on them as they are, and where asked for together with them; the mesh takes what they show."""
+    kept = []
+    for name in ("decouple", "decouple_jointly"):
+        learn = getattr(pipeline, name)
+        monkeypatch.setattr(pipeline, name, lambda *given, learn=learn: kept.append(learn(*given)) or kept[-1])
     monkeypatch.setattr(pipeline, "is_thin", lambda *_: True)
-    monkeypatch.setattr(pipeline, "decouple_jointly", learn)
-    settings = replace(QUICK, decoupling=replace(QUICK.decoupling, joint=0.5)) if asked else QUICK
-    asset = reconstruct(balls(), settings)
-    assert len(shapes) == asked
-    if asked:
-        [shape] = shapes
-        visible = shape.gaussians.opacities().detach().numpy() >= pipeline.UNSEEN
-        assert np.array_equal(asset.surfels.roughness, shape.roughness[visible])
-        assert np.array_equal(asset.surfels.centre, shape.gaussians.arrays()["centre"][visible])
-        assert len(asset.mesh.vertices) == len(shape.mesh.vertices) == asset.provenance["report"]["mesh"]["vertices"]
+    asset = reconstruct(balls(), replace(QUICK, decoupling=replace(QUICK.decoupling, joint=joint)))
+    [found] = kept
+    own = found.surfels
+    assert own is not None and (own.mesh is not None) == (joint > 0)
+    visible = own.gaussians.opacities().detach().numpy() >= pipeline.UNSEEN
+    for channel in ("albedo", "roughness", "metallic"):
+        assert np.array_equal(getattr(asset.surfels, channel), getattr(own, channel)[visible])
+    assert np.array_equal(asset.surfels.centre, own.gaussians.arrays()["centre"][visible])
+    assert len(asset.mesh.vertices) == asset.provenance["report"]["mesh"]["vertices"] == len(found.albedo)
+    assert np.array_equal(asset.mesh.albedo, found.albedo)
+
+
+@pytest.mark.parametrize(
+    ("asked", "thin", "on_surfels"),
+    [("auto", True, True), ("auto", False, False), ("mesh", True, False), ("surfels", False, True)],
+)
+def test_materials_are_learned_on_what_is_asked_for(asked, thin, on_surfels, monkeypatch):
+    monkeypatch.setattr(pipeline, "is_thin", lambda *_: thin)
+    kept, learn = [], pipeline.decouple
+    monkeypatch.setattr(pipeline, "decouple", lambda *given: kept.append(learn(*given)) or kept[-1])
+    asset = reconstruct(balls(), replace(QUICK, decoupling=replace(QUICK.decoupling, domain=asked)))
+    assert (kept[0].surfels is not None) is on_surfels and asset.provenance["report"]["thin"] is thin
+
+
+@pytest.mark.parametrize("domain", ["mesh", "surfels"])
+def test_a_state_of_another_domain_is_not_gone_on_from(domain, tmp_path, monkeypatch, caplog):
+    """As where the first part was learned anew, and is thin now."""
+    for thin in (domain == "surfels", domain != "surfels"):
+        monkeypatch.setattr(pipeline, "is_thin", lambda *_, thin=thin: thin)
+        with caplog.at_level("INFO"):
+            caplog.clear()
+            reconstruct(balls(), QUICK, folder=tmp_path)
+    assert "materials: going on" not in caplog.text and "starting over" in caplog.text
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Light gathered at pixels of a mesh, differentiable in radiance, roughness and normals: `estimator` for torch."""
+"""Light gathered at pixels, differentiable in radiance, roughness and normals: `estimator` for torch."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PARTS = 8
 
 
 class Gatherer:
-    """Draws directions at pixels of a mesh and sums what arrives along them.
+    """Draws directions at pixels and sums what arrives along them.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Gatherer:
     tree : TriangleBVH
         Of its triangles, or of nothing where nothing is in the way.
     cache : (v, 4, 3) float32 array or None
-        See `cache.radiance_cache`; None: what hits the mesh is black.
+        See `radiance_cache.radiance_cache`; None: what hits the mesh is black.
     counts : tuple of int
         Even numbers of cosine, GGX and light samples a pixel.
     normals : bool

@@ -88,7 +88,7 @@ def decouple_jointly(
     on_progress: Callable[[Progress], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
     checkpoint: Path | None = None,
-    thin: bool = False,
+    on_surfels: bool = False,
     start: Array | None = None,
     now: Callable[[], float] = time.monotonic,
 ) -> Decoupled:
@@ -103,7 +103,7 @@ def decouple_jointly(
     on_progress : callable, optional
     cancelled : callable, optional
     checkpoint : Path, optional
-    thin : bool
+    on_surfels : bool
         The first part is on the surfels as they are.
     start : (v, 3) float32 array, optional
     now : callable
@@ -113,8 +113,8 @@ def decouple_jointly(
     Decoupled
         With `Decoupled.surfels`, its mesh among them.
     """
-    domain = domain_of(capture, mesh, settings, start, surfels.gaussians if thin else None)
-    job = JointJob(capture, domain, mesh, surfels, settings, checkpoint, now)
+    began, domain = now(), domain_of(capture, mesh, settings, start, surfels.gaussians if on_surfels else None)
+    job = JointJob(capture, domain, mesh, surfels, settings, checkpoint, now, began)
     return learned(job, on_progress, cancelled)
 
 
@@ -129,11 +129,11 @@ class JointJob(Job):
 
     def __init__(
         self, capture: Capture, domain: Domain, mesh: Mesh, surfels: LearnedSurfels, settings: Settings,
-        checkpoint: Path | None, now: Callable[[], float],
+        checkpoint: Path | None, now: Callable[[], float], began: float | None = None,
     ) -> None:  # fmt: skip
         #: Materials of the surfels, once they are learned.
         self._own: Materials | None = None
-        super().__init__(capture, domain, mesh, settings, checkpoint, CPU, now)
+        super().__init__(capture, domain, mesh, settings, checkpoint, CPU, now, began)
         self._fused = surfels.fused
         background = torch.tensor(background_of(capture), dtype=torch.float32)
         self.learner = Learner(surfels.gaussians, surfels.schedule, surfels.radius, background, CPU)
@@ -145,7 +145,7 @@ class JointJob(Job):
         super().step()
 
     def _begin(self) -> None:
-        """Learn materials of the surfels from now on, beginning with those of the mesh."""
+        """Learn materials of the surfels from now on, beginning with those of the first part."""
         gaussians, settings = self.learner.gaussians, self._settings
         surfels = gaussians.surfels()
         assert surfels.sh is not None
@@ -165,7 +165,7 @@ class JointJob(Job):
                     shown = blend(torch.from_numpy(self._shown), corners, shares).numpy()
                     self._like = LikePoints(shown, surfels.centre, settings.seed)
         colours = srgb_to_linear(np.clip(0.5 + SH0 * surfels.sh[:, 0], 0, 1))
-        self._regularisers = Regularisers(edges, colours, settings, finer)
+        self._regularisers = Regularisers(edges, colours, self._held, finer)
         # Light and exposures go on; moments that begin at 0 need a count of steps that does, too.
         self._own, self._adam_of_own = own, Adam(own.parameters)
         for moments in (self._adam.first, self._adam.second):

@@ -34,11 +34,12 @@ def features(pixels: Pixels, count: int, edges: Array) -> Array:
         Chromaticity (two), log brightness, score; points that no photograph shows take the mean of their
         neighbours along `edges` (e, 2), in turn.
     """
-    corner, share, each = pixels.index.reshape(-1), pixels.share.reshape(-1), pixels.index.shape[1]
-    log = np.repeat(np.log(pixels.colour.mean(axis=1) + _KNEE), each)
+    pixel, column = np.nonzero(pixels.share > 0)
+    corner, share = pixels.index[pixel, column], pixels.share[pixel, column]
+    log = np.log(pixels.colour.mean(axis=1) + _KNEE)[pixel]
     order = np.lexsort((log, corner))
     corner, share, log = corner[order], share[order].clip(1e-6), log[order, None]
-    colour = np.repeat(pixels.colour, each, axis=0)[order]
+    colour = pixels.colour[pixel[order]]
     total = np.bincount(corner, share, count)
     before = np.cumsum(share, dtype=np.float64) - 0.5 * share - (np.cumsum(total) - total)[corner]
     place = before / total[corner]

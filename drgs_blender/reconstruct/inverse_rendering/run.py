@@ -43,6 +43,8 @@ log = logging.getLogger(__name__)
 DEFAULT = Settings()
 #: Steps between two tables of light sampling, between two reports, and seconds between two checkpoints.
 _AIM, _REPORT, _SAVE = 25, 25, 20.0
+#: How much more surfels that photographs show alike are held so than vertices.
+_ALIKE = 3.0
 #: Photographs in display values were exposed for white, unless their mean is less than so much of `brightness`.
 _DARKEST = 0.2
 
@@ -93,7 +95,8 @@ def decouple(
         The mesh has no faces.
     Cancelled
     """
-    job = Job(capture, domain_of(capture, mesh, settings, start, surfels), mesh, settings, checkpoint, backend, now)
+    began, domain = now(), domain_of(capture, mesh, settings, start, surfels)
+    job = Job(capture, domain, mesh, settings, checkpoint, backend, now, began)
     return learned(job, on_progress, cancelled)
 
 
@@ -145,9 +148,10 @@ class Job:
         checkpoint: Path | None,
         backend: LearningBackend,
         now: Callable[[], float],
+        began: float | None = None,
     ) -> None:
         self._domain, self._mesh, self._settings, self._capture = domain, mesh, settings, capture
-        self.schedule, self.score = Schedule(settings, now), Score()
+        self.schedule, self.score = Schedule(settings, now, began), Score()
         self._pixels, points, edges = domain.pixels, domain.points, domain.edges
         self._gain = _gain(capture, float(self._pixels.colour.mean()), settings.brightness)
         self._pixels.colour *= np.float32(self._gain)
@@ -171,7 +175,11 @@ class Job:
             self._shown = features(self._pixels, len(points), edges)
             self._like = LikePoints(self._shown, points, settings.seed)
         colours = np.maximum(cache[:, 0] * 0.28209479, 0)
-        self._regularisers = Regularisers(edges, colours, settings, finer)
+        #: Settings of what holds materials.
+        self._held = settings
+        if domain.surfels is not None:
+            self._held = replace(settings, same_material=_ALIKE * settings.same_material)
+        self._regularisers = Regularisers(edges, colours, self._held, finer)
         #: Logarithm of the brightness of the photographs, one each.
         self._exposure = torch.zeros(len(capture.training)) if settings.exposure else None
         self._adam = Adam(self._learned())

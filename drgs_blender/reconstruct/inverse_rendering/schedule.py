@@ -24,6 +24,8 @@ class Schedule:
     settings : Settings
     now : callable
         Monotonic clock, seconds.
+    began : float, optional
+        When the run began by it; None: now.
 
     Attributes
     ----------
@@ -31,9 +33,11 @@ class Schedule:
         Steps that are done.
     """
 
-    def __init__(self, settings: Settings, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, settings: Settings, now: Callable[[], float] = time.monotonic, began: float | None = None
+    ) -> None:
         self._settings, self._now = settings, now
-        self._spent, self._began = 0.0, now()
+        self._spent, self._began = 0.0, now() if began is None else began
         self.iteration = 0
 
     @property

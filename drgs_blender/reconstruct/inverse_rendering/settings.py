@@ -61,7 +61,7 @@ class Settings:
         leave blotches.
     same_material : float
         Weight of the differences of materials between vertices that photographs show alike, up to about a quarter of
-        the object apart.
+        the object apart; between surfels three times as much, as each is seen by fewer pixels.
     unbiased : bool
         Compare two independent estimates of each pixel, so that their noise is not learned from.
     weight_by_prediction : bool
@@ -75,13 +75,16 @@ class Settings:
         "metallic" learns albedo and metallic; "specular" diffuse and specular colour, turned into the former at the
         end; "dielectric" albedo alone, metallic is 0.
     normals : bool
-        Also learn an offset of each vertex normal, held by `normal_smoothness`.
+        Also learn an offset of each normal, of vertices or of thin things of surfels, held by `normal_smoothness`.
     normal_smoothness : float
         Weight of the squared differences of these offsets along edges, as `smoothness` more on finer meshes.
+    domain : {"auto", "mesh", "surfels"}
+        What materials and normals are learned on: the vertices of the mesh, or the surfels; "auto": the surfels of thin
+        things, the mesh of others. Toys of many small parts may gain by surfels, what is smooth or polished does not.
     joint : float
         Last part of the steps in which the surfels are learned, too, with materials of their own (the paper's way), on
-        the CPU; 0: they stay as they are, and materials are learned on the mesh; 1: from the first step on. Normals and
-        views left out gain on some objects, relit pictures and albedo do not.
+        the CPU; 0: they stay as they are, and materials are learned on the mesh, of thin things on the surfels; 1: from
+        the first step on. Normals and views left out gain on some objects, relit pictures and albedo do not.
     exposure : bool
         Also learn the brightness of every photograph.
     most_pixels : int
@@ -111,13 +114,14 @@ class Settings:
     binary_metallic_prior: Weight = 0.0
     metal_albedo_prior: Weight = 0.05
     metal_smoothness: Weight = 5.0
-    same_material: Weight = 0.01
+    same_material: Weight = 0.003
     unbiased: bool = True
     weight_by_prediction: bool = True
     clipped_neighbour_weight: Part = 0.5
     parametrisation: Literal["metallic", "specular", "dielectric"] = "metallic"
     normals: bool = False
     normal_smoothness: Weight = 0.3
+    domain: Literal["auto", "mesh", "surfels"] = "auto"
     joint: Part = 0.0
     exposure: bool = False
     most_pixels: Annotated[int, Range(1, 1 << 31)] = 2_000_000

@@ -1,4 +1,4 @@
-"""The learned surface: its materials, and normals on top of those of the mesh."""
+"""The learned surface: materials and normals of the points of a domain."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Surfels as the domain of materials: of thin things, of which a mesh makes tubes.
 
-A pixel shows the blend of the surfels that cover most of it. Rays meet their sheets (`render.surfels.sheets`), and
-start above them, as when the asset is rendered.
+A pixel shows the blend of the surfels that cover most of it, those of its heaviest surface. Rays meet their sheets
+(`render.surfels.sheets`) and start above them, as when the asset is rendered.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ...render.reference.raster import camera_rays, pixel_centres
 from ...render.scene.triangle_bvh import TriangleBVH
 from ...render.surfels.sheets import sheets
 from ..capture.capture import Capture, View
-from ..meshing.crops import cropped_views
+from ..meshing.crops import corner_of, cropped_views
 from ..model.contributors import strongest
 from ..model.gaussians import Gaussians
 from .domain import Domain
@@ -53,7 +53,10 @@ def surfel_domain(capture: Capture, gaussians: Gaussians, settings: Settings) ->
     blank = np.zeros(len(vertices), np.float32)
     occluder = Mesh(vertices, faces, np.zeros_like(vertices), blank, blank)
     scale = np.sqrt(np.maximum((u * u).sum(1), (v * v).sum(1)))
-    pixels = of_training_views(capture, settings, lambda k, view: _pixels_of(k, view, gaussians, scale))
+    parts = cropped_views(capture.training, vertices)
+    pixels = of_training_views(
+        capture, settings, lambda k, view: _surfel_pixels(k, view, parts[k], gaussians, normals, scale)
+    )
     owner = np.repeat(np.arange(len(centres)), len(vertices) // max(len(centres), 1))
     edges = neighbours(centres, normals)
     return Domain(centres, normals.astype(np.float32), edges, pixels, occluder, owner, gaussians)
@@ -79,36 +82,49 @@ def carried(values: Array, mesh: Mesh, gaussians: Gaussians, views: list[View]) 
 def neighbours(centres: Array, normals: Array) -> Array:
     """Pairs (e, 2) of surfels that lie side by side on one surface, each once."""
     _, near = cKDTree(centres).query(centres, min(_NEIGHBOURS + 1, len(centres)))
-    pairs = np.stack([np.repeat(np.arange(len(centres)), near.shape[1] - 1), near[:, 1:].ravel()], 1)
+    near = near.reshape(len(centres), -1)
+    pairs = np.stack([np.repeat(np.arange(len(centres)), near.shape[1]), near.ravel()], 1)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     coplanar = np.abs(np.einsum("nc,nc->n", normals[pairs[:, 0]], normals[pairs[:, 1]])) > _COPLANAR
     return np.unique(np.sort(pairs[coplanar], axis=1), axis=0).astype(np.int64)
 
 
-def _pixels_of(number: int, view: View, gaussians: Gaussians, scale: Array) -> Pixels:
-    """The pixels of the view `number` that show surfels, whose larger standard deviations `scale` (n,) are."""
+def _surfel_pixels(number: int, view: View, part: View, gaussians: Gaussians, axes: Array, scale: Array) -> Pixels:
+    """The pixels of the view `number` that show surfels, found in its cropped `part`.
+
+    `axes` (n, 3) and `scale` (n,) are the surfels' normals and larger standard deviations.
+    """
     check_size(view)
-    camera = view.camera
-    with torch.no_grad():
-        shown = gaussians.render(camera, torch.zeros(3), 0, reflections=False)
-    index, weight = strongest(gaussians, camera, _MOST)
-    alpha = shown.maps.alpha.numpy()
-    seen = (alpha > _COVERED) & within_mask(view)
+    camera = part.camera
+    index, weight, depth = strongest(gaussians, camera, _MOST)
+    alpha = weight.sum(axis=-1)
+    # Surfels of few steps may cover nothing whole.
+    seen = (alpha > min(_COVERED, _COVERED * float(alpha.max()))) & within_mask(part)
     row = np.flatnonzero(seen)
+    index, weight, depth = (array.reshape(-1, _MOST)[row] for array in (index, weight, depth))
+    # Of the heaviest surface alone, as when the asset is rendered: others would be lit in between.
+    size = WINDOW_SCALES * scale[index]
+    beside = np.abs(depth[:, :, None] - depth[:, None]) <= size[..., None]
+    heaviest = np.einsum("nij,nj->ni", beside, weight).argmax(axis=1)
+    weight = np.where(beside[np.arange(len(row)), heaviest], weight, 0)
+    share = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
     origin, direction = (a.numpy().astype(np.float32)[row] for a in camera_rays(camera, pixel_centres(camera)))
-    index, weight = index.reshape(-1, _MOST)[row], weight.reshape(-1, _MOST)[row]
-    share = weight / weight.sum(axis=1, keepdims=True)
-    normal = unit(shown.normal.numpy().reshape(-1, 3)[row], (0, 0, 0)).astype(np.float32)
-    depth = (shown.maps.depth.numpy()[seen] / alpha[seen])[:, None]
+    towards = -direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    own = axes[index]
+    facing = np.sign(np.einsum("nkc,nc->nk", own, towards))
+    normal = unit(np.einsum("nk,nkc->nc", share * facing, own), (0, 0, 0)).astype(np.float32)
     along = direction @ -np.asarray(camera.matrix_world, np.float32)[:3, 2]
-    lift = WINDOW_SCALES * (share * scale[index]).sum(axis=1, keepdims=True)
-    part = Pixels(
+    place = origin + ((share * depth).sum(axis=1) / along)[:, None] * direction
+    left, top = corner_of(camera, view.camera)
+    y, x = np.divmod(row, camera.width)
+    found = Pixels(
         np.full(len(row), number, np.int32),
-        row.astype(np.int32),
+        ((y + top) * view.camera.width + x + left).astype(np.int32),
         index,
         share,
-        (origin + depth * direction / along[:, None] + lift * normal).astype(np.float32),
+        (place + (share * size).sum(axis=1, keepdims=True) * normal).astype(np.float32),
         normal,
-        -direction / np.linalg.norm(direction, axis=1, keepdims=True),
-        *photographed(view, seen, row),
+        towards,
+        *photographed(part, seen, row),
     )
-    return part.select(part.usable())
+    return found.select(found.usable())

@@ -1,4 +1,4 @@
-"""Which surfels show in each pixel of a view, and how much: the weights of `raster`, strongest first."""
+"""Which surfels show in each pixel of a view, how much and where: the weights of `raster`, strongest first."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .projection import splat_of
 from .raster import WorldSurfels, arranged, view_of
 
 
-def strongest(gaussians: Gaussians, camera: Camera, most: int) -> tuple[Array, Array]:
+def strongest(gaussians: Gaussians, camera: Camera, most: int) -> tuple[Array, Array, Array]:
     """The `most` surfels that cover most of each pixel of a view.
 
     Returns
@@ -26,19 +26,22 @@ def strongest(gaussians: Gaussians, camera: Camera, most: int) -> tuple[Array, A
         Rows of the surfels, by descending weight; 0 where there are fewer.
     weight : (h, w, most) float32 array
         As in `raster`; 0 where there are fewer.
+    depth : (h, w, most) float32 array
+        Metres along the view.
     """
     parameters, (width, height) = view_of(camera)
     u, v, _ = gaussians.frames()
     numbers = gaussians.centres().numpy(force=True), u, v, gaussians.opacities().numpy(force=True)
     surfels = WorldSurfels(*(np.ascontiguousarray(a, np.float32) for a in numbers))
     order, splats, tiles = arranged(surfels, np.zeros((len(gaussians), 0), np.float32), parameters, (width, height))
-    index, weight = np.zeros((height, width, most), np.int32), np.zeros((height, width, most), np.float32)
-    over_strided(_list_tiles, len(tiles.start) - 1, splats, tiles, order, index, weight)
-    return index, weight
+    index = np.zeros((height, width, most), np.int32)
+    weight, depth = np.zeros((2, height, width, most), np.float32)
+    over_strided(_list_tiles, len(tiles.start) - 1, splats, tiles, order, index, weight, depth)
+    return index, weight, depth
 
 
 @njit
-def _list_tiles(first, last, workers, splats, tiles, order, index, weight):  # type: ignore[no-untyped-def]
+def _list_tiles(first, last, workers, splats, tiles, order, index, weight, depth):  # type: ignore[no-untyped-def]
     height, width, most = index.shape
     rest = np.empty((TILE, TILE), np.float32)
     for worker in range(first, last):
@@ -54,7 +57,7 @@ def _list_tiles(first, last, workers, splats, tiles, order, index, weight):  # t
                         if t < MIN_TRANSMITTANCE:
                             continue
                         ex, ey = np.float32(x + 0.5) - splat.rx, np.float32(y + 0.5) - splat.ry
-                        q, _, _, _, _ = strength(ex, ey, splat, splats.near, splats.far)
+                        q, z, _, _, _ = strength(ex, ey, splat, splats.near, splats.far)
                         if q >= splat.cut:
                             continue
                         w = t * min(splat.opacity * gaussian(q), np.float32(MAX_ALPHA))
@@ -64,5 +67,6 @@ def _list_tiles(first, last, workers, splats, tiles, order, index, weight):  # t
                             place -= 1
                         for k in range(most - 1, place, -1):
                             weight[y, x, k], index[y, x, k] = weight[y, x, k - 1], index[y, x, k - 1]
+                            depth[y, x, k] = depth[y, x, k - 1]
                         if place < most:
-                            weight[y, x, place], index[y, x, place] = w, order[i]
+                            weight[y, x, place], index[y, x, place], depth[y, x, place] = w, order[i], z

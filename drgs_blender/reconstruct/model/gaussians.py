@@ -17,7 +17,6 @@ from ...geometry.normals import quaternions
 from ..backend import CPU, LearningBackend
 from ..capture.training_views import pixel_rays
 from .attributes import COEFFICIENTS, COLOUR, NORMAL, frames
-from .encoding import to_display, to_linear
 from .raster import GradientStatistics, Maps
 from .reflection_probe import dark_cube, pyramid
 
@@ -25,8 +24,6 @@ from .reflection_probe import dark_cube, pyramid
 SH0 = 0.28209479177387814
 #: Logit of the tint of surfels that nothing is known of.
 MATT = -3.0
-#: Coverage below which the colour of a pixel fades.
-_BARE = 1e-3
 
 
 @dataclass(slots=True)
@@ -122,11 +119,7 @@ class Gaussians:
         materials: Tensor | None = None,
         turn: Array | None = None,
     ) -> RenderedView:
-        """Render a view over `background`, (3,) or (h, w, 3), sRGB.
-
-        Colours of surfels are sRGB values, which are decoded and blended as light, as materials are when the asset is
-        lit: what learns to look right when blended in another way would let through too much of what is behind it.
-        The blend is encoded and laid over the background as pictures are.
+        """Render a view over `background`, (3,) or (h, w, 3).
 
         `rays` are `training_views.pixel_rays` where they are at hand, `materials` (n, c) values to blend as well,
         `turn` that of the view (`View.turn`).
@@ -134,14 +127,13 @@ class Gaussians:
         reflections = reflections and self.light is not None
         centre, eye = self.centres(), np.asarray(camera.matrix_world)[:3, 3]
         u, v, opacity, features = self.backend.attributes(self.parameters, centre, eye, bands, reflections)
-        features = torch.cat([to_linear(features[:, :NORMAL]), features[:, NORMAL:]], 1)
         known = features.shape[1]
         if materials is not None:
             features = torch.cat([features, materials], 1)
         maps = self.backend.rasterise(centre, u, v, opacity, features, camera, statistics)
         blended = None if materials is None else maps.features[..., known:]
         maps.features = maps.features[..., :known].contiguous()
-        light, alpha = maps.features[..., COLOUR:NORMAL], maps.alpha[..., None]
+        colour = maps.features[..., COLOUR : COLOUR + 3] + (1 - maps.alpha)[..., None] * background
         if reflections:
             assert self.light is not None
             rays = pixel_rays(camera, self.backend.device) if rays is None else rays
@@ -149,8 +141,7 @@ class Gaussians:
             if turn is not None:
                 to_light = torch.as_tensor(turn, dtype=torch.float32, device=self.backend.device).T
                 features, rays = _turned(features, to_light), (rays @ to_light).contiguous()
-            light = light + self.backend.mirrored(features, maps.alpha, rays, pyramid(self.light))
-        colour = to_display(light / alpha.clamp(min=_BARE)) * alpha + (1 - alpha) * background
+            colour = colour + self.backend.mirrored(features, maps.alpha, rays, pyramid(self.light))
         return RenderedView(colour, maps.features[..., NORMAL : NORMAL + 3], maps, blended)
 
     def select(self, rows: Array) -> Gaussians:
@@ -186,9 +177,7 @@ class Gaussians:
             sh = raw["sh"].copy()
             if self.light is not None:
                 # Harmonics know no mirrors: the mean of what is mirrored.
-                tint = torch.sigmoid(self.parameters["tint"])
-                own = to_linear(torch.from_numpy(0.5 + SH0 * sh[:, 0])) + tint * self.light.exp().mean()
-                sh[:, 0] = (to_display(own).numpy() - 0.5) / SH0
+                sh[:, 0] += torch.sigmoid(self.parameters["tint"]).numpy() * self.light.exp().mean().item() / SH0
             albedo = srgb_to_linear(np.clip(0.5 + SH0 * sh[:, 0], 0, 1))
             return Surfels(
                 self.centres().numpy().copy(), scale, quaternions(frame.astype(np.float64)),

@@ -1,9 +1,9 @@
 """The reflection probe: a learned cube of light around the object, looked up along reflected rays.
 
 A blurred mirror, deferred: each pixel's blended normal reflects the view, each surfel says how much and how blurred.
-Values are light, linear, like the decoded colours that they are added to; Fresnel and occlusion are left to the
-materials' own stage. It is less than the split-sum shading of Ref-Gaussian (Yao et al. 2025), whose other parts did not
-change shapes: docs/decoupling.md has the figures.
+Values are display-encoded, like the colours that they are added to; Fresnel and occlusion are left to the materials'
+own stage. It is less than the split-sum shading of Ref-Gaussian (Yao et al. 2025), whose other parts did not change
+shapes: docs/decoupling.md has the figures.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ BARE = np.float32(0.02)
 _PARTS = 8
 
 
-def dark_cube(value: float = 0.073) -> Tensor:
+def dark_cube(value: float = 0.3) -> Tensor:
     """Logarithms (6, 3, 32, 32) of an even light."""
     return torch.full((6, 3, SHARPEST, SHARPEST), float(np.log(value)))
 
