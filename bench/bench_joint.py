@@ -35,12 +35,13 @@ from drgs_blender.reconstruct.capture.capture import Capture
 from drgs_blender.reconstruct.readers import read_capture
 from drgs_blender.reconstruct.settings import Settings
 
-#: Way -> its name in the table, and `decoupling.joint`.
-WAYS = {
-    "on-the-mesh": ("surfels stay, materials on the mesh", 0.0),
-    "blurred": ("the same, surfels take the values of where they hang", 0.0),
-    "last-half": ("surfels learned in the last half", 0.5),
-    "all": ("surfels learned from the first step", 1.0),
+#: Way -> its name in the table, and settings of decoupling.
+WAYS: dict[str, tuple[str, dict[str, Any]]] = {
+    "on-the-mesh": ("surfels stay, materials on the mesh", {"domain": "mesh"}),
+    "on-surfels": ("surfels stay, materials on them", {"domain": "surfels"}),
+    "blurred": ("on the mesh, surfels take the values of where they hang", {"domain": "mesh"}),
+    "last-half": ("surfels learned in the last half", {"joint": 0.5}),
+    "all": ("surfels learned from the first step", {"joint": 1.0}),
 }
 #: What light meets -> whether the asset is thin, and what rays see.
 RAYS: dict[str, tuple[bool, Any]] = {
@@ -55,9 +56,9 @@ def ways(capture: Capture, folder: Path, truth: Truth, name: str, options: argpa
     rows: dict[str, Any] = {}
     blurred = patch.object(pipeline, "blended_as", lambda gaussians, visible, start, *rest: start)
     for way in options.ways:
-        label, joint = WAYS[way]
+        label, change = WAYS[way]
         settings = Settings()
-        settings = replace(settings, decoupling=replace(settings.decoupling, iterations=options.steps, joint=joint))
+        settings = replace(settings, decoupling=replace(settings.decoupling, iterations=options.steps, **change))
         surfels = learned(capture, name)  # joint learning moves them
         begun = processor_seconds()
         with same_surfels(surfels), blurred if way == "blurred" else nullcontext():
