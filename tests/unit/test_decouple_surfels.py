@@ -14,7 +14,7 @@ torch = pytest.importorskip("torch")
 from capture_cases import camera  # noqa: E402
 
 from drgs_blender.core.asset.model import Mesh  # noqa: E402
-from drgs_blender.core.color import linear_to_srgb  # noqa: E402
+from drgs_blender.core.color import linear_to_srgb, srgb_to_linear  # noqa: E402
 from drgs_blender.core.errors import Cancelled  # noqa: E402
 from drgs_blender.reconstruct.capture.capture import Capture, View  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.regularisers import Regularisers  # noqa: E402
@@ -115,6 +115,8 @@ def test_rays_of_a_leaf_start_on_the_side_that_is_seen(capture, leaf):
     eye = np.array([view.camera.matrix_world[2, 3] for view in capture.views])[pixels.view]
     assert (np.sign(pixels.origin[:, 2]) == np.sign(eye)).all() and (np.sign(pixels.flat[:, 2]) == np.sign(eye)).all()
     assert pixels.share.sum(axis=1) == pytest.approx(1, abs=1e-5)
+    shown = np.stack([view.colour.reshape(-1, 3) for view in capture.training])  # views are cropped to the leaf
+    assert np.array_equal(pixels.colour, srgb_to_linear(shown[pixels.view, pixels.place]))
     facing = Surface(domain.points, domain.normals, SMALL, np.ones(3), True).at(pixels, domain.edges[:5])
     assert (facing.normal.numpy() * pixels.towards).sum(1).min() > 0
 
