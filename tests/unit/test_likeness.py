@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -12,6 +14,7 @@ torch = pytest.importorskip("torch")
 from drgs_blender.core.asset import Mesh  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.likeness import LikePoints, features  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.pixels import Pixels  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.radiance_cache import edges_of  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.regularisers import Regularisers  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.surface import Pairs  # noqa: E402
@@ -35,8 +38,22 @@ def pixels(mesh: Mesh, colour: np.ndarray) -> Pixels:
     third, none = np.full((len(face), 3), 1 / 3, np.float32), np.zeros((len(face), 3), np.float32)
     place = np.arange(len(face), dtype=np.int32)
     return Pixels(
-        view, place, face, third, none, none, none, colour[view, face].astype(np.float32), none > 0, none > 0, none
+        view,
+        place,
+        mesh.faces[face],
+        third,
+        none,
+        none,
+        none,
+        colour[view, face].astype(np.float32),
+        none > 0,
+        none > 0,
     )
+
+
+def of(mesh: Mesh, colour: np.ndarray) -> np.ndarray:
+    """Features of the vertices."""
+    return features(pixels(mesh, colour), len(mesh.vertices), edges_of(mesh.faces))
 
 
 def painted(mesh: Mesh) -> np.ndarray:
@@ -54,7 +71,7 @@ def sides(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 def test_features_leave_highlights_out_and_tell_what_reflects(ball):
     left, right = sides(ball)
-    found = features(pixels(ball, painted(ball)), ball)
+    found = of(ball, painted(ball))
     assert np.isfinite(found).all()
     chroma, log, score = found[:, :2] * 0.03, found[:, 2] * 0.5, found[:, 3] * 0.4
     assert chroma[left] == pytest.approx(np.tile(RED[:2] / RED.sum(), (left.sum(), 1)), abs=0.01)
@@ -63,9 +80,19 @@ def test_features_leave_highlights_out_and_tell_what_reflects(ball):
     assert abs(score[left]).max() < 0.01 and score[right].min() > 0.3
 
 
+def test_points_that_have_no_share_of_a_pixel_take_nothing_of_it(ball):
+    """As where a pixel shows fewer surfels than others."""
+    seen = pixels(ball, painted(ball))
+    padded = replace(
+        seen, index=np.pad(seen.index, ((0, 0), (0, 2))), share=np.pad(seen.share, ((0, 0), (0, 2)))
+    )  # of the first vertex
+    count, edges = len(ball.vertices), edges_of(ball.faces)
+    assert np.array_equal(features(padded, count, edges), features(seen, count, edges))
+
+
 def test_light_of_another_brightness_changes_no_chromaticity_and_no_score(ball):
     colour = 2 * painted(ball)  # bright enough for the knee not to matter much
-    one, other = (features(pixels(ball, c), ball) for c in (colour, 4 * colour))
+    one, other = (of(ball, c) for c in (colour, 4 * colour))
     assert other[:, :2] == pytest.approx(one[:, :2], abs=0.01)
     assert other[:, 3] == pytest.approx(one[:, 3], abs=0.2)
     assert (other[:, 2] - one[:, 2]).mean() * 0.5 == pytest.approx(np.log(4), rel=0.05)
@@ -78,7 +105,7 @@ def test_pairs_of_other_looks_or_from_afar_do_not_count(ball):
     colour[:, spot] = RED[[1, 0, 1]]
     inside = np.setdiff1d(ball.faces[spot], ball.faces[~spot])
     assert len(inside) and len(np.unique(ball.faces[spot])) < 12
-    like = LikePoints(features(pixels(ball, colour), ball), ball.vertices, 0)
+    like = LikePoints(of(ball, colour), ball.vertices, 0)
     pairs, weight = (x.numpy() for x in like.draw(np.random.default_rng(1)))
     assert pairs.shape == (len(weight), 2) and weight.min() >= 0 and weight.max() <= 1
     left, right = sides(ball)
