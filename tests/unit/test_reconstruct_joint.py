@@ -14,7 +14,7 @@ pytest.importorskip("skimage")
 
 from drgs_blender.core.errors import Cancelled  # noqa: E402
 from drgs_blender.geometry.normals import unit  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering import joint, surfel_domain  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering import joint, pixels  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.decoupled import Decoupled  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.domain import mesh_domain  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.joint import JointJob, LearnedSurfels, decouple_jointly  # noqa: E402
@@ -193,7 +193,7 @@ def test_materials_are_carried_by_parts_of_the_photographs(mesh, capture, monkey
         columns = job._columns().numpy()
         parts = carried(columns, mesh, gaussians, capture.training)
         fewer = sum(drawn)
-        monkeypatch.setattr(surfel_domain, "cropped_views", lambda views, _: views)
+        monkeypatch.setattr(pixels, "cropped_views", lambda views, _: views)
         whole = carried(columns, mesh, gaussians, capture.training)
     assert fewer < 0.6 * (sum(drawn) - fewer)
     for a, b in zip(parts, whole, strict=True):

@@ -37,6 +37,8 @@ class Domain:
         Of the training views.
     occluder : Mesh
         What rays meet.
+    tree : TriangleBVH
+        Of its triangles.
     owner : (w,) int64 array
         Point of each vertex of the occluder.
     surfels : Gaussians, optional
@@ -48,35 +50,13 @@ class Domain:
     edges: Array
     pixels: Pixels
     occluder: Mesh
+    tree: TriangleBVH
     owner: Array
     surfels: Gaussians | None = None
 
-    def tree(self, shadows: bool) -> TriangleBVH:
-        """Tree of the triangles that rays meet; of none without shadows."""
-        tree = TriangleBVH()
-        tree.build(self.occluder.vertices, self.occluder.faces[: None if shadows else 0])
-        return tree
-
 
 def mesh_domain(capture: Capture, mesh: Mesh, settings: Settings, normals: Array | None = None) -> Domain:
-    """The vertices of a mesh.
-
-    Parameters
-    ----------
-    capture : Capture
-    mesh : Mesh
-        World space, faces counter-clockwise seen from outside; its materials are not used.
-    settings : Settings
-    normals : (v, 3) float32 array, optional
-        Unit normals to begin with, in place of the smooth ones.
-
-    Raises
-    ------
-    AssetError
-        The mesh has no faces.
-    UsageError
-        As of `pixels.of_training_views`; a picture and its camera of different sizes.
-    """
+    """The vertices of a mesh; parameters and errors are those of `run.decouple`, `normals` its `start`."""
     if not len(mesh.faces):
         raise AssetError("mesh", "has no faces", "Decoupling needs the surface")
     tree = TriangleBVH()
@@ -84,4 +64,4 @@ def mesh_domain(capture: Capture, mesh: Mesh, settings: Settings, normals: Array
     pixels = of_training_views(capture, settings, lambda k, view: pixels_of(k, view, mesh, tree))
     if normals is None:
         normals = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
-    return Domain(mesh.vertices, normals, edges_of(mesh.faces), pixels, mesh, np.arange(len(mesh.vertices)))
+    return Domain(mesh.vertices, normals, edges_of(mesh.faces), pixels, mesh, tree, np.arange(len(mesh.vertices)))

@@ -165,7 +165,7 @@ class JointJob(Job):
                     shown = blend(torch.from_numpy(self._shown), corners, shares).numpy()
                     self._like = LikePoints(shown, surfels.centre, settings.seed)
         colours = srgb_to_linear(np.clip(0.5 + SH0 * surfels.sh[:, 0], 0, 1))
-        self._regularisers = Regularisers(edges, colours, self._held, finer)
+        self._regularisers = Regularisers(edges, colours, settings, finer)
         # Light and exposures go on; moments that begin at 0 need a count of steps that does, too.
         self._own, self._adam_of_own = own, Adam(own.parameters)
         for moments in (self._adam.first, self._adam.second):

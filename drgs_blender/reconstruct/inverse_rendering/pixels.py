@@ -15,6 +15,7 @@ from ...core.errors import UsageError
 from ...render.reference.raster import camera_rays, pixel_centres
 from ...render.scene.triangle_bvh import TriangleBVH
 from ..capture.capture import Capture, View
+from ..meshing.crops import cropped_views
 from .losses import CLIPPED
 from .settings import Settings
 
@@ -160,6 +161,16 @@ def pixels_of(index: int, view: View, mesh: Mesh, tree: TriangleBVH) -> Pixels:
     )
     # A face seen from behind is an error of the mesh, or of its orientation: nothing can be learned there.
     return part.select(part.usable())
+
+
+def onto_vertices(mesh: Mesh, views: list[View], shown: Callable[[View], Array]) -> Array:
+    """Sums (v, c) at a mesh's vertices of what is `shown` (h, w, c) of it in views cropped to it; see `Pixels.onto`."""
+    tree, total = TriangleBVH(), np.zeros(())
+    tree.build(mesh.vertices, mesh.faces)
+    for index, view in enumerate(cropped_views(views, mesh.vertices)):
+        pixels, picture = pixels_of(index, view, mesh, tree), shown(view)
+        total = total + pixels.onto(picture.reshape(-1, picture.shape[-1])[pixels.place], len(mesh.vertices))
+    return total
 
 
 def check_size(view: View) -> None:

@@ -17,6 +17,7 @@ from torch import Tensor
 from ...core.asset.model import Mesh
 from ...core.errors import Cancelled
 from ...render.reference.brdf import MIN_GGX_ALPHA, dot
+from ...render.scene.triangle_bvh import TriangleBVH
 from .. import checkpoint as states
 from ..backend import CPU, LearningBackend
 from ..capture.capture import Capture
@@ -150,6 +151,8 @@ class Job:
         now: Callable[[], float],
         began: float | None = None,
     ) -> None:
+        if domain.surfels is not None:
+            settings = replace(settings, same_material=_ALIKE * settings.same_material)
         self._domain, self._mesh, self._settings, self._capture = domain, mesh, settings, capture
         self.schedule, self.score = Schedule(settings, now, began), Score()
         self._pixels, points, edges = domain.pixels, domain.points, domain.edges
@@ -158,7 +161,8 @@ class Job:
         cache, self._weight = radiance_cache(self._pixels, len(points), edges)
         counts = (settings.cosine, settings.ggx, settings.light)
         sent = cache[domain.owner] if settings.indirect else None
-        gatherer = backend.gatherer(domain.occluder, domain.tree(settings.shadows), sent, counts, settings.normals)
+        tree = domain.tree if settings.shadows else TriangleBVH()  # an empty one: nothing is in the way
+        gatherer = backend.gatherer(domain.occluder, tree, sent, counts, settings.normals)
 
         # Grey light that shows a surface of albedo .4 as bright as the photographs, which has their hue. Colours begin
         # without any detail: light is to explain shading before albedo can.
@@ -175,11 +179,7 @@ class Job:
             self._shown = features(self._pixels, len(points), edges)
             self._like = LikePoints(self._shown, points, settings.seed)
         colours = np.maximum(cache[:, 0] * 0.28209479, 0)
-        #: Settings of what holds materials.
-        self._held = settings
-        if domain.surfels is not None:
-            self._held = replace(settings, same_material=_ALIKE * settings.same_material)
-        self._regularisers = Regularisers(edges, colours, self._held, finer)
+        self._regularisers = Regularisers(edges, colours, settings, finer)
         #: Logarithm of the brightness of the photographs, one each.
         self._exposure = torch.zeros(len(capture.training)) if settings.exposure else None
         self._adam = Adam(self._learned())

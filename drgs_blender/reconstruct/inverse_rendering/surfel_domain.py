@@ -22,7 +22,7 @@ from ..meshing.crops import corner_of, cropped_views
 from ..model.contributors import strongest
 from ..model.gaussians import Gaussians
 from .domain import Domain
-from .pixels import Pixels, check_size, of_training_views, photographed, pixels_of, within_mask
+from .pixels import Pixels, check_size, of_training_views, onto_vertices, photographed, within_mask
 from .radiance_cache import edges_of, filled
 from .settings import Settings
 
@@ -59,22 +59,22 @@ def surfel_domain(capture: Capture, gaussians: Gaussians, settings: Settings) ->
     )
     owner = np.repeat(np.arange(len(centres)), len(vertices) // max(len(centres), 1))
     edges = neighbours(centres, normals)
-    return Domain(centres, normals.astype(np.float32), edges, pixels, occluder, owner, gaussians)
+    tree = TriangleBVH()
+    tree.build(vertices, faces)
+    return Domain(centres, normals.astype(np.float32), edges, pixels, occluder, tree, owner, gaussians)
 
 
 def carried(values: Array, mesh: Mesh, gaussians: Gaussians, views: list[View]) -> tuple[Array, Array]:
     """Values (v, c) in [0, 1] of a mesh's vertices, means of what views show of the surfels', and who is seen (v,)."""
-    tree = TriangleBVH()
-    tree.build(mesh.vertices, mesh.faces)
     columns = torch.from_numpy(np.asarray(values, np.float32))
-    total = np.zeros((len(mesh.vertices), columns.shape[1] + 1))
-    for k, view in enumerate(cropped_views(views, mesh.vertices)):
-        pixels = pixels_of(k, view, mesh, tree)
+
+    def shown(view: View) -> Array:
         with torch.no_grad():
-            shown = gaussians.render(view.camera, torch.zeros(3), 0, reflections=False, materials=columns)
-        assert shown.materials is not None
-        maps = torch.cat([shown.materials, shown.maps.alpha[..., None]], 2)
-        total += pixels.onto(maps.flatten(0, 1).numpy()[pixels.place], len(total))
+            rendered = gaussians.render(view.camera, torch.zeros(3), 0, reflections=False, materials=columns)
+        assert rendered.materials is not None
+        return torch.cat([rendered.materials, rendered.maps.alpha[..., None]], 2).numpy()
+
+    total = onto_vertices(mesh, views, shown)
     seen = total[:, -1] > 1e-3
     return np.clip(filled(total[:, :-1] / np.maximum(total[:, -1:], 1e-9), seen, edges_of(mesh.faces)), 0, 1), seen
 

@@ -11,10 +11,8 @@ import numpy as np
 from ...core.arrays import Array
 from ...core.asset.model import Mesh
 from ...geometry.normals import VertexNormals, unit
-from ...render.scene.triangle_bvh import TriangleBVH
 from ..capture.capture import View
-from ..inverse_rendering.pixels import Normals, pixels_of
-from .crops import cropped_views
+from ..inverse_rendering.pixels import Normals, onto_vertices
 
 #: Least cosine between both; a surfel's normal that is farther off is of something else.
 ALIKE = 0.5
@@ -35,13 +33,7 @@ def with_surfel_normals(mesh: Mesh, views: list[View], normals: Normals) -> Arra
     (v, 3) float32 array
         Unit; those of the mesh where no view shows a vertex, or something else.
     """
-    tree = TriangleBVH()
-    tree.build(mesh.vertices, mesh.faces)
     own = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
-    total = np.zeros((len(own), 3))
-    for index, view in enumerate(cropped_views(views, mesh.vertices)):
-        pixels = pixels_of(index, view, mesh, tree)
-        total += pixels.onto(unit(normals(view).reshape(-1, 3)[pixels.place], (0, 0, 0)), len(own))
-    shown = unit(total, (0, 0, 0))
+    shown = unit(onto_vertices(mesh, views, lambda view: unit(normals(view), (0, 0, 0))), (0, 0, 0))
     alike = (shown * own).sum(axis=1, keepdims=True) > ALIKE
     return unit(own + np.where(alike, shown, 0)).astype(np.float32)
