@@ -9,11 +9,14 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import bpy
+import numpy as np
 
-from ..drgs_blender.core.asset import Asset
+from ..drgs_blender.core.asset import Asset, Mesh
 from ..drgs_blender.core.asset.container import read_asset
+from ..drgs_blender.core.asset.part import vertices_of
 from ..drgs_blender.core.errors import AssetError, UsageError
 from ..drgs_blender.core.frame_sequences import frame_path
+from . import mesh_arrays
 from .blend_paths import relative
 from .preferences import ROOT
 
@@ -162,6 +165,25 @@ def load(path: Path) -> Asset:
 def forget() -> None:
     """Close every asset."""
     _open.clear()
+
+
+def captured_mesh(obj: bpy.types.Object) -> Mesh:
+    """Vertices of the asset, with their channels, for those of the mesh of `obj`; new ones have those of the first.
+
+    Raises
+    ------
+    AssetError
+        The file is absent, or the mesh is not the asset's any more.
+    """
+    own = load(file_of(obj)).mesh
+    rows = mesh_arrays.source_rows(obj.data, len(own.vertices))
+    if rows is None:
+        raise AssetError(
+            f'Object "{obj.name}"',
+            f"its mesh has {len(obj.data.vertices)} vertices, the asset {len(own.vertices)}",
+            "Undo the edit, or import the asset again",
+        )
+    return own if np.array_equal(rows, np.arange(len(own.vertices))) else vertices_of(own, rows.clip(0))
 
 
 def _unpack(volume: bpy.types.Volume) -> Path:

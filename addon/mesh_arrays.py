@@ -17,6 +17,8 @@ ATTRIBUTES = {
 }
 #: Types of attributes that brushes can paint.
 COLOURS = ("FLOAT_COLOR", "BYTE_COLOR")
+#: Attribute with the asset's vertex that each vertex is, and a checksum of that number.
+SOURCE_VERTEX = "drgs_vertex"
 #: Types of attributes besides colours that can be masks.
 MASKS = {"BOOLEAN": bool, "FLOAT": np.float32}
 
@@ -38,10 +40,66 @@ def new_mesh(name: str, source: Mesh) -> bpy.types.Mesh:
         mask = np.zeros(len(source.vertices), bool)
         mask[members] = True
         mesh.attributes.new(group, "BOOLEAN", "POINT").data.foreach_set("value", mask)
+    write_source_vertices(mesh)
     mesh.attributes.default_color_name = mesh.attributes.active_color_name = "albedo"
     mesh.update(calc_edges=True)
     mesh.shade_smooth()
     return mesh
+
+
+def write_source_vertices(mesh: bpy.types.Mesh, rows: Array | None = None) -> None:
+    """Have every vertex know which of its asset's it is, whatever is deleted, duplicated or reordered later.
+
+    Parameters
+    ----------
+    mesh : bpy.types.Mesh
+    rows : (n,) int32 array, optional
+        The asset's vertex of each, -1: none; by default the asset's in its order.
+    """
+    if (old := mesh.attributes.get(SOURCE_VERTEX)) is not None:
+        mesh.attributes.remove(old)
+    rows = np.arange(len(mesh.vertices), dtype=np.int32) if rows is None else rows
+    attribute = mesh.attributes.new(SOURCE_VERTEX, "INT32_2D", "POINT")
+    attribute.data.foreach_set("value", np.column_stack((rows, _checksum(rows))).ravel())
+
+
+def read_source_vertices(mesh: bpy.types.Mesh) -> Array | None:
+    """(n,) int32 asset's vertex of each vertex, -1 of new ones; None where the mesh does not know.
+
+    What Blender blended of several vertices (subdivided edges, cuts) has no number whose checksum is right.
+    """
+    attribute = mesh.attributes.get(SOURCE_VERTEX)
+    if attribute is None or (attribute.data_type, attribute.domain) != ("INT32_2D", "POINT"):
+        return None
+    values = np.empty(2 * len(mesh.vertices), np.int32)
+    attribute.data.foreach_get("value", values)
+    rows, sums = values[::2], values[1::2]
+    return np.where((rows >= 0) & (_checksum(rows) == sums), rows, -1).astype(np.int32)
+
+
+def source_rows(mesh: bpy.types.Mesh, count: int) -> Array | None:
+    """(n,) int32 asset's vertex of each vertex of a mesh, -1 of new ones; None where that is not known.
+
+    A mesh that knows nothing, as those of older files, has the vertices of the asset if it has as many.
+
+    Parameters
+    ----------
+    mesh : bpy.types.Mesh
+    count : int
+        Vertices of the asset.
+    """
+    rows = read_source_vertices(mesh)
+    if rows is not None and (rows < count).all() and (rows >= 0).any():
+        return rows
+    return np.arange(count, dtype=np.int32) if len(mesh.vertices) == count else None
+
+
+def _checksum(rows: Array) -> Array:
+    """(n,) int32: the finaliser of MurmurHash3, which is 0 of no number below 2^31 that is not -1."""
+    x = rows.astype(np.uint32) + np.uint32(1)
+    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+        x = (x ^ (x >> np.uint32(shift))) * np.uint32(factor)
+    return (x ^ (x >> np.uint32(16))).view(np.int32)
 
 
 def write_channel(mesh: bpy.types.Mesh, channel: str, values: Array) -> None:
@@ -139,7 +197,8 @@ def read_mask(obj: bpy.types.Object, mesh: bpy.types.Mesh, name: str) -> Array |
     """
     group, attribute = obj.vertex_groups.get(name), mesh.attributes.get(name)
     if group is not None:
-        return group_weights(obj.original.data, group.index)
+        own = obj.original.data  # an evaluated mesh need not have the weights; one of other vertices has its own
+        return group_weights(own if len(own.vertices) == len(mesh.vertices) else mesh, group.index)
     if attribute is None or not is_mask(attribute):
         return None
     if attribute.data_type in COLOURS:
@@ -194,8 +253,8 @@ def read_edges(mesh: bpy.types.Mesh) -> Array:
 
 
 def read_corner_normals(mesh: bpy.types.Mesh) -> Array:
-    """(m, 3, 3) float32 unit normals, object space, of the corners of a mesh of triangles."""
-    normals = np.empty((len(mesh.polygons), 3, 3), np.float32)
+    """(l, 3) float32 unit normals, object space, of all corners."""
+    normals = np.empty((len(mesh.loops), 3), np.float32)
     mesh.corner_normals.foreach_get("vector", normals.ravel())
     return normals
 
@@ -215,11 +274,7 @@ def has_smooth_triangles(mesh: bpy.types.Mesh) -> bool:
 
 def smooth_or_corner_normals(mesh: bpy.types.Mesh) -> Array | None:
     """(l, 3) float32 unit normals, object space, of all corners; None where `has_smooth_triangles`."""
-    if has_smooth_triangles(mesh):
-        return None
-    normals = np.empty((len(mesh.loops), 3), np.float32)
-    mesh.corner_normals.foreach_get("vector", normals.ravel())
-    return normals
+    return None if has_smooth_triangles(mesh) else read_corner_normals(mesh)
 
 
 def read_vertex_normals(mesh: bpy.types.Mesh) -> Array | None:
@@ -245,6 +300,14 @@ def read_loop_triangles(mesh: bpy.types.Mesh) -> tuple[Array, Array]:
     mesh.loop_triangles.foreach_get("loops", corners.ravel())
     mesh.loop_triangle_polygons.foreach_get("value", polygons)
     return corners, polygons
+
+
+def read_polygons(mesh: bpy.types.Mesh) -> tuple[Array, Array]:
+    """(p,) int32 first corner of every polygon, and how many it has."""
+    start, total = np.empty(len(mesh.polygons), np.int32), np.empty(len(mesh.polygons), np.int32)
+    mesh.polygons.foreach_get("loop_start", start)
+    mesh.polygons.foreach_get("loop_total", total)
+    return start, total
 
 
 def read_corner_vertices(mesh: bpy.types.Mesh) -> Array:

@@ -181,7 +181,8 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
         if not bpy.data.filepath and self.directory.startswith("//"):
             raise UsageError("Folder", f"{self.directory} lies beside the .blend, which is not saved", "Save it first")
         evaluated = obj.evaluated_get(context.evaluated_depsgraph_get())
-        same = check_topology(evaluated, evaluated.data, assets.load(assets.file_of(obj)).mesh, messages.Warnings())
+        fit = check_topology(evaluated, evaluated.data, assets.load(assets.file_of(obj)).mesh, messages.Warnings())
+        same = fit.part is None and fit.corners is None
         uvs = mesh_arrays.read_uvs(evaluated.data, "")
         if not same or uvs is None:
             raise UsageError(

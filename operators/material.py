@@ -11,8 +11,8 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
 from ..addon import assets, mesh_arrays
 from ..addon.viewport_material import update_viewport_material
-from ..drgs_blender.core.asset import BASE_CHANNELS, MATERIAL_CHANNELS, OPTIONAL_CHANNELS, Mesh
-from ..drgs_blender.core.errors import AssetError, UsageError
+from ..drgs_blender.core.asset import BASE_CHANNELS, MATERIAL_CHANNELS, OPTIONAL_CHANNELS
+from ..drgs_blender.core.errors import UsageError
 from . import selection
 from .base import DrgsOperator
 from .nearest_surface import nearest, source_of
@@ -136,7 +136,7 @@ class DRGS_OT_restore_material(DrgsOperator, selection.ObjectMode, bpy.types.Ope
 
     def run(self, context: bpy.types.Context) -> set[str]:
         for obj in selection.editable(selection.selected(context), data=True):
-            mesh_arrays.restore_channels(obj.data, captured(obj))
+            mesh_arrays.restore_channels(obj.data, assets.captured_mesh(obj))
             update_viewport_material(obj.data)
             obj.drgs.adjustment.reset()
         return {"FINISHED"}
@@ -228,30 +228,12 @@ def set_material(obj: bpy.types.Object, preset: Preset, weight: Array) -> None:
 
 
 def present(obj: bpy.types.Object, channel: str) -> Array:
-    """A material channel as it is rendered now, without modifiers; see `captured` for the errors."""
+    """A material channel as it is rendered now, without modifiers; see `assets.captured_mesh` for the errors."""
     try:
         values = mesh_arrays.read_channel(obj.data, channel)
     except TypeError:  # an attribute of another kind, which the render does not heed either
         values = None
-    return captured(obj).channel(channel) if values is None else values
-
-
-def captured(obj: bpy.types.Object) -> Mesh:
-    """The mesh of the asset, which has as many vertices as that of `obj`.
-
-    Raises
-    ------
-    AssetError
-        The file is absent, or the mesh is not the asset's any more.
-    """
-    own = assets.load(assets.file_of(obj)).mesh
-    if len(own.vertices) != len(obj.data.vertices):
-        raise AssetError(
-            f'Object "{obj.name}"',
-            f"its mesh has {len(obj.data.vertices)} vertices, the asset {len(own.vertices)}",
-            "Undo the edit, or import the asset again",
-        )
-    return own
+    return assets.captured_mesh(obj).channel(channel) if values is None else values
 
 
 CLASSES = (

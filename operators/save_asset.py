@@ -7,10 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import bpy
+import numpy as np
 from bpy.props import BoolProperty, StringProperty
 
 from ..addon import assets, blend_paths, mesh_arrays, messages
 from ..addon.export.objects import appearance_of
+from ..addon.export.topology_check import check_topology
 from ..addon.viewport_material import update_viewport_material
 from ..drgs_blender.core.asset.container import write_asset
 from ..drgs_blender.core.errors import UsageError
@@ -68,9 +70,12 @@ class DRGS_OT_save_asset(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
                 self.report({"WARNING"}, f"{problem}; the file has the adjusted materials of their vertices")
         if self.use_saved:
             for obj, target in zip(selection.editable(objects, vertices=False, data=True), paths):
+                rows = rows_in_part(obj, context.evaluated_depsgraph_get())
                 obj.drgs.asset = assets.anchor(target)
                 obj.drgs.adjustment.reset()
-                mesh_arrays.restore_channels(obj.data, assets.load(target).mesh)
+                if rows is not None:
+                    mesh_arrays.write_source_vertices(obj.data, rows)
+                mesh_arrays.restore_channels(obj.data, assets.captured_mesh(obj))
                 update_viewport_material(obj.data)
         self.report({"INFO"}, f"Saved {', '.join(map(str, paths))}")
         return {"FINISHED"}
@@ -90,11 +95,26 @@ def save(obj: bpy.types.Object, path: Path, depsgraph: bpy.types.Depsgraph) -> i
     """
     source = assets.file_of(obj)
     asset = assets.load(source)
-    painted, adjustment = appearance_of(obj.evaluated_get(depsgraph), asset, messages.Warnings())
+    asset, _, painted, adjustment = appearance_of(obj.evaluated_get(depsgraph), asset, messages.Warnings())
     edited = edited_asset(asset, painted, adjustment)
     write_asset(path, replace(edited, provenance={**asset.provenance, "edited_from": source.name}))
     textures = asset.mesh.textures
     return 0 if textures is None else edited_textures(asset.mesh, textures, painted, adjustment)[1]
+
+
+def rows_in_part(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray | None:
+    """(n,) int32 number of each vertex of the mesh of `obj` in what `save` writes, -1 of none; None where all is."""
+    rest, evaluated = assets.load(assets.file_of(obj)).mesh, obj.evaluated_get(depsgraph)
+    part = check_topology(evaluated, evaluated.data, rest, messages.Warnings()).part
+    if part is None:
+        return None
+    rows = mesh_arrays.source_rows(obj.data, len(rest.vertices))
+    assert rows is not None, "the evaluated mesh knows them"
+    if len(evaluated.data.vertices) == len(rows):
+        return np.where(rows >= 0, np.cumsum(rows >= 0) - 1, -1).astype(np.int32)
+    number = np.full(len(rest.vertices) + 1, -1, np.int32)  # modifiers leave vertices out: the first copy of each
+    number[part.vertices[::-1]] = np.arange(len(part.vertices), dtype=np.int32)[::-1]
+    return number[rows]
 
 
 CLASSES = (DRGS_OT_save_asset,)

@@ -8,6 +8,7 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.core.arrays import same_bits
+from ...drgs_blender.core.asset.part import Part
 from ...drgs_blender.core.frame import Frame, MotionStep, Pose
 from .. import mesh_arrays
 from .camera import export_camera, picture_of
@@ -55,6 +56,15 @@ def add_moments(
             frame_set(now, part)
 
 
+def _vertices(mesh: bpy.types.Mesh, part: Part | None) -> Array:
+    """Vertices of a mesh, or of the part of an asset that it has now; all of them where it has another then."""
+    vertices = mesh_arrays.read_vertices(mesh)
+    rows = None if part is None else mesh_arrays.read_source_vertices(mesh)
+    if part is None or rows is None or not np.array_equal(rows[rows >= 0], part.vertices):
+        return vertices
+    return vertices[rows >= 0]
+
+
 def _moment(
     frame: Frame,
     depsgraph: bpy.types.Depsgraph,
@@ -78,7 +88,7 @@ def _moment(
         if shape not in vertices and not mesh.is_editmode:
             pointer = mesh.as_pointer()
             if pointer not in read:
-                read[pointer] = mesh_arrays.read_vertices(mesh)
+                read[pointer] = _vertices(mesh, frame.objects[shape[1]].part if shape[0] == "object" else None)
                 read[pointer].flags.writeable = False
             vertices[shape] = read[pointer]
 

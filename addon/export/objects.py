@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
 
 from ...drgs_blender.core.asset import MATERIAL_CHANNELS, Asset
+from ...drgs_blender.core.asset.part import part_of
 from ...drgs_blender.core.frame import Adjustment, ObjectState
 from ...drgs_blender.core.materials import ShaderAOV
 from ...drgs_blender.core.passes import Pass
@@ -23,11 +24,31 @@ from .instances import Key, Visible, terminator_offset
 from .materials import finite
 from .meshes import check_normals
 from .surface_nodes import SurfaceWalker
-from .topology_check import check_modifiers, check_topology
+from .topology_check import Fit, check_modifiers, check_topology
 
 Warn = Callable[[str], None]
 #: Gives the engine's key of the asset at a path.
 KeyOf = Callable[[Path], str]
+
+
+class Appearance(NamedTuple):
+    """What an object has of its asset, and how that differs.
+
+    Attributes
+    ----------
+    asset : Asset
+        Of what is left of it.
+    vertices : (n, 3) float32 array
+        Object space, evaluated.
+    painted : dict of str to array
+        Channels of the vertices that differ from the asset's.
+    adjustment : Adjustment, optional
+    """
+
+    asset: Asset
+    vertices: np.ndarray
+    painted: dict[str, np.ndarray]
+    adjustment: Adjustment | None
 
 
 class DrgsObjects:
@@ -115,49 +136,54 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     mesh = obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph) if editing else obj.data
     try:
         point_caches.check(obj, asset.mesh, warn, final=depsgraph.mode == "RENDER")
-        same_faces = check_topology(obj, mesh, asset.mesh, warn)
+        fit = check_topology(obj, mesh, asset.mesh, warn)
         arrays: dict[str, Any] = {
-            "vertices": mesh_arrays.read_vertices(mesh),
-            "corner_normals": _corner_normals(obj, mesh, same_faces, warn),
-            **{c: None if captured else _edited(obj, mesh, asset, c, warn) for c in MATERIAL_CHANNELS},
+            "vertices": fit.of_part(mesh_arrays.read_vertices(mesh)),
+            "corner_normals": _corner_normals(obj, mesh, fit, warn),
+            **{c: None if captured else _edited(obj, mesh, asset, c, fit, warn) for c in MATERIAL_CHANNELS},
         }
         for array in arrays.values():
             if array is not None:
                 array.flags.writeable = False  # so that the engine's client need not copy it
         appearance = cache_playback.fracture_state(obj)
-        adjustment = None if captured else _adjustment(obj, mesh, warn)
-        return ObjectState(name=obj.name, asset=key_of(path), adjustment=adjustment, **arrays, **appearance)
+        adjustment = None if captured else _adjustment(obj, mesh, fit, warn)
+        return ObjectState(
+            name=obj.name, asset=key_of(path), part=fit.part, adjustment=adjustment, **arrays, **appearance
+        )
     finally:
         if editing:
             obj.to_mesh_clear()
 
 
-def appearance_of(obj: bpy.types.Object, asset: Asset, warn: Warn) -> tuple[dict[str, np.ndarray], Adjustment | None]:
-    """Painted channels of an evaluated object in Object Mode that differ from its asset, and its adjustments.
+def appearance_of(obj: bpy.types.Object, asset: Asset, warn: Warn) -> Appearance:
+    """What an evaluated object in Object Mode has of its asset, and how that differs.
 
     Raises
     ------
     AssetError
-        Its mesh is not the asset's, moved; names the object.
+        Its mesh is not the asset's any more; names the object.
     """
-    check_topology(obj, obj.data, asset.mesh, warn)
-    painted = {channel: _edited(obj, obj.data, asset, channel, warn) for channel in MATERIAL_CHANNELS}
-    return {name: values for name, values in painted.items() if values is not None}, _adjustment(obj, obj.data, warn)
+    fit = check_topology(obj, obj.data, asset.mesh, warn)
+    painted = {channel: _edited(obj, obj.data, asset, channel, fit, warn) for channel in MATERIAL_CHANNELS}
+    return Appearance(
+        asset if fit.part is None else part_of(asset, fit.part, f'Object "{obj.name}"'),
+        fit.of_part(mesh_arrays.read_vertices(obj.data)),
+        {name: values for name, values in painted.items() if values is not None},
+        _adjustment(obj, obj.data, fit, warn),
+    )
 
 
-def _corner_normals(obj: bpy.types.Object, mesh: bpy.types.Mesh, same_faces: bool, warn: Warn) -> np.ndarray | None:
+def _corner_normals(obj: bpy.types.Object, mesh: bpy.types.Mesh, fit: Fit, warn: Warn) -> np.ndarray | None:
     """Normals per corner where the mesh has flat, sharp or custom ones; smooth ones the engine makes itself."""
     if mesh.normals_domain == "POINT":
         return None
-    if not same_faces:
-        warn(f'"{obj.name}": its faces are not those of the asset, so it is shaded smooth')
-        return None
     normals = mesh_arrays.read_corner_normals(mesh)
+    normals = normals.reshape(-1, 3, 3) if fit.corners is None else normals[fit.corners]
     check_normals(obj.name, mesh, normals, warn)
     return normals
 
 
-def _adjustment(obj: bpy.types.Object, mesh: bpy.types.Mesh, warn: Warn) -> Adjustment | None:
+def _adjustment(obj: bpy.types.Object, mesh: bpy.types.Mesh, fit: Fit, warn: Warn) -> Adjustment | None:
     """The adjustments of an object; None where they change nothing."""
     settings = obj.drgs.adjustment
     if not settings.values():
@@ -171,13 +197,16 @@ def _adjustment(obj: bpy.types.Object, mesh: bpy.types.Mesh, warn: Warn) -> Adju
                 "points; they are applied nowhere"
             )
             return None
+        mask = fit.of_part(mask)
         if lost := int((~np.isfinite(mask)).sum()):
             warn(f'"{obj.name}": {lost} values of the mask "{settings.mask}" are not finite; 0 is used there')
             mask = np.nan_to_num(mask, posinf=0.0, neginf=0.0)
     return settings.to_frame(mask, warn)
 
 
-def _edited(obj: bpy.types.Object, mesh: bpy.types.Mesh, asset: Asset, channel: str, warn: Warn) -> np.ndarray | None:
+def _edited(
+    obj: bpy.types.Object, mesh: bpy.types.Mesh, asset: Asset, channel: str, fit: Fit, warn: Warn
+) -> np.ndarray | None:
     """A material channel where it differs from the asset's, else None."""
     try:
         values = mesh_arrays.read_channel(mesh, channel)
@@ -186,7 +215,8 @@ def _edited(obj: bpy.types.Object, mesh: bpy.types.Mesh, asset: Asset, channel: 
         return None
     if values is None:
         return None
-    own, lost = asset.mesh.channel(channel), np.isnan(values)
+    values, own = fit.of_part(values), fit.of_asset(asset.mesh.channel(channel))
+    lost = np.isnan(values)
     if lost.any():
         warn(f'"{obj.name}": {lost.sum()} values of attribute {channel} are not finite; the asset\'s are used there')
         values[lost] = own[lost]

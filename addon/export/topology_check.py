@@ -1,15 +1,18 @@
-"""The topology check: whether an evaluated mesh is the asset's, moved: the same vertices, joined by the same faces."""
+"""The topology check: what an evaluated mesh has of its asset: all of it, moved, or a part."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import bpy
 import numpy as np
 
 from ...drgs_blender.core.asset import Mesh
+from ...drgs_blender.core.asset.part import Part
 from ...drgs_blender.core.errors import AssetError
 from .. import mesh_arrays
+from .face_match import match_faces
 
 Array = np.ndarray
 
@@ -21,10 +24,16 @@ DEFORMING = {
     *("DATA_TRANSFER", "NORMAL_EDIT", "WEIGHTED_NORMAL", "UV_PROJECT", "UV_WARP", "VERTEX_WEIGHT_EDIT"),
     *("VERTEX_WEIGHT_MIX", "VERTEX_WEIGHT_PROXIMITY", "DYNAMIC_PAINT", "PARTICLE_SYSTEM"),
 }
+#: Modifiers that make all faces anew, and how.
+REMODELLING = {
+    "SUBSURF": "subdividing the mesh", "MULTIRES": "subdividing the mesh", "DECIMATE": "merging faces",
+    "REMESH": "making a new mesh", "MIRROR": "mirroring the mesh", "SKIN": "making a new mesh",
+    "SCREW": "making a new mesh", "OCEAN": "making a new mesh",
+}  # fmt: skip
 
 
 def check_modifiers(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
-    """Refuse an object that is subdivided last of all, before its mesh is asked for.
+    """Refuse an object whose faces a modifier makes anew, before its mesh is asked for.
 
     From 5.0 on Blender subdivides only when somebody looks at the result, which may take minutes.
 
@@ -38,54 +47,89 @@ def check_modifiers(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> No
     limit = render.simplify_subdivision_render if final else render.simplify_subdivision
     for modifier in reversed(obj.original.modifiers):
         shown = modifier.show_render if final else modifier.show_viewport
-        if not shown or modifier.type in DEFORMING:
+        if not shown or modifier.type in DEFORMING or not len(obj.original.data.polygons):
             continue
-        if modifier.type == "SUBSURF" and len(obj.original.data.polygons):
+        if modifier.type in ("SUBSURF", "MULTIRES"):
             levels = modifier.render_levels if final else modifier.levels
-            if min(levels, limit if render.use_simplify else levels) > 0:
-                raise AssetError(
-                    f'Object "{obj.name}"',
-                    f'modifier "{modifier.name}" changes the number of vertices by subdividing the mesh',
-                    "Remove it, or disable it for renders",
-                )
-        return
+            if min(levels, limit if render.use_simplify else levels) <= 0:
+                continue
+        if modifier.type in REMODELLING:
+            raise AssetError(
+                f'Object "{obj.name}"',
+                f'modifier "{modifier.name}" changes the number of vertices by {REMODELLING[modifier.type]}',
+                "Remove it, or disable it for renders",
+            )
 
 
-def check_topology(obj: bpy.types.Object, mesh: bpy.types.Mesh, rest: Mesh, warn: Callable[[str], None]) -> bool:
+class Fit(NamedTuple):
+    """How a mesh fits its asset.
+
+    Attributes
+    ----------
+    part : Part, optional
+        What it has left of the asset; None: all of it, once.
+    vertices : (n,) int64 array, optional
+        Vertices of the mesh that are the part's; None: all.
+    corners : (m, 3) int32 array, optional
+        Corners of the mesh for those of the faces of the part, or of the asset; None: they are in its order.
+    """
+
+    part: Part | None = None
+    vertices: Array | None = None
+    corners: Array | None = None
+
+    def of_part(self, values: Array) -> Array:
+        """Values of the mesh's vertices for those of the part."""
+        return values if self.vertices is None else values[self.vertices]
+
+    def of_asset(self, values: Array) -> Array:
+        """Values of the asset's vertices for those of the part."""
+        return values if self.part is None else values[self.part.vertices]
+
+
+def check_topology(obj: bpy.types.Object, mesh: bpy.types.Mesh, rest: Mesh, warn: Callable[[str], None]) -> Fit:
     """Compare the evaluated `mesh` of `obj` with the asset's mesh.
 
-    Faces in another order, and triangles merged to polygons, still join the vertices as the asset does: every edge
-    of the mesh is an edge of the asset. A mesh whose vertices were renumbered has other edges.
-
-    Returns
-    -------
-    bool
-        Whether the faces are the asset's, corner by corner.
+    Vertices know which of the asset's they are, whatever was deleted, duplicated or reordered; those of older files are
+    the asset's in its order. Triangles merged to polygons are the same faces.
 
     Raises
     ------
     AssetError
-        Vertices were added, removed or renumbered; names object, asset and the modifiers that may have done it.
+        Nothing of the asset is left, or the vertices do not know which they are and are others; names object, asset and
+        the modifiers that may have done it.
     """
-    if len(mesh.vertices) != len(rest.vertices):
-        raise _wrong_count(obj, len(mesh.vertices), len(rest.vertices))
+    count = len(rest.vertices)
+    rows = mesh_arrays.source_rows(mesh, count)
+    if rows is None:
+        raise _wrong_count(obj, len(mesh.vertices), count)
     triangles = mesh_arrays.read_triangles(mesh)
-    if triangles is not None and np.array_equal(triangles, rest.faces):
-        return True
-    foreign = np.setdiff1d(_keys(mesh_arrays.read_edges(mesh)), _keys(_edges(rest.faces)))
-    if len(foreign):
+    if len(rows) == count and triangles is not None and np.array_equal(triangles, rest.faces):
+        return Fit()
+    known = mesh_arrays.read_source_vertices(mesh) is not None
+    if not known and len(foreign := np.setdiff1d(_keys(mesh_arrays.read_edges(mesh)), _keys(_edges(rest.faces)))):
         raise AssetError(
             f'Object "{obj.name}"',
             f"its faces do not join the vertices as {obj.original.drgs.asset.name} does "
             f"({len(foreign)} edges differ){_named(obj)}",
             "Undo the edit or disable the modifier, import the asset again, or choose the file of this mesh",
         )
-    missing = len(rest.faces) - (len(mesh.loops) - 2 * len(mesh.polygons))
-    if missing > 0:
-        warn(f'"{obj.name}": {missing} faces of its asset were deleted; they are rendered all the same')
-    elif missing < 0:
-        warn(f'"{obj.name}": {-missing} faces are not in its asset and are not rendered')
-    return False
+    matched = match_faces(mesh, rows, rest.faces)
+    if len(mesh.polygons) and not len(matched.face) and len(rest.faces):
+        raise AssetError(
+            f'Object "{obj.name}"', f"has no face of {obj.original.drgs.asset.name} any more{_named(obj)}",
+            "Undo the edit or disable the modifier, or import the asset again",
+        )  # fmt: skip
+    if matched.foreign:
+        warn(f'"{obj.name}": {matched.foreign} faces are not in its asset and are not rendered')
+    in_order = len(rows) == count and bool((rows == np.arange(count)).all())
+    if in_order and len(matched.face) == len(np.unique(matched.face)) == len(rest.faces):
+        return Fit(corners=matched.corners[np.argsort(matched.face)])
+    there = rows >= 0
+    number = np.cumsum(there, dtype=np.int32) - 1
+    faces = number[mesh_arrays.read_corner_vertices(mesh)[matched.corners]]
+    part = Part(rows[there], np.ascontiguousarray(faces, np.int32), matched.face)
+    return Fit(part, None if there.all() else np.flatnonzero(there), matched.corners)
 
 
 def _edges(faces: Array) -> Array:

@@ -63,16 +63,18 @@ def _batch(obj: bpy.types.Object) -> gpu.types.GPUBatch | None:
         asset = assets.load(assets.file_of(obj))
     except DrgsError:  # reported when the object is rendered
         return None
-    vertices = mesh_arrays.read_vertices(obj.data)
-    sizes = _WIDTH * asset.surfels.scale.max(axis=1)
-    return draw.disc_batch(posed_centres(asset, vertices), colours(obj, asset), sizes.astype(np.float32))
+    shown, vertices = shown_asset(obj, asset)
+    sizes = _WIDTH * shown.surfels.scale.max(axis=1, initial=0)
+    return draw.disc_batch(posed_centres(shown, vertices), shown.surfels.albedo, sizes.astype(np.float32))
 
 
-def colours(obj: bpy.types.Object, asset: Asset) -> Array:
-    """(n, 3) float32 linear: the albedo of the surfels as it is painted and adjusted on the evaluated object."""
-    if obj.drgs.show_captured or obj.mode == "EDIT":  # then its mesh is a wrapper without attributes
-        return asset.surfels.albedo
+def shown_asset(obj: bpy.types.Object, asset: Asset) -> tuple[Asset, Array]:
+    """What the evaluated object has of its asset, as it is painted and adjusted, and its (n, 3) vertices."""
+    if obj.mode == "EDIT":  # then its mesh is a wrapper without attributes
+        return asset, mesh_arrays.read_vertices(obj.data)
     try:
-        return edited_asset(asset, *appearance_of(obj, asset, lambda text: None)).surfels.albedo
+        found = appearance_of(obj, asset, lambda text: None)
     except DrgsError:  # reported, as warnings are, when the object is rendered
-        return asset.surfels.albedo
+        return asset, mesh_arrays.read_vertices(obj.data)
+    captured = obj.drgs.show_captured
+    return found.asset if captured else edited_asset(found.asset, found.painted, found.adjustment), found.vertices

@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from .asset.part import Part
 from .materials import Image, Material, ShaderAOV
 
 Array = np.ndarray
@@ -171,6 +172,8 @@ class ObjectState:
         To which belongs what it emits; "": none.
     terminator_offset : float
         Blender's Shadow Terminator Geometry Offset, in [0, 1]; 0: off.
+    part : Part, optional
+        What an edited mesh has left of the asset; all arrays are then of its vertices and faces. None: all of it.
     """
 
     name: str
@@ -195,6 +198,7 @@ class ObjectState:
     emission: Array | None = None
     specular: Array | None = None
     coat: Array | None = None
+    part: Part | None = None
 
 
 @dataclass(slots=True)

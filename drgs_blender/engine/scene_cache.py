@@ -14,7 +14,7 @@ from ..compute.warp.posed_surfels import DevicePosedSurfels, joined
 from ..core.asset.container import read_asset
 from ..core.asset.model import Asset, PosedSurfels
 from ..core.errors import AssetError, UsageError
-from ..core.frame import Frame, MeshState, MotionStep, ObjectState, RenderSettings, World
+from ..core.frame import Frame, MeshState, MotionStep, ObjectState, World
 from ..core.materials import Image
 from ..core.memory import give_back
 from ..core.passes import COLOURS
@@ -37,7 +37,8 @@ from .cached_objects import CachedObject, begun, emission_of, surfel_mask
 from .captured_objects import captured_faults, captured_object, shows_captured
 from .loaded_assets import LoadedAsset
 from .optional_channels import channel_faults, may_need, surfel_emission
-from .scene_objects import in_asset_order, join, moved_vertices, posed_surfels
+from .part_cache import PartCache
+from .scene_objects import check_surface, in_asset_order, join, moved_vertices, posed_surfels
 from .surfel_sheets import meets_sheets, sheet_mesh
 
 Array = np.ndarray
@@ -81,6 +82,7 @@ class SceneCache:
 
     def __init__(self) -> None:
         self._assets: dict[str, LoadedAsset] = {}
+        self._parts = PartCache()
         self.objects: list[CachedObject] = []
         self.meshes: list[MeshState] = []
         self.images: list[Image] = []
@@ -161,6 +163,7 @@ class SceneCache:
         seen, met = frame.settings.camera_sees == "surfels", frame.settings.rays_see == "surfels"
         objects: list[CachedObject] = []
         faults: list[str] = []
+        self._parts.begin()
         for index, state in enumerate(frame.objects):
             loaded = self._assets.get(state.asset)
             if loaded is None:
@@ -169,8 +172,9 @@ class SceneCache:
                     f"its asset {state.asset} is not loaded",
                     "Link the object to its file again",
                 )
+            loaded = self._parts.loaded(loaded, state)
             shown = shows_captured(state, loaded.asset, frame)
-            _check_surface(state, loaded.asset, frame.settings, shown)
+            check_surface(state, loaded.asset, frame.settings, shown)
             state = in_asset_order(state, loaded.asset)
             known = self.objects[index] if index < len(self.objects) else None
             kept = reuse_equal(state, None if known is None else known.state)
@@ -388,13 +392,3 @@ def _light_of(world: World, known: World | None, light: EnvironmentLight | None)
     if world is not known:
         light.rotation = np.ascontiguousarray(world.rotation, np.float32)
     return light
-
-
-def _check_surface(state: ObjectState, asset: Asset, settings: RenderSettings, captured: bool) -> None:
-    """Refuse an asset of which nothing would be seen, or that light would not meet; `captured` ones need no mesh."""
-    subject, bare = f"object {state.name}", settings.camera_sees == "mesh" or settings.rays_see == "mesh"
-    if bare and not captured and not len(asset.mesh.faces):
-        remedy = "Set Camera Sees and Rays See to Surfels, or import a file whose mesh has faces"
-        raise AssetError(subject, f"the mesh of {state.asset} has no faces", remedy)
-    if "surfels" in (settings.camera_sees, settings.rays_see) and not len(asset.surfels):
-        raise AssetError(subject, f"{state.asset} has no surfels", "Set Camera Sees and Rays See to Mesh")

@@ -10,7 +10,7 @@ import numpy as np
 from ..compute.warp.posed_surfels import FIELDS, with_fields
 from ..core.asset.model import BASE_CHANNELS, MATERIAL_CHANNELS, Asset, PosedSurfels, Surfels, as_float
 from ..core.errors import AssetError, UsageError
-from ..core.frame import ObjectState, Pose
+from ..core.frame import ObjectState, Pose, RenderSettings
 from ..core.material_adjustments import adjusted
 from ..deform.fracture import torn_faces
 from ..deform.granular import grainy
@@ -22,6 +22,16 @@ from ..render.scene.trace_scene import TraceObject
 Array = np.ndarray
 
 _MIRRORED = [0, 2, 1]  # order of the corners of a face whose object is mirrored
+
+
+def check_surface(state: ObjectState, asset: Asset, settings: RenderSettings, captured: bool) -> None:
+    """Refuse an asset of which nothing would be seen, or that light would not meet; `captured` ones need no mesh."""
+    subject, bare = f"object {state.name}", settings.camera_sees == "mesh" or settings.rays_see == "mesh"
+    if bare and not captured and not len(asset.mesh.faces):
+        remedy = "Set Camera Sees and Rays See to Surfels, or import a file whose mesh has faces"
+        raise AssetError(subject, f"the mesh of {state.asset} has no faces", remedy)
+    if "surfels" in (settings.camera_sees, settings.rays_see) and not len(asset.surfels):
+        raise AssetError(subject, f"{state.asset} has no surfels", "Set Camera Sees and Rays See to Mesh")
 
 
 def in_asset_order(state: ObjectState, asset: Asset) -> ObjectState:

@@ -247,7 +247,7 @@ def test_before_and_after_is_a_switch_that_loses_nothing(ball, scene, ball_file)
 
     def state():
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        discs = surfels.colours(ball.evaluated_get(depsgraph), asset)
+        discs = surfels.shown_asset(ball.evaluated_get(depsgraph), asset)[0].surfels.albedo
         return export_frame(depsgraph, str, lambda text: None, cache=cache).objects[0], discs
 
     after = state()

@@ -622,7 +622,7 @@ def test_discs_have_the_colours_that_are_painted_and_adjusted(ball, ball_file):
     surfels, asset = part("addon.viewport.surfels"), part("addon.assets").load(ball_file)
 
     def shown():
-        return surfels.colours(ball.evaluated_get(bpy.context.evaluated_depsgraph_get()), asset)
+        return surfels.shown_asset(ball.evaluated_get(bpy.context.evaluated_depsgraph_get()), asset)[0].surfels.albedo
 
     np.testing.assert_array_equal(shown(), asset.surfels.albedo)
     bpy.ops.drgs.set_material(preset="GOLD")

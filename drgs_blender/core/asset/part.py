@@ -1,0 +1,130 @@
+"""Parts of an asset: what an edited mesh has left of it, with the surfels that hang on that; copies, too."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..errors import AssetError
+from .model import OPTIONAL_CHANNELS, SURFEL_CHANNELS, Array, Asset, Binding, Mesh, Surfels
+
+_MATERIALS = ("albedo", "roughness", "metallic")
+_REMEDY = "Undo the edit, or import the asset again"
+
+
+@dataclass(slots=True)
+class Part:
+    """Vertices and faces of an asset that an edited mesh has: without those deleted, with those duplicated.
+
+    Attributes
+    ----------
+    vertices : (n,) int32 array
+        The asset's vertex that each vertex of the mesh is.
+    faces : (m, 3) int32 array
+        Vertices of the mesh, corner by corner those of the asset's face.
+    face : (m,) int32 array
+        The asset's face that each is.
+    removed : (k,) int32 array, optional
+        Surfels of the asset that are left out though their face is there.
+    """
+
+    vertices: Array
+    faces: Array
+    face: Array
+    removed: Array | None = None
+
+
+def part_of(asset: Asset, part: Part, subject: str = "part") -> Asset:
+    """The asset of the vertices, faces and surfels in a part; environment and provenance are kept.
+
+    Surfels are in the order of the asset; where a face is there several times, so are its surfels. Where the vertices
+    come from (`Mesh.source`) is not known any more.
+
+    Parameters
+    ----------
+    asset : Asset
+    part : Part
+    subject : str
+        For messages.
+
+    Raises
+    ------
+    AssetError
+        The part refers to what the asset does not have.
+    """
+    mesh = asset.mesh
+    _check(asset, part, subject)
+    textures = mesh.textures
+    if textures is not None:
+        normals = None if textures.normals is None else textures.normals[part.face]
+        textures = replace(
+            textures, uvs=textures.uvs[part.face], material=textures.material[part.face], normals=normals
+        )
+    cut = replace(vertices_of(mesh, part.vertices), faces=part.faces, textures=textures)
+    surfels, binding = asset.surfels, asset.binding
+    if binding is not None:
+        rows, faces = _surfels_of(binding.face, part, len(mesh.faces))
+        surfels = _taken(surfels, rows)
+        binding = Binding(faces, binding.barycentric[rows], binding.offset[rows], binding.normal[rows])
+    elif part.removed is not None:
+        surfels = _taken(surfels, np.delete(np.arange(len(surfels)), part.removed))
+    return replace(asset, mesh=cut, surfels=surfels, binding=binding)
+
+
+def vertices_of(mesh: Mesh, rows: Array) -> Mesh:
+    """A mesh without faces of the vertices `rows`, (n,) int32, with their channels and groups."""
+    values = {name: getattr(mesh, name) for name in ("vertices", *_MATERIALS, *OPTIONAL_CHANNELS)}
+    taken = {name: None if value is None else value[rows] for name, value in values.items()}
+    groups = {name: np.flatnonzero(np.isin(rows, of)).astype(np.int32) for name, of in mesh.groups.items()}
+    return Mesh(faces=np.empty((0, 3), np.int32), groups=groups, **taken)
+
+
+def _check(asset: Asset, part: Part, subject: str) -> None:
+    """AssetError where arrays of a part do not fit each other or its asset."""
+    for name, rows, shape, count in (
+        ("vertices", part.vertices, (-1,), len(asset.mesh.vertices)),
+        ("faces", part.faces, (-1, 3), len(part.vertices)),
+        ("face", part.face, (len(part.faces),), len(asset.mesh.faces)),
+        ("removed", part.removed, (-1,), len(asset.surfels)),
+    ):
+        if rows is None:
+            continue
+        fits = rows.dtype.kind == "i" and rows.ndim == len(shape)
+        if not fits or any(wanted not in (-1, found) for wanted, found in zip(shape, rows.shape, strict=True)):
+            raise AssetError(subject, f"{name} of its part have shape {rows.shape} and type {rows.dtype}", _REMEDY)
+        if rows.size and (rows.min() < 0 or rows.max() >= count):
+            raise AssetError(subject, f"{name} of its part refer to number {int(rows.max())} of {count}", _REMEDY)
+
+
+def _surfels_of(face: Array, part: Part, faces: int) -> tuple[Array, Array]:
+    """(k,) surfels that hang on the faces of a part, in order, and the (k,) face of the part that each hangs on.
+
+    Parameters
+    ----------
+    face : (n,) int32 array
+        The asset's face of each surfel.
+    part : Part
+    faces : int
+        Of the asset.
+    """
+    kept = np.ones(len(face), bool)
+    if part.removed is not None:
+        kept[part.removed] = False
+    by_face = np.flatnonzero(kept)[np.argsort(face[kept], kind="stable")]
+    count = np.bincount(face[kept], minlength=faces)
+    first = np.cumsum(count) - count
+    of_part = count[part.face]
+    within = np.arange(of_part.sum()) - np.repeat(np.cumsum(of_part) - of_part, of_part)
+    rows = by_face[np.repeat(first[part.face], of_part) + within]
+    hangs_on = np.repeat(np.arange(len(part.face), dtype=np.int32), of_part)
+    order = np.argsort(rows, kind="stable")
+    return rows[order], hangs_on[order]
+
+
+def _taken(surfels: Surfels, rows: Array) -> Surfels:
+    """The surfels `rows`."""
+    names = ("centre", "scale", "rotation", "opacity", *_MATERIALS, "sh", *SURFEL_CHANNELS)
+    values = {name: getattr(surfels, name) for name in names}
+    taken = {name: None if value is None else value[rows] for name, value in values.items()}
+    return Surfels(**taken, extras={name: values[rows] for name, values in surfels.extras.items()})
