@@ -19,6 +19,8 @@ ATTRIBUTES = {
 COLOURS = ("FLOAT_COLOR", "BYTE_COLOR")
 #: Attribute with the asset's vertex that each vertex is, and a checksum of that number.
 SOURCE_VERTEX = "drgs_vertex"
+#: Numbers of vertices that a float32 says exactly.
+_NUMBERS = 1 << 24
 #: Types of attributes besides colours that can be masks.
 MASKS = {"BOOLEAN": bool, "FLOAT": np.float32}
 
@@ -58,23 +60,28 @@ def write_source_vertices(mesh: bpy.types.Mesh, rows: Array | None = None) -> No
     """
     if (old := mesh.attributes.get(SOURCE_VERTEX)) is not None:
         mesh.attributes.remove(old)
+    if len(mesh.vertices) > _NUMBERS:  # they know no number, so their faces must stay as they are
+        return
     rows = np.arange(len(mesh.vertices), dtype=np.int32) if rows is None else rows
-    attribute = mesh.attributes.new(SOURCE_VERTEX, "INT32_2D", "POINT")
-    attribute.data.foreach_set("value", np.column_stack((rows, _checksum(rows))).ravel())
+    attribute = mesh.attributes.new(SOURCE_VERTEX, "FLOAT2", "POINT")
+    attribute.data.foreach_set("vector", np.column_stack((rows, _checksum(rows))).astype(np.float32).ravel())
 
 
 def read_source_vertices(mesh: bpy.types.Mesh) -> Array | None:
     """(n,) int32 asset's vertex of each vertex, -1 of new ones; None where the mesh does not know.
 
-    What Blender blended of several vertices (subdivided edges, cuts) has no number whose checksum is right.
+    Where Blender makes vertices between others (subdivided edges, cuts), it blends their numbers, so that checksums are
+    wrong; integers it would copy.
     """
     attribute = mesh.attributes.get(SOURCE_VERTEX)
-    if attribute is None or (attribute.data_type, attribute.domain) != ("INT32_2D", "POINT"):
+    if attribute is None or (attribute.data_type, attribute.domain) != ("FLOAT2", "POINT"):
         return None
-    values = np.empty(2 * len(mesh.vertices), np.int32)
-    attribute.data.foreach_get("value", values)
-    rows, sums = values[::2], values[1::2]
-    return np.where((rows >= 0) & (_checksum(rows) == sums), rows, -1).astype(np.int32)
+    values = np.empty(2 * len(mesh.vertices), np.float32)
+    attribute.data.foreach_get("vector", values)
+    number, sums = values[::2], values[1::2]
+    whole = (number >= 0) & (number < _NUMBERS) & (number == np.floor(number))
+    rows = np.where(whole, number, 0).astype(np.int32)
+    return np.where(whole & (_checksum(rows) == sums), rows, -1).astype(np.int32)
 
 
 def source_rows(mesh: bpy.types.Mesh, count: int) -> Array | None:
@@ -95,11 +102,11 @@ def source_rows(mesh: bpy.types.Mesh, count: int) -> Array | None:
 
 
 def _checksum(rows: Array) -> Array:
-    """(n,) int32: the finaliser of MurmurHash3, which is 0 of no number below 2^31 that is not -1."""
+    """(n,) float32 in [1, 2): bits of the finaliser of MurmurHash3, so that those of a mean are not the mean."""
     x = rows.astype(np.uint32) + np.uint32(1)
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
         x = (x ^ (x >> np.uint32(shift))) * np.uint32(factor)
-    return (x ^ (x >> np.uint32(16))).view(np.int32)
+    return ((x >> np.uint32(9)) | np.uint32(0x3F800000)).view(np.float32)
 
 
 def write_channel(mesh: bpy.types.Mesh, channel: str, values: Array) -> None:

@@ -73,8 +73,7 @@ class DrgsObjects:
         Raises
         ------
         AssetError
-            Its asset or what it plays is missing, or the evaluated mesh is not the asset's, moved; names object and
-            modifiers.
+            Its asset or what it plays is missing, or the evaluated mesh is not the asset's; names object and modifiers.
         """
         obj = item.object
         if not np.isfinite(item.matrix_world).all():
@@ -88,6 +87,9 @@ class DrgsObjects:
             (uid(obj), uid(obj.data)),
             lambda: _shape(obj, self._depsgraph, self._key_of, self._warn),
         )
+        if shape.part is not None and not len(shape.part.face):
+            self._warn(f'"{obj.name}": none of the faces of its asset is left; it is left out')
+            return
         material = obj.material_slots[0].material if obj.material_slots else None
         visibility = self._holdouts.cut_out(item, [material], lambda: None).visibility
         self.states.append(

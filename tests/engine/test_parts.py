@@ -113,5 +113,5 @@ def test_a_part_that_does_not_fit_names_the_object(asset_path, make_frame, upper
     if change == {"face": None}:
         change = {"face": np.full_like(upper.face, 10**6)}
     frame.objects[0] = replace(frame.objects[0], part=replace(upper, **change))
-    with pytest.raises(AssetError, match="object Ball.*of its part"):
+    with pytest.raises(AssetError, match=r"object Ball.*of its part"):
         fresh(asset_path, frame)
