@@ -323,6 +323,14 @@ class DrgsObjectSettings(bpy.types.PropertyGroup):
         options=blend_paths.RELATIVE,
     )
 
+    surfel_points: PointerProperty(
+        type=bpy.types.Mesh,
+        name="Surfels",
+        description="Points of the surfels that are left; empty: all that the asset has",
+    )
+    points_of: PointerProperty(
+        type=bpy.types.Object, name="Points Of", description="The DR-GS object whose surfels these points are"
+    )
     adjustment: PointerProperty(
         type=DrgsAdjustmentSettings,
         name="Adjustments",

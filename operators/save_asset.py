@@ -73,6 +73,7 @@ class DRGS_OT_save_asset(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
                 rows = rows_in_part(obj, context.evaluated_depsgraph_get())
                 obj.drgs.asset = assets.anchor(target)
                 obj.drgs.adjustment.reset()
+                obj.drgs.surfel_points = None
                 if rows is not None:
                     mesh_arrays.write_source_vertices(obj.data, rows)
                 mesh_arrays.restore_channels(obj.data, assets.captured_mesh(obj))

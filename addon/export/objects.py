@@ -11,11 +11,11 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.core.asset import MATERIAL_CHANNELS, Asset
-from ...drgs_blender.core.asset.part import part_of
+from ...drgs_blender.core.asset.part import Part, part_of
 from ...drgs_blender.core.frame import Adjustment, ObjectState
 from ...drgs_blender.core.materials import ShaderAOV
 from ...drgs_blender.core.passes import Pass
-from .. import assets, cache_playback, mesh_arrays, point_caches
+from .. import assets, cache_playback, mesh_arrays, point_caches, surfel_points
 from ..viewport_material import is_viewport_material
 from .aov_nodes import aov_values
 from .export_cache import ExportCache, uid
@@ -82,12 +82,13 @@ class DrgsObjects:
         check_modifiers(obj, self._depsgraph)
         cache_playback.check(obj, self._warn, final=self._depsgraph.mode == "RENDER")
         appearance = obj.drgs.show_captured, obj.drgs.adjustment.values(), *cache_playback.fracture_state(obj).items()
+        appearance = *appearance, surfel_points.state_of(obj)
         shape = self._cache.get(
             ("object", uid(obj), obj.name, obj.data.as_pointer(), obj.mode, str(assets.file_of(obj)), appearance),
-            (uid(obj), uid(obj.data)),
+            (uid(obj), uid(obj.data), uid(obj.original.drgs.surfel_points)),
             lambda: _shape(obj, self._depsgraph, self._key_of, self._warn),
         )
-        if shape.part is not None and not len(shape.part.face):
+        if shape.part is not None and not len(shape.part.face) and shape.part.removed is None:
             self._warn(f'"{obj.name}": none of the faces of its asset is left; it is left out')
             return
         material = obj.material_slots[0].material if obj.material_slots else None
@@ -138,7 +139,7 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     mesh = obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph) if editing else obj.data
     try:
         point_caches.check(obj, asset.mesh, warn, final=depsgraph.mode == "RENDER")
-        fit = check_topology(obj, mesh, asset.mesh, warn)
+        fit = without_removed(check_topology(obj, mesh, asset.mesh, warn), obj, asset)
         arrays: dict[str, Any] = {
             "vertices": fit.of_part(mesh_arrays.read_vertices(mesh)),
             "corner_normals": _corner_normals(obj, mesh, fit, warn),
@@ -157,6 +158,16 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
             obj.to_mesh_clear()
 
 
+def without_removed(fit: Fit, obj: bpy.types.Object, asset: Asset) -> Fit:
+    """How an object fits its asset, without the surfels that were removed from it."""
+    removed = surfel_points.removed_of(obj, asset)
+    if removed is None:
+        return fit
+    whole = np.arange(len(asset.mesh.vertices), dtype=np.int32), asset.mesh.faces
+    part = Part(*whole, np.arange(len(asset.mesh.faces), dtype=np.int32)) if fit.part is None else fit.part
+    return fit._replace(part=replace(part, removed=removed))
+
+
 def appearance_of(obj: bpy.types.Object, asset: Asset, warn: Warn) -> Appearance:
     """What an evaluated object in Object Mode has of its asset, and how that differs.
 
@@ -165,7 +176,7 @@ def appearance_of(obj: bpy.types.Object, asset: Asset, warn: Warn) -> Appearance
     AssetError
         Its mesh is not the asset's any more; names the object.
     """
-    fit = check_topology(obj, obj.data, asset.mesh, warn)
+    fit = without_removed(check_topology(obj, obj.data, asset.mesh, warn), obj, asset)
     painted = {channel: _edited(obj, obj.data, asset, channel, fit, warn) for channel in MATERIAL_CHANNELS}
     return Appearance(
         asset if fit.part is None else part_of(asset, fit.part, f'Object "{obj.name}"'),

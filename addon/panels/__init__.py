@@ -6,6 +6,7 @@ import bpy
 
 from . import (
     adjustment,
+    clean,
     compositing,
     header,
     object_data,
@@ -33,6 +34,7 @@ CLASSES = (
     *workflow.CLASSES,
     *sidebar.CLASSES,
     *adjustment.CLASSES,
+    *clean.CLASSES,
 )
 
 _register, _unregister = bpy.utils.register_classes_factory(CLASSES)

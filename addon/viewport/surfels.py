@@ -12,7 +12,7 @@ from mathutils import Matrix
 from ...drgs_blender.core.asset import Asset
 from ...drgs_blender.core.errors import DrgsError
 from ...drgs_blender.core.material_adjustments import edited_asset
-from .. import assets, mesh_arrays
+from .. import assets, mesh_arrays, surfel_points
 from ..export.export_cache import ExportCache, uid
 from ..export.objects import appearance_of
 from . import draw
@@ -47,9 +47,10 @@ def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         obj = instance.object
         if not instance.show_self or not assets.is_drgs(obj):
             continue
-        look = obj.drgs.show_captured, obj.drgs.adjustment.values()
+        look = obj.drgs.show_captured, obj.drgs.adjustment.values(), surfel_points.state_of(obj)
         key = "object", uid(obj), obj.data.as_pointer(), obj.mode, look
-        batch = cache.get(key, (uid(obj), uid(obj.data)), partial(_batch, obj))
+        owners = uid(obj), uid(obj.data), uid(obj.original.drgs.surfel_points)
+        batch = cache.get(key, owners, partial(_batch, obj))
         if batch is None:
             continue
         matrix: Matrix = instance.matrix_world

@@ -65,10 +65,10 @@ def part_of(asset: Asset, part: Part, subject: str = "part") -> Asset:
     surfels, binding = asset.surfels, asset.binding
     if binding is not None:
         rows, faces = _surfels_of(binding.face, part, len(mesh.faces))
-        surfels = _taken(surfels, rows)
+        surfels = taken(surfels, rows)
         binding = Binding(faces, binding.barycentric[rows], binding.offset[rows], binding.normal[rows])
     elif part.removed is not None:
-        surfels = _taken(surfels, np.delete(np.arange(len(surfels)), part.removed))
+        surfels = taken(surfels, np.delete(np.arange(len(surfels)), part.removed))
     return replace(asset, mesh=cut, surfels=surfels, binding=binding)
 
 
@@ -122,8 +122,8 @@ def _surfels_of(face: Array, part: Part, faces: int) -> tuple[Array, Array]:
     return rows[order], hangs_on[order]
 
 
-def _taken(surfels: Surfels, rows: Array) -> Surfels:
-    """The surfels `rows`."""
+def taken(surfels: Surfels, rows: Array) -> Surfels:
+    """The surfels `rows`, (k,) int array."""
     names = ("centre", "scale", "rotation", "opacity", *_MATERIALS, "sh", *SURFEL_CHANNELS)
     values = {name: getattr(surfels, name) for name in names}
     taken = {name: None if value is None else value[rows] for name, value in values.items()}

@@ -1,0 +1,321 @@
+"""Clean a capture: its surfels as points to select and delete, floaters found by themselves, a box to crop to."""
+
+from __future__ import annotations
+
+import bmesh
+import bpy
+import numpy as np
+from bpy.props import BoolProperty, EnumProperty, FloatProperty
+from mathutils.kdtree import KDTree
+
+from ..addon import assets, mesh_arrays, surfel_points
+from ..addon.viewport.surfels import posed_centres
+from ..drgs_blender.core.asset import Asset
+from ..drgs_blender.core.asset.part import taken
+from ..drgs_blender.core.errors import UsageError
+from ..drgs_blender.core.floaters import find_floaters
+from . import selection
+from .base import DrgsOperator
+
+Array = np.ndarray
+
+
+class DRGS_OT_edit_surfels(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
+    """Show the surfels of the active DR-GS object as points in Edit Mode: select them by box, lasso or circle, delete
+    them with X, then press Finish"""
+
+    bl_idname = "drgs.edit_surfels"
+    bl_label = "Edit Surfels"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        (obj,) = selection.editable(selection.selected(context)[-1:], vertices=False)
+        mesh = points_of(obj, context.evaluated_depsgraph_get())
+        surfel_points.keep_removed(mesh, len(assets.load(assets.file_of(obj)).surfels))
+        points = bpy.data.objects.new(mesh.name, mesh)
+        points.drgs.points_of = obj
+        points.matrix_world = obj.matrix_world
+        points.show_in_front = True
+        points.hide_render = True
+        assets.collection(context).objects.link(points)
+        selection.select_only(context, [points], points)
+        bpy.ops.object.mode_set(mode="EDIT")
+        context.tool_settings.mesh_select_mode = True, False, False
+        bpy.ops.mesh.select_all(action="DESELECT")
+        return {"FINISHED"}
+
+
+class DRGS_OT_select_surfels(DrgsOperator, bpy.types.Operator):
+    """Select the surfels that are floaters, faint, large, of the colour of the selected ones, or far from the mesh"""
+
+    bl_idname = "drgs.select_surfels"
+    bl_label = "Select Surfels"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    criterion: EnumProperty(
+        name="By",
+        description="Which surfels are selected",
+        items=(
+            ("FLOATERS", "Floaters", "Small parts in the air, and faint, wide or distant surfels that stand alone"),
+            ("OPACITY", "Opacity", "Those that are fainter"),
+            ("SIZE", "Size", "Those that are larger than a multiple of the median"),
+            ("COLOUR", "Colour", "Those with nearly the mean colour of the selected ones"),
+            ("DISTANCE", "Distance", "Those that are farther from the mesh than a multiple of the median size"),
+        ),
+        default="FLOATERS",
+    )
+    strength: FloatProperty(name="Strength", description="More finds more floaters", min=0.1, max=10.0, default=1.0)
+    opacity: FloatProperty(name="Opacity", description="Select what is fainter", min=0.0, max=1.0, default=0.1)
+    size: FloatProperty(name="Size", description="Select what is larger, in medians", min=0.0, max=1000.0, default=5.0)
+    tolerance: FloatProperty(
+        name="Tolerance", description="Distance of colours, as displayed, that still are alike", min=0.0, max=2.0,
+        default=0.1,
+    )  # fmt: skip
+    distance: FloatProperty(
+        name="Distance", description="Select what is farther from the mesh, in medians of the size", min=0.0,
+        max=1000.0, default=3.0,
+    )  # fmt: skip
+    use_extend: BoolProperty(name="Extend", description="Keep what is selected already", default=False)
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Press Edit Surfels first")
+        return context.mode == "EDIT_MESH" and edited(context) is not None
+
+    def draw(self, context: bpy.types.Context) -> None:
+        column = self.layout.column()
+        column.prop(self, "criterion")
+        of = {"FLOATERS": "strength", "OPACITY": "opacity", "SIZE": "size", "COLOUR": "tolerance"}
+        column.prop(self, of.get(self.criterion, "distance"))
+        column.prop(self, "use_extend")
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        points, obj = edited(context)
+        asset = assets.load(assets.file_of(obj))
+        mesh = bmesh.from_edit_mesh(points.data)
+        layer = mesh.verts.layers.int.get(surfel_points.SURFEL)
+        rows = np.array([vertex[layer] for vertex in mesh.verts], np.int64)
+        before = np.array([vertex.select for vertex in mesh.verts], bool)
+        found = self.chosen_of(asset, rows, before)
+        count = int(found.sum())
+        if self.use_extend:
+            found |= before
+        for vertex, chosen in zip(mesh.verts, found.tolist(), strict=True):
+            vertex.select = chosen
+        mesh.select_flush_mode()
+        bmesh.update_edit_mesh(points.data, loop_triangles=False, destructive=False)
+        self.report({"INFO"}, f"{count:,} of {len(rows):,} surfels")
+        return {"FINISHED"}
+
+    def chosen_of(self, asset: Asset, rows: Array, before: Array) -> Array:
+        """(n,) bool of the surfels `rows`, of which `before` says what is selected."""
+        surfels = asset.surfels
+        size = surfels.scale.max(axis=1)
+        typical = float(np.median(size)) if len(size) else 0.0
+        if self.criterion == "OPACITY":
+            return (surfels.opacity < self.opacity)[rows]
+        if self.criterion == "SIZE":
+            return (size > self.size * typical)[rows]
+        if self.criterion == "COLOUR":
+            if not before.any():
+                raise UsageError("Selection", "holds no surfel whose colour is meant", "Select one or several")
+            shown = surfels.albedo.clip(0, 1)[rows] ** (1 / 2.2)
+            return np.linalg.norm(shown - shown[before].mean(axis=0), axis=1) <= self.tolerance
+        away = distances(asset)
+        if self.criterion == "DISTANCE":
+            return np.zeros(len(rows), bool) if away is None else (away > self.distance * typical)[rows]
+        left = np.unique(rows)
+        found = np.zeros(len(surfels), bool)
+        found[left] = find_floaters(taken(surfels, left), None if away is None else away[left], self.strength)
+        return found[rows]
+
+
+class DRGS_OT_finish_surfels(DrgsOperator, bpy.types.Operator):
+    """End the editing of surfels: those that were deleted are not rendered any more, and faces that only they covered
+    go, too"""
+
+    bl_idname = "drgs.finish_surfels"
+    bl_label = "Finish"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    use_faces: BoolProperty(
+        name="Delete Their Faces",
+        description="Also delete the faces to which a deleted surfel is the nearest, so that they throw no shadow",
+        default=True,
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Press Edit Surfels first")
+        return context.mode in ("EDIT_MESH", "OBJECT") and edited(context) is not None
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        points, obj = edited(context)
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        mesh = points.data
+        before = np.array(mesh.get(surfel_points.SURFEL, ()), np.int64)
+        bpy.data.objects.remove(points)
+        selection.select_only(context, [obj], obj)
+        asset = assets.load(assets.file_of(obj))
+        removed = surfel_points.removed_of(obj, asset)
+        if removed is None:
+            obj.drgs.surfel_points = None
+            return {"FINISHED"}
+        new = np.setdiff1d(removed, before)
+        if self.use_faces and len(new) and len(obj.data.polygons):
+            delete_vertices_or_faces(obj, faces=faces_of(obj, asset, new))
+        obj.update_tag()
+        self.report({"INFO"}, f"{len(removed):,} of {len(asset.surfels):,} surfels are removed")
+        return {"FINISHED"}
+
+
+class DRGS_OT_restore_surfels(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
+    """Bring back all surfels that were deleted from the selected DR-GS objects; faces come back by Undo alone"""
+
+    bl_idname = "drgs.restore_surfels"
+    bl_label = "Restore Surfels"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        for obj in selection.editable(selection.selected(context), vertices=False):
+            obj.drgs.surfel_points = None
+            obj.update_tag()
+        return {"FINISHED"}
+
+
+class DRGS_OT_crop(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
+    """Delete what of the selected DR-GS objects lies outside the box around another selected object"""
+
+    bl_idname = "drgs.crop"
+    bl_label = "Crop to Box"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    use_inside: BoolProperty(name="Delete Inside", description="Delete what lies in the box instead", default=False)
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        objects = selection.editable(selection.selected(context), vertices=False, data=True)
+        boxes = [o for o in context.selected_objects if not assets.is_drgs(o) and o.type in ("MESH", "EMPTY")]
+        if len(boxes) != 1:
+            raise UsageError(
+                "Selection", f"holds {len(boxes)} objects that could be the box",
+                "Select the DR-GS objects and one cube, or one empty",
+            )  # fmt: skip
+        depsgraph = context.evaluated_depsgraph_get()
+        for obj in objects:
+            asset = assets.load(assets.file_of(obj))
+            vertices = evaluated_vertices(obj, depsgraph)
+            gone = in_box(boxes[0], obj, vertices) == self.use_inside
+            mesh = points_of(obj, depsgraph)
+            rows, places = surfel_points.rows_of(mesh), np.empty((len(mesh.vertices), 3), np.float32)
+            assert rows is not None
+            mesh.vertices.foreach_get("co", places.ravel())
+            left = in_box(boxes[0], obj, places) != self.use_inside
+            if not left.any():
+                raise UsageError(f'Object "{obj.name}"', "would be gone as a whole", "Move the box, or delete it")
+            obj.drgs.surfel_points = None
+            bpy.data.meshes.remove(mesh)
+            if not (left.all() and len(rows) == len(asset.surfels)):
+                obj.drgs.surfel_points = surfel_points.new_points(f"{obj.name} surfels", rows[left], places[left])
+            if gone.any() and len(gone) == len(obj.data.vertices):
+                delete_vertices_or_faces(obj, vertices=gone)
+            obj.update_tag()
+        return {"FINISHED"}
+
+
+def edited(context: bpy.types.Context) -> tuple[bpy.types.Object, bpy.types.Object] | None:
+    """The points that are edited, and the DR-GS object whose surfels they are."""
+    points = context.active_object
+    obj = None if points is None else points.drgs.points_of
+    return None if points is None or not assets.is_drgs(obj) else (points, obj)
+
+
+def points_of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.types.Mesh:
+    """The mesh of points of an object's surfels, new where it has none or shares it, placed as the object is posed."""
+    asset, known = assets.load(assets.file_of(obj)), obj.drgs.surfel_points
+    rows = None if known is None else surfel_points.rows_of(known)
+    rows = np.arange(len(asset.surfels), dtype=np.int32) if rows is None else rows[rows < len(asset.surfels)]
+    vertices = evaluated_vertices(obj, depsgraph)
+    own = mesh_arrays.source_rows(obj.data, len(asset.mesh.vertices))
+    if own is not None and len(own) == len(vertices):  # what was deleted stays where it was
+        posed = asset.mesh.vertices.copy()
+        posed[own[own >= 0]] = vertices[own >= 0]
+        vertices = posed
+    places = posed_centres(asset, vertices)[rows]
+    obj.drgs.surfel_points = mesh = surfel_points.new_points(f"{obj.name} surfels", rows, places)
+    if known is not None and not known.users:
+        bpy.data.meshes.remove(known)
+    return mesh
+
+
+def evaluated_vertices(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Array:
+    """(n, 3) float32 object space, as modifiers move them; where these change their number, of the mesh itself."""
+    moved = mesh_arrays.read_vertices(obj.evaluated_get(depsgraph).data)
+    return moved if len(moved) == len(obj.data.vertices) else mesh_arrays.read_vertices(obj.data)
+
+
+def in_box(box: bpy.types.Object, obj: bpy.types.Object, places: Array) -> Array:
+    """(n,) bool: which (n, 3) places of `obj` lie in the box around `box`, turned as it is."""
+    if box.type == "EMPTY":
+        low, high = -box.empty_display_size * np.ones(3), box.empty_display_size * np.ones(3)
+    else:
+        corners = np.array(box.bound_box)
+        low, high = corners.min(axis=0), corners.max(axis=0)
+    world = selection.in_world(obj, places)
+    inverse = np.array(box.matrix_world.inverted_safe(), np.float64)
+    local = world @ inverse[:3, :3].T + inverse[:3, 3]
+    return ((local >= low) & (local <= high)).all(axis=1)
+
+
+def distances(asset: Asset) -> Array | None:
+    """(n,) metres of the surfels from the mesh, along the normal of the face that each hangs on; None without one."""
+    binding, mesh = asset.binding, asset.mesh
+    if binding is None:
+        return None
+    corners = mesh.vertices[mesh.faces[binding.face]].astype(np.float64)
+    foot = np.einsum("nk,nkc->nc", binding.barycentric.clip(0, 1), corners)
+    return np.linalg.norm(asset.surfels.centre - foot, axis=1)
+
+
+def faces_of(obj: bpy.types.Object, asset: Asset, removed: Array) -> Array:
+    """(p,) bool polygons of the mesh to which one of the surfels `removed` is the nearest of all, at rest."""
+    rows = mesh_arrays.source_rows(obj.data, len(asset.mesh.vertices))
+    found = np.zeros(len(obj.data.polygons), bool)
+    if rows is None:
+        return found
+    centre = asset.surfels.centre
+    start, total = mesh_arrays.read_polygons(obj.data)
+    corners = mesh_arrays.read_corner_vertices(obj.data)
+    rest = asset.mesh.vertices[rows[corners].clip(0)]
+    middle = np.add.reduceat(rest, start, axis=0) / total[:, None]
+    margin = 4 * float(np.median(asset.surfels.scale.max(axis=1)))
+    low, high = centre[removed].min(axis=0) - margin, centre[removed].max(axis=0) + margin
+    near = np.flatnonzero(((centre >= low - margin) & (centre <= high + margin)).all(axis=1))
+    tree = KDTree(len(near))
+    for number in near.tolist():
+        tree.insert(centre[number], number)
+    tree.balance()
+    gone = np.zeros(len(centre), bool)
+    gone[removed] = True
+    for polygon in np.flatnonzero(((middle >= low) & (middle <= high)).all(axis=1)).tolist():
+        _, number, _ = tree.find(middle[polygon])
+        found[polygon] = number is not None and gone[number]
+    return found
+
+
+def delete_vertices_or_faces(obj: bpy.types.Object, vertices: Array | None = None, faces: Array | None = None) -> None:
+    """Delete vertices, (n,) bool, or faces, (p,) bool, of the mesh of an object, with vertices that lose all faces."""
+    mesh = bmesh.new()
+    mesh.from_mesh(obj.data)
+    if vertices is not None:
+        mesh.verts.ensure_lookup_table()
+        bmesh.ops.delete(mesh, geom=[mesh.verts[i] for i in np.flatnonzero(vertices).tolist()], context="VERTS")
+    if faces is not None:
+        mesh.faces.ensure_lookup_table()
+        bmesh.ops.delete(mesh, geom=[mesh.faces[i] for i in np.flatnonzero(faces).tolist()], context="FACES")
+    mesh.to_mesh(obj.data)
+    mesh.free()
+    obj.data.update()
+
+
+CLASSES = (DRGS_OT_edit_surfels, DRGS_OT_select_surfels, DRGS_OT_finish_surfels, DRGS_OT_restore_surfels, DRGS_OT_crop)
