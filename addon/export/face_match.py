@@ -40,6 +40,8 @@ class Matched(NamedTuple):
 def match_faces(mesh: bpy.types.Mesh, rows: Array, faces: Array) -> Matched:
     """Find the faces of an asset in a mesh; polygons stand for all triangles of their corners.
 
+    Of a face that is there both ways round, as of a solidified shell, the asset's side counts.
+
     Parameters
     ----------
     mesh : bpy.types.Mesh
@@ -63,8 +65,13 @@ def match_faces(mesh: bpy.types.Mesh, rows: Array, faces: Array) -> Matched:
     face = order[first[there] + _rank(keys) % count[there]].astype(np.int32)
     own = faces[face]
     same = ids[:, None, :] == own[:, :, None]
+    order = same.argmax(axis=2)
     right = same.any(axis=2).all(axis=1)  # the same key, and not by chance
-    corners = np.take_along_axis(corners, same.argmax(axis=2), axis=1)[right]
+    flipped = (order[:, 1] - order[:, 0]) % 3 == 2
+    both = np.zeros(len(faces), bool)
+    both[face[~flipped]] = True
+    right &= ~(flipped & both[face])  # the inside of a shell that a modifier made
+    corners = np.take_along_axis(corners, order, axis=1)[right]
     seen = len(np.unique(polygon[right]))
     return Matched(face[right], np.ascontiguousarray(corners, np.int32), len(mesh.polygons) - seen)
 

@@ -164,6 +164,22 @@ def test_masked_vertices_are_left_out_and_come_back(ball, export):
     assert export()[0].objects[0].part is None
 
 
+@pytest.mark.parametrize(("kind", "copies", "foreign"), [("ARRAY", 2, 0), ("EDGE_SPLIT", 1, 0), ("SOLIDIFY", 1, 1)])
+def test_modifiers_that_copy_or_split(ball, export, kind, copies, foreign):
+    """An array has the surfels of each copy; the inner side of a shell has none, and is counted."""
+    modifier = ball.modifiers.new("Some", kind)
+    if kind == "EDGE_SPLIT":
+        modifier.split_angle = 0
+    (state,), warnings = export()[0].objects, export()[1]
+    m = len(sphere()[1])
+    np.testing.assert_array_equal(np.bincount(state.part.face, minlength=m), copies)
+    assert len(warnings) == foreign
+    if foreign:
+        assert f"{m} faces are not in its asset" in warnings[0]
+        radius = np.linalg.norm(state.vertices[state.part.faces], axis=2)
+        assert radius.min() > 0.999
+
+
 def test_a_cut_object_is_saved_and_is_whole_again(ball, export, tmp_path, ball_file):
     gone = high(ball)
     delete(ball, gone)
