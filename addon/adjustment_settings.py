@@ -17,11 +17,11 @@ Array = np.ndarray
 
 #: Settings that are numbers, and the values of all, the tint first, that change nothing.
 NUMBERS = (
-    *("hue", "saturation", "value"),
+    *("hue", "saturation", "value", "brightness", "contrast"),
     *(f"{channel}_{part}" for channel in ("roughness", "metallic") for part in ("gain", "offset", "low", "high")),
     *("emission", "opacity"),
 )
-_NEUTRAL = ((1.0, 1.0, 1.0), 0.0, 1.0, 1.0, *(2 * (1.0, 0.0, 0.0, 1.0)), 1.0, 1.0)
+_NEUTRAL = ((1.0, 1.0, 1.0), 0.0, 1.0, 1.0, 0.0, 0.0, *(2 * (1.0, 0.0, 0.0, 1.0)), 1.0, 1.0)
 
 
 def _masks(settings: DrgsAdjustmentSettings, context: bpy.types.Context, typed: str) -> Iterable[str]:
@@ -72,6 +72,13 @@ class DrgsAdjustmentSettings(bpy.types.PropertyGroup):
         "Saturation", "Factor on the albedo's saturation; 0 is grey", min=0.0, soft_max=2.0, default=1.0
     )
     value: _number("Value", "Factor on the albedo's brightness", min=0.0, soft_max=2.0, max=100.0, default=1.0)
+    brightness: _number(
+        "Brightness", "Added to the albedo, as Blender's node does", soft_min=-1.0, soft_max=1.0, default=0.0
+    )
+    contrast: _number(
+        "Contrast", "Spreads the albedo around middle grey, as Blender's node does", soft_min=-1.0, soft_max=1.0,
+        default=0.0,
+    )  # fmt: skip
     roughness_gain: _number("Roughness Factor", "Multiplies the roughness", min=0.0, soft_max=4.0, default=1.0)
     roughness_offset: _number("Offset", "Added to the roughness after the factor", min=-1.0, max=1.0, default=0.0)
     roughness_low: _number("Minimum", "The roughness becomes no lower than this", min=0.0, max=1.0, default=0.0)
@@ -121,4 +128,6 @@ class DrgsAdjustmentSettings(bpy.types.PropertyGroup):
             mask=mask,
             emission=own.emission,
             opacity=own.opacity,
+            brightness=own.brightness,
+            contrast=own.contrast,
         )

@@ -29,7 +29,7 @@ class _Adjustments:
         settings = context.object.drgs.adjustment
         layout.active = settings.use and not context.object.drgs.captured_colours
         column = layout.column(align=True)
-        for name in ("tint", "hue", "saturation", "value"):
+        for name in ("tint", "hue", "saturation", "value", "brightness", "contrast"):
             column.prop(settings, name)
         for channel in ("roughness", "metallic"):
             column = layout.column(align=True)

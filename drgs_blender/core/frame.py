@@ -103,7 +103,7 @@ class Adjustment:
     Attributes
     ----------
     tint : tuple of float
-        Linear Rec.709 factors on the albedo, after hue, saturation and value.
+        Linear Rec.709 factors on the albedo, after all other changes of colour.
     hue : float
         Turns, added to the hue of the albedo (HSV, as Blender's node).
     saturation, value : float
@@ -114,6 +114,9 @@ class Adjustment:
         How much of it a vertex gets, in [0, 1]; None: all of it everywhere.
     emission, opacity : float
         Factors on those of the object; of the opacity at most 1.
+    brightness, contrast : float
+        Of the linear albedo after hue, saturation and value, as Blender's node: new = max(0, (1 + contrast) old +
+        brightness - contrast / 2).
     """
 
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -125,6 +128,8 @@ class Adjustment:
     mask: Array | None = None
     emission: float = 1.0
     opacity: float = 1.0
+    brightness: float = 0.0
+    contrast: float = 0.0
 
 
 @dataclass(slots=True)

@@ -58,7 +58,10 @@ def scaled(name: str, values: Array, factor: float, mask: Array | None = None) -
 
 
 def recoloured(albedo: Array, adjustment: Adjustment) -> Array:
-    """(n, 3) float32 albedo with another hue, saturation, value (HSV of linear values) and tint; not clipped."""
+    """(n, 3) float32 albedo with another hue, saturation, value (HSV of linear values), brightness, contrast and tint.
+
+    Not clipped at 1.
+    """
     colour = np.asarray(albedo, np.float32)
     if (adjustment.hue, adjustment.saturation, adjustment.value) != (0.0, 1.0, 1.0):
         highest = colour.max(axis=1)
@@ -77,6 +80,9 @@ def recoloured(albedo: Array, adjustment: Adjustment) -> Array:
         distance = np.mod(np.array([5, 3, 1], np.float32) + sector[:, None], 6)
         lost = np.clip(np.minimum(distance, 4 - distance), 0, 1)
         colour = value[:, None] * (1 - saturation[:, None] * lost)
+    if (adjustment.brightness, adjustment.contrast) != (0.0, 0.0):
+        gain, offset = 1 + adjustment.contrast, adjustment.brightness - adjustment.contrast / 2
+        colour = np.maximum(colour * np.float32(gain) + np.float32(offset), 0)
     return np.asarray(colour * np.array(adjustment.tint, np.float32), np.float32)
 
 

@@ -15,6 +15,8 @@ Array = np.ndarray
 
 _SLOT = {name: slot for slot, name in enumerate(SLOTS) if slot != NORMAL}
 #: Those that an adjustment multiplies by a number alone.
+#: Changes of the colour; the first two are factors.
+COLOUR = ("tint", "value", "hue", "saturation", "brightness", "contrast")
 _SCALED = ("emission", "opacity")
 #: Difference from which a vertex is painted, or not at all or wholly under a mask.
 _SAME = 1e-6
@@ -84,7 +86,7 @@ def adjusted_textures(
     under, has = number > 0, textures.slots >= 0
     if changes[ALBEDO]:
         gain = np.array(adjustment.tint, np.float64) * adjustment.value
-        linear = (adjustment.hue, adjustment.saturation) == (0.0, 1.0)
+        linear = all(getattr(adjustment, name) == getattr(Adjustment(), name) for name in COLOUR[2:])
         plain = linear & (factors[:, :3] * gain <= 1).all(axis=1) & (gain >= 0).all()
         factors[under & plain, :3] *= gain
         pending[:, ALBEDO] = under & ~plain & has[:, ALBEDO]
@@ -138,7 +140,7 @@ def _changes(adjustment: Adjustment) -> Array:
     """(8,) bool: which slots an adjustment changes."""
     changes = np.zeros(len(SLOTS), bool)
     plain = Adjustment()
-    changes[ALBEDO] = any(getattr(adjustment, k) != getattr(plain, k) for k in ("hue", "saturation", "value", "tint"))
+    changes[ALBEDO] = any(getattr(adjustment, name) != getattr(plain, name) for name in COLOUR)
     for name in ("roughness", "metallic", *_SCALED):
         changes[_SLOT[name]] = getattr(adjustment, name) != getattr(plain, name)
     return changes

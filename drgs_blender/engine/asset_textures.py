@@ -14,6 +14,7 @@ from ..core.errors import AssetError
 from ..core.frame import Adjustment
 from ..core.material_adjustments import adjusted_number, recoloured
 from ..core.materials import Image
+from ..core.texture_adjustments import COLOUR
 from ..deform.face_frames import local_normals, posed_normals
 
 Array = np.ndarray
@@ -69,11 +70,7 @@ class TexturedAsset:
     def baked(self, number: int, slot: int, factors: Array, adjustment: Adjustment) -> Image:
         """An image times its factor, adjusted; made again when the adjustment has changed."""
         name = ("albedo", "roughness", "metallic")[slot]
-        settings = (
-            (adjustment.tint, adjustment.hue, adjustment.saturation, adjustment.value)
-            if slot == ALBEDO
-            else getattr(adjustment, name)
-        )
+        settings = tuple(getattr(adjustment, part) for part in COLOUR) if slot == ALBEDO else getattr(adjustment, name)
         where = (number, name, tuple(factors.tolist()))
         key = (*where, settings)
         if key not in self._images:

@@ -41,6 +41,14 @@ def test_hue_saturation_and_value_are_those_of_the_standard_library(materials):
         np.testing.assert_allclose(new, expected, atol=2e-6)
 
 
+def test_brightness_and_contrast_are_those_of_blenders_node(materials):
+    """After hue, saturation and value, before the tint."""
+    change = Adjustment(value=0.8, brightness=0.1, contrast=0.5, tint=(0.5, 1, 1))
+    made = adjusted(materials, change)["albedo"]
+    expected = np.maximum(1.5 * (0.8 * materials["albedo"]) + 0.1 - 0.25, 0) * (0.5, 1, 1)
+    np.testing.assert_allclose(made, expected.clip(0, 1), atol=1e-6)
+
+
 def test_gain_offset_and_limits(materials):
     made = adjusted(materials, Adjustment(roughness=(2.0, -0.25, 0.1, 0.6), metallic=(-1.0, 1.0, 0.0, 1.0)))
     np.testing.assert_allclose(made["roughness"], np.clip(2 * materials["roughness"] - 0.25, 0.1, 0.6), atol=1e-6)

@@ -181,6 +181,7 @@ ADJUSTMENTS = (
     Adjustment(tint=(0.5, 0.8, 1.0)),
     Adjustment(value=1.9),
     Adjustment(hue=0.3, saturation=0.7, value=1.1, tint=(1, 0.5, 1)),
+    Adjustment(brightness=0.1, contrast=-0.3),
     Adjustment(roughness=(0.5, 0.0, 0.0, 1.0), metallic=(-1.0, 0.9, 0.1, 0.7)),
     Adjustment(roughness=(3.0, 0.0, 0.0, 1.0)),
 )

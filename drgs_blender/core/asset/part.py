@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -74,10 +75,10 @@ def part_of(asset: Asset, part: Part, subject: str = "part") -> Asset:
 
 def vertices_of(mesh: Mesh, rows: Array) -> Mesh:
     """A mesh without faces of the vertices `rows`, (n,) int32, with their channels and groups."""
-    values = {name: getattr(mesh, name) for name in ("vertices", *_MATERIALS, *OPTIONAL_CHANNELS)}
-    taken = {name: None if value is None else value[rows] for name, value in values.items()}
+    values: dict[str, Any] = {name: getattr(mesh, name) for name in ("vertices", *_MATERIALS, *OPTIONAL_CHANNELS)}
+    chosen: dict[str, Any] = {name: None if value is None else value[rows] for name, value in values.items()}
     groups = {name: np.flatnonzero(np.isin(rows, of)).astype(np.int32) for name, of in mesh.groups.items()}
-    return Mesh(faces=np.empty((0, 3), np.int32), groups=groups, **taken)
+    return Mesh(faces=np.empty((0, 3), np.int32), groups=groups, **chosen)
 
 
 def _check(asset: Asset, part: Part, subject: str) -> None:
@@ -125,6 +126,6 @@ def _surfels_of(face: Array, part: Part, faces: int) -> tuple[Array, Array]:
 def taken(surfels: Surfels, rows: Array) -> Surfels:
     """The surfels `rows`, (k,) int array."""
     names = ("centre", "scale", "rotation", "opacity", *_MATERIALS, "sh", *SURFEL_CHANNELS)
-    values = {name: getattr(surfels, name) for name in names}
-    taken = {name: None if value is None else value[rows] for name, value in values.items()}
-    return Surfels(**taken, extras={name: values[rows] for name, values in surfels.extras.items()})
+    values: dict[str, Any] = {name: getattr(surfels, name) for name in names}
+    chosen: dict[str, Any] = {name: None if value is None else value[rows] for name, value in values.items()}
+    return Surfels(**chosen, extras={name: values[rows] for name, values in surfels.extras.items()})
