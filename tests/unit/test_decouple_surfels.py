@@ -21,7 +21,7 @@ from drgs_blender.reconstruct.inverse_rendering.regularisers import Regularisers
 from drgs_blender.reconstruct.inverse_rendering.run import decouple  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.surface import Surface  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.surfel_domain import neighbours, surfel_domain  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.surfel_domain import _keep_heaviest, neighbours, surfel_domain  # noqa: E402
 from drgs_blender.reconstruct.model.contributors import strongest  # noqa: E402
 from drgs_blender.reconstruct.model.gaussians import Gaussians  # noqa: E402
 
@@ -184,3 +184,27 @@ def test_a_stopped_run_on_surfels_goes_on_to_the_same_result(capture, leaf, tmp_
     for name in ("albedo", "roughness", "metallic", "normals"):
         assert np.array_equal(getattr(resumed.surfels, name), getattr(whole.surfels, name))
     assert np.array_equal(resumed.albedo, whole.albedo)
+
+
+def test_a_surfel_without_neighbours_is_learned(capture, leaf):
+    found = decouple(capture, tube(), replace(SMALL, iterations=2), surfels=leaf.select(torch.tensor([544])))
+    assert found.surfels is not None and np.isfinite(found.surfels.albedo).all()
+
+
+def test_a_mesh_that_no_photograph_shows_takes_the_materials_of_the_nearest_surfels(capture, leaf):
+    mesh = tube()
+    mesh.vertices = mesh.vertices + np.float32([100.0, 0, 0])
+    found = decouple(capture, mesh, replace(SMALL, iterations=2), surfels=leaf)
+    assert found.surfels is not None
+    assert found.albedo.min() >= found.surfels.albedo.min() > 0.05
+
+
+def test_the_heaviest_surface_is_where_most_weight_lies_within_reach():
+    rng = np.random.default_rng(0)
+    weight, depth, size = (rng.random((500, 16)).astype(np.float32) for _ in range(3))
+    size *= 0.3
+    beside = np.abs(depth[:, :, None] - depth[:, None]) <= size[..., None]
+    heaviest = np.einsum("nij,nj->ni", beside, weight).argmax(axis=1)
+    wanted = np.where(beside[np.arange(500), heaviest], weight, 0)
+    _keep_heaviest(weight, depth, size)
+    np.testing.assert_array_equal(weight, wanted)

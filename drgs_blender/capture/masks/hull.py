@@ -96,16 +96,18 @@ class Hull:
     def pixels(self, view: MaskView) -> int:
         """Pixels of a voxel in a view, about."""
         away = max(float(np.linalg.norm(view.centre - self._middle)), 1e-9)
-        return max(1, int(np.ceil(self.cell * view.lens.fx / away)))
+        return max(1, int(np.ceil(min(self.cell * view.lens.fx / away, max(view.shape)))))
 
     def seen_by(self, view: MaskView, solid: Array) -> Array:
         """(h, w) bool: the voxels' outline in a view."""
         height, width = view.shape
         at, depth = view.project(self.places[solid])
+        at, depth = at[depth > 0], depth[depth > 0]
         drawn = np.zeros((height, width), np.uint8)
         if not len(at):
             return drawn > 0
-        size = 1 | int(np.ceil(1.2 * self.cell * view.lens.fx / max(float(np.median(depth)), 1e-9)))
+        size = 1.2 * self.cell * view.lens.fx / max(float(np.median(depth)), 1e-9)
+        size = 1 | int(np.ceil(min(size, 2 * max(height, width))))
         at = np.nan_to_num(at, nan=-1e6)
         fits = (at > -size).all(axis=1) & (at[:, 0] < width + size) & (at[:, 1] < height + size)
         column, row = np.clip(at[fits].astype(int), 0, [width - 1, height - 1]).T

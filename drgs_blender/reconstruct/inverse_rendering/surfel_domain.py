@@ -6,10 +6,13 @@ A pixel shows the blend of the surfels that cover most of it, those of its heavi
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from ...compute.jit import njit
 from ...core.arrays import Array
 from ...core.asset.model import Mesh
 from ...geometry.normals import unit
@@ -25,6 +28,8 @@ from .domain import Domain
 from .pixels import Pixels, check_size, of_training_views, onto_vertices, photographed, within_mask
 from .radiance_cache import edges_of, filled
 from .settings import Settings
+
+log = logging.getLogger(__name__)
 
 #: Neighbours of a surfel along which its materials are smooth, and the least cosine between their planes.
 _NEIGHBOURS, _COPLANAR = 6, 0.5
@@ -76,6 +81,9 @@ def carried(values: Array, mesh: Mesh, gaussians: Gaussians, views: list[View]) 
 
     total = onto_vertices(mesh, views, shown)
     seen = total[:, -1] > 1e-3
+    if not seen.any():  # as of rods of two pixels: a pixel away from the outline nothing is left
+        log.warning("no photograph shows the mesh of the surfels: it takes the materials of the nearest")
+        return columns.numpy()[cKDTree(gaussians.centres().numpy(force=True)).query(mesh.vertices)[1]], seen
     return np.clip(filled(total[:, :-1] / np.maximum(total[:, -1:], 1e-9), seen, edges_of(mesh.faces)), 0, 1), seen
 
 
@@ -87,6 +95,26 @@ def neighbours(centres: Array, normals: Array) -> Array:
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     coplanar = np.abs(np.einsum("nc,nc->n", normals[pairs[:, 0]], normals[pairs[:, 1]])) > _COPLANAR
     return np.unique(np.sort(pairs[coplanar], axis=1), axis=0).astype(np.int64)
+
+
+@njit
+def _keep_heaviest(weight, depth, size):  # type: ignore[no-untyped-def]
+    """Of the heaviest surface alone, as when the asset is rendered: others would be lit in between.
+
+    Sets the weights (n, k) of what is farther than `size` from the depth at which most weight is to 0, in place.
+    """
+    for pixel in range(len(weight)):
+        place, most = 0, np.float32(-1.0)
+        for i in range(weight.shape[1]):
+            total = np.float32(0.0)
+            for j in range(weight.shape[1]):
+                if abs(depth[pixel, i] - depth[pixel, j]) <= size[pixel, i]:
+                    total += weight[pixel, j]
+            if total > most:
+                place, most = i, total
+        for j in range(weight.shape[1]):
+            if abs(depth[pixel, place] - depth[pixel, j]) > size[pixel, place]:
+                weight[pixel, j] = 0
 
 
 def _surfel_pixels(number: int, view: View, part: View, gaussians: Gaussians, axes: Array, scale: Array) -> Pixels:
@@ -102,11 +130,8 @@ def _surfel_pixels(number: int, view: View, part: View, gaussians: Gaussians, ax
     seen = (alpha > min(_COVERED, _COVERED * float(alpha.max()))) & within_mask(part)
     row = np.flatnonzero(seen)
     index, weight, depth = (array.reshape(-1, _MOST)[row] for array in (index, weight, depth))
-    # Of the heaviest surface alone, as when the asset is rendered: others would be lit in between.
     size = WINDOW_SCALES * scale[index]
-    beside = np.abs(depth[:, :, None] - depth[:, None]) <= size[..., None]
-    heaviest = np.einsum("nij,nj->ni", beside, weight).argmax(axis=1)
-    weight = np.where(beside[np.arange(len(row)), heaviest], weight, 0)
+    _keep_heaviest(weight, depth, size)
     share = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
     origin, direction = (a.numpy().astype(np.float32)[row] for a in camera_rays(camera, pixel_centres(camera)))
     towards = -direction / np.linalg.norm(direction, axis=1, keepdims=True)
