@@ -24,6 +24,7 @@ from ..capture.capture import Capture, View
 from ..meshing.crops import corner_of, cropped_views
 from ..model.contributors import strongest
 from ..model.gaussians import Gaussians
+from ..model.raster import WorldSurfels
 from .domain import Domain
 from .pixels import Pixels, check_size, of_training_views, onto_vertices, photographed, within_mask
 from .radiance_cache import edges_of, filled
@@ -59,13 +60,13 @@ def surfel_domain(capture: Capture, gaussians: Gaussians, settings: Settings) ->
     occluder = Mesh(vertices, faces, np.zeros_like(vertices), blank, blank)
     scale = np.sqrt(np.maximum((u * u).sum(1), (v * v).sum(1)))
     parts = cropped_views(capture.training, vertices)
+    shown = WorldSurfels(*(np.ascontiguousarray(a, np.float32) for a in (centres, u, v, opacities)))
     pixels = of_training_views(
-        capture, settings, lambda k, view: _surfel_pixels(k, view, parts[k], gaussians, normals, scale)
+        capture, settings, lambda k, view: _surfel_pixels(k, view, parts[k], shown, normals, scale)
     )
     owner = np.repeat(np.arange(len(centres)), len(vertices) // max(len(centres), 1))
     edges = neighbours(centres, normals)
-    tree = TriangleBVH()
-    tree.build(vertices, faces)
+    tree = TriangleBVH(vertices, faces)
     return Domain(centres, normals.astype(np.float32), edges, pixels, occluder, tree, owner, gaussians)
 
 
@@ -117,14 +118,14 @@ def _keep_heaviest(weight, depth, size):  # type: ignore[no-untyped-def]
                 weight[pixel, j] = 0
 
 
-def _surfel_pixels(number: int, view: View, part: View, gaussians: Gaussians, axes: Array, scale: Array) -> Pixels:
+def _surfel_pixels(number: int, view: View, part: View, surfels: WorldSurfels, axes: Array, scale: Array) -> Pixels:
     """The pixels of the view `number` that show surfels, found in its cropped `part`.
 
     `axes` (n, 3) and `scale` (n,) are the surfels' normals and larger standard deviations.
     """
     check_size(view)
     camera = part.camera
-    index, weight, depth = strongest(gaussians, camera, _MOST)
+    index, weight, depth = strongest(surfels, camera, _MOST)
     alpha = weight.sum(axis=-1)
     # Surfels of few steps may cover nothing whole.
     seen = (alpha > min(_COVERED, _COVERED * float(alpha.max()))) & within_mask(part)
@@ -138,8 +139,7 @@ def _surfel_pixels(number: int, view: View, part: View, gaussians: Gaussians, ax
     own = axes[index]
     facing = np.sign(np.einsum("nkc,nc->nk", own, towards))
     normal = unit(np.einsum("nk,nkc->nc", share * facing, own), (0, 0, 0)).astype(np.float32)
-    along = direction @ -np.asarray(camera.matrix_world, np.float32)[:3, 2]
-    place = origin + ((share * depth).sum(axis=1) / along)[:, None] * direction
+    place = origin + (share * depth).sum(axis=1, keepdims=True) * direction  # of unit depth
     left, top = corner_of(camera, view.camera)
     y, x = np.divmod(row, camera.width)
     found = Pixels(
