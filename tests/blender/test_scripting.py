@@ -16,6 +16,8 @@ from physics_scenes import cache_of
 from scenes import PACKAGE, ROOT, part, read_exr, write_ball, write_exr
 from test_motion import READ
 
+pytestmark = pytest.mark.blender_api
+
 PAGE = (ROOT / "docs" / "scripting.md").read_text(encoding="utf-8")
 WIDTH, HEIGHT = 160, 120
 #: A script as a Blender with factory settings runs it: the page says how it begins and, in the module, ends.
