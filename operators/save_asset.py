@@ -67,7 +67,7 @@ class DRGS_OT_save_asset(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
         for obj, target in zip(objects, paths):
             if lost := save(obj, target, context.evaluated_depsgraph_get()):
                 problem = f'"{obj.name}": textures of {lost} faces cannot say its adjustments'
-                self.report({"WARNING"}, f"{problem}; the file has the adjusted materials of their vertices")
+                self.warn(f"{problem}; the file has the adjusted materials of their vertices")
         if self.use_saved:
             for obj, target in zip(selection.editable(objects, vertices=False, data=True), paths):
                 rows = rows_in_part(obj, context.evaluated_depsgraph_get())

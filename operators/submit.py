@@ -37,6 +37,9 @@ class DRGS_OT_submit(DrgsOperator, bpy.types.Operator):
         if job.done and job.error:
             self.report({"ERROR"}, job.error)
             return {"CANCELLED"}
+        if job.done:  # without a window no panel shows it
+            self.report({"INFO"}, f"{job.text}. Submit with")
+            self.report({"INFO"}, job.command)
         return {"FINISHED"}
 
 

@@ -22,7 +22,14 @@ ROOT = Path(__file__).resolve().parent.parent
 BUILD = ROOT / "build" / "docs"
 #: Pages in the order of the navigation; README.md is the start page. Every page of docs/ must be here.
 NAVIGATION = {
-    "Start": ("docs/user-guide.md", "docs/command-line.md", "examples/README.md", "docs/glossary.md", "CHANGELOG.md"),
+    "Start": (
+        "docs/user-guide.md",
+        "docs/scripting.md",
+        "docs/command-line.md",
+        "examples/README.md",
+        "docs/glossary.md",
+        "CHANGELOG.md",
+    ),
     "Guides": (
         *("docs/rendering.md", "docs/simulation.md", "docs/deformation.md", "docs/decoupling.md", "docs/capture.md"),
         *("docs/reconstruct-settings.md", "docs/published-sets.md"),

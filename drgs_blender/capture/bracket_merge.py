@@ -83,7 +83,7 @@ class _Outcome:
         if self.lost > _ABOVE:
             notes.append(f"{self.lost:.1%} of its pixels are saturated in every exposure")
         if self.above > _ABOVE:
-            notes.append(f"{self.above:.1%} of its pixels are brighter than white, which drgs reconstruct clips")
+            notes.append(f"{self.above:.1%} of its pixels are brighter than white")
         return notes
 
 
@@ -345,5 +345,5 @@ def _lines(found: Brackets, outcomes: Sequence[_Outcome]) -> list[str]:
     line = f"brackets: {merged} merged, of {found.size} exposures ({stops} stops)"
     above = max(one.above for one in outcomes)
     if above > _ABOVE:
-        line += f"; up to {above:.1%} of a picture is brighter than white, which drgs reconstruct clips"
+        line += f"; up to {above:.1%} of a picture is brighter than white: only materials and light are learned from it"
     return [line]

@@ -18,6 +18,8 @@ from .masks import stage as mask_stage
 from .pictures import Picture
 from .preparation import Prepared, prepare
 from .registration import FEWEST, Registration, register
+from .soundness import check_directions
+from .still_camera import stood_still
 from .world_alignment import Alignment, align_to_ground, align_to_markers
 
 logger = logging.getLogger(__name__)
@@ -221,8 +223,11 @@ def _cameras(ready: Prepared, photos: list[Photo], ups: dict[str, gravity.Vector
         enough = len(marked.matrices) >= max(FEWEST, _MARKED * len(photos))
         if settings.poses == "markers" or enough:
             return marked, _of_sheet(sheet)
+    if ready.masks is None:
+        _check_surroundings(ready, photos, settings, str(source))
     try:
         found = _by_features(ready, photos, ordered, str(source), tell, cancelled)
+        check_directions(found, str(source))
     except AssetError as error:
         if marked is None or sheet is None or len(marked.matrices) < FEWEST:
             raise
@@ -239,6 +244,26 @@ def _cameras(ready: Prepared, photos: list[Photo], ups: dict[str, gravity.Vector
         alignment = align_to_ground(found, settings.distance, gravity.measured_up(found, ups, str(source)))
         _tell_guesses(alignment, source)
     return found, alignment
+
+
+def _check_surroundings(ready: Prepared, photos: list[Photo], settings: Settings, subject: str) -> None:
+    """Refuse pictures without masks of an object that was turned before a camera that stood still.
+
+    `Settings.poses` "features" tries them all the same.
+    """
+    files = {photo.file for photo in photos}
+    looks = [one.signature for photo, one in zip(ready.photos, ready.looks, strict=True) if photo.file in files]
+    if not stood_still(looks):
+        return
+    problem = "shows the same surroundings in all pictures: the camera stood still, and the object was turned"
+    remedy = (
+        "Features would find the room, not the object. Draw masks (white on the object, folder masks), or lay a marker "
+        "sheet under the object and turn it with it (drgs markers)"
+    )
+    if settings.poses == "features":
+        logger.warning("%s %s. %s", subject, problem, remedy)
+        return
+    raise AssetError(subject, problem, f"{remedy}; --poses features tries it all the same")
 
 
 def _by_features(ready: Prepared, photos: list[Photo], ordered: bool, subject: str, tell: Tell,

@@ -198,9 +198,13 @@ def _attempt(colmap: Any, database: Path, pictures: Path, folder: Path, settings
         if cancelled():
             token.cancel()
 
-    found = colmap.incremental_mapping(
-        str(database), str(pictures), str(folder), options, str(start) if start else "", lambda: None, next_image, token
-    )
+    model = str(start) if start else ""
+    try:
+        found = colmap.incremental_mapping(
+            str(database), str(pictures), str(folder), options, model, lambda: None, next_image, token
+        )
+    except InterruptedError as error:  # COLMAP's word for a token that was cancelled
+        raise Cancelled from error
     if cancelled():
         raise Cancelled
     return list(found.values())

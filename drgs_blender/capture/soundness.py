@@ -10,11 +10,15 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..core.arrays import Array
+from ..core.errors import AssetError
+
+if TYPE_CHECKING:
+    from .registration import Registration
 
 #: Points, seen by two or more of the other pictures, without which a camera is none.
 LEAST_POINTS = 12
@@ -22,6 +26,8 @@ LEAST_POINTS = 12
 _AGREES = 4.0
 #: Part of a picture's verified matches that must agree with the cameras of the others.
 _AGREEING = 0.5
+#: Degrees that the directions of all cameras span, below which they show one side alone.
+_SPAN = 12.0
 #: Part of its points that a picture may share with those left out, which may have bent its camera.
 _SHARED = 0.25
 
@@ -175,3 +181,15 @@ def _agreement(model: Any, matches: Sequence[tuple[int, int, Array]]) -> dict[tu
         agree = np.abs((second * lines).sum(axis=1)) * focal < _AGREES * slope
         found[a, b] = int(agree.sum()), len(pair)
     return found
+
+
+def check_directions(found: Registration, subject: str) -> None:
+    """Raise AssetError where all cameras look the same way: of an object that was turned, or of one side of it."""
+    facing = np.array([-matrix[:3, 2] for matrix in found.matrices.values()])
+    span = float(np.degrees(np.arccos(np.clip((facing @ facing.T).min(), -1, 1))))
+    if span < _SPAN:
+        raise AssetError(
+            subject, f"shows one side alone: its {len(facing)} cameras look the same way within {span:.0f} degrees",
+            "Go around the object. If it was turned before a camera that stood still, draw masks, or let a marker "
+            "sheet turn with it (drgs markers)",
+        )  # fmt: skip

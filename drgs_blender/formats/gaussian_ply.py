@@ -19,13 +19,12 @@ from ..core.color import srgb_to_linear
 from ..core.errors import AssetError
 from .axes import FARTHEST, multiply_quaternions
 from .files import SurfelFile
+from .harmonics import SH_C0
 from .ply import Header, Rows, read_ply
 
 Array = np.ndarray
 Columns = dict[str, Array]
 
-#: Zeroth spherical-harmonic basis function.
-SH_C0 = 0.28209479177387814
 #: A splat whose shortest axis is more than this part of the next one is not nearly a surfel.
 FLAT = 0.3
 #: Largest SH degree in use has 16 coefficients; more is damage.

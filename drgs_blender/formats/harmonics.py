@@ -12,6 +12,8 @@ import numpy as np
 
 Array = np.ndarray
 
+#: Value of the constant one.
+SH_C0 = 0.28209479177387814
 #: Splats rotated at once; bounds the memory of the intermediate bases.
 _BLOCK = 1 << 16
 
@@ -25,7 +27,7 @@ def basis(directions: Array, degree: int) -> Array:
 def polynomials(x: Any, y: Any, z: Any, one: Any, degree: int) -> list[Any]:
     """Basis functions of unit directions; arrays or tensors, `one` full of ones."""
     xx, yy, zz = x * x, y * y, z * z
-    columns = [0.28209479177387814 * one]
+    columns = [SH_C0 * one]
     if degree >= 1:
         a = 0.4886025119029199
         columns += [-a * y, a * z, -a * x]

@@ -29,19 +29,24 @@ MEANING = 2
 def fingerprint(capture: Capture, **settings: Any) -> str:
     """Digest of what a state depends on.
 
-    Photographs, masks, normals, cameras, settings that JSON can hold, this version, and `MEANING`.
+    Photographs, masks, normals, cameras, background, sparse points, settings that JSON can hold, this version, and
+    `MEANING`.
     """
     digest = hashlib.sha256(
         f"{__version__} {MEANING} ".encode() + json.dumps(settings, sort_keys=True, default=str).encode()
     )
+    digest.update(f"{capture.background}".encode())
+    if capture.points is not None:
+        digest.update(np.ascontiguousarray(capture.points).data)
     for view in capture.views:
         camera = view.camera
-        digest.update(f"{view.name} {view.test} {camera.width} {camera.height}".encode())
+        digest.update(f"{view.name} {view.test} {view.linear} {camera.width} {camera.height}".encode())
         digest.update(np.asarray(camera.matrix_world, np.float64).tobytes())
         digest.update(np.array([camera.fx, camera.fy, camera.cx, camera.cy]).tobytes())
         digest.update(np.ascontiguousarray(view.colour).data)
-        for layer in (view.mask, view.normals, view.above_white, view.turn):
-            if layer is not None:
+        for name in ("mask", "normals", "above_white", "turn"):
+            if (layer := getattr(view, name)) is not None:
+                digest.update(name.encode())
                 digest.update(np.ascontiguousarray(layer).data)
     return digest.hexdigest()
 

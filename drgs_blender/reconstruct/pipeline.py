@@ -136,7 +136,7 @@ def reconstruct(
     settings = settings or Settings()
     settings.check()
     if idle := settings.without_effect():
-        log.warning("%s: no effect with variant %s, materials %s", first_of(idle), settings.variant, settings.materials)
+        log.warning("%s: no effect with the other settings", first_of(idle))
     region = find_region(capture)
     if (count := len(capture.training)) < FEW_VIEWS:
         log.warning("%s: only %d views, too few for shape, materials and light. Take 30", capture.source, count)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from ..core.errors import UsageError
 from .inverse_rendering.settings import Settings as Decoupling
@@ -111,16 +111,34 @@ class Settings:
 
     def without_effect(self) -> list[str]:
         """Names of settings that are not the default and decide nothing, because of others."""
-        default = Settings()
-        names = (
-            [] if self.materials else [f"decoupling.{name}" for name in _changed(self.decoupling, default.decoupling)]
-        )
-        if self.materials and self.decoupling.joint and self.variant == "m":
-            names += ["decoupling.joint"]
-        if self.materials and self.decoupling.domain == "surfels" and self.variant == "m":
-            names += ["decoupling.domain"]
-        return names + (["fixed"] if self.fixed and self.variant == "p" else [])
+        default, schedule = Settings(), self.schedule
+        changed = [f"decoupling.{name}" for name in _changed(self.decoupling, default.decoupling)]
+        changed += [f"schedule.{name}" for name in _changed(schedule, default.schedule)]
+        idle = {f"schedule.{name}" for name in ("patches_from", "patches_spread") if not schedule.patches}
+        idle |= {"schedule.median"} if not schedule.consistency else set()
+        idle |= {f"decoupling.{name}" for name in self._idle_of_materials()}
+        return [name for name in changed if name in idle] + (["fixed"] if self.fixed and self.variant == "p" else [])
+
+    def _idle_of_materials(self) -> set[str]:
+        """Names of the settings of inverse rendering that decide nothing, changed or not."""
+        s = self.decoupling
+        if not self.materials:
+            return {field.name for field in fields(s)}
+        idle = {"joint", "domain"} if self.variant == "m" else set()
+        if not s.unbiased:
+            idle |= {"weight_by_prediction", "clipped_neighbour_weight"}
+        if not s.weight_by_prediction:
+            idle |= {"clipped_neighbour_weight"}
+        if s.parametrisation != "metallic":
+            idle |= {"binary_metallic_prior", "metal_albedo_prior", "metal_smoothness"}
+        if not s.smoothness:
+            idle |= {"metal_smoothness"}
+        if not s.normals:
+            idle |= {"normal_smoothness"}
+        if not s.shadows:
+            idle |= {"indirect"}
+        return idle
 
 
-def _changed(one: Decoupling, other: Decoupling) -> list[str]:
+def _changed(one: Any, other: Any) -> list[str]:
     return [field.name for field in fields(one) if getattr(one, field.name) != getattr(other, field.name)]

@@ -139,6 +139,8 @@ def test_save_keeps_textures_and_what_factors_can_say(ball, tmp_path):
     ball.drgs.adjustment.hue = 0.25
     bpy.ops.drgs.save_asset(filepath=str(tmp_path / "hue.drgs"))
     assert (read(tmp_path / "hue.drgs").slots[:, 0] == -1).all()
+    last = part("addon.messages").history[-1]
+    assert last.level == "WARNING" and "cannot say its adjustments" in last.text
 
 
 def test_images_of_optional_channels_are_shown_and_saved(scene, tmp_path):

@@ -34,7 +34,7 @@ def write() -> set[str]:
     ("manager", "file", "starts"),
     [("openjd", "template.json", "openjd run "), ("slurm", "render.sbatch", "sh "), ("flamenco", "job.json", "curl ")],
 )
-def test_a_job_is_written_and_its_command_shown(settings, tmp_path, manager, file, starts):
+def test_a_job_is_written_and_its_command_shown(settings, tmp_path, capfd, manager, file, starts):
     settings.manager, settings.chunk, settings.options = manager, 2, "--samples 16"
     settings.use_denoise, settings.denoised = True, "//clean/####.exr"
     settings.sbatch, settings.retries = "--partition=farm --mem=8G", 7
@@ -42,6 +42,7 @@ def test_a_job_is_written_and_its_command_shown(settings, tmp_path, manager, fil
     text = (tmp_path / "job" / file).read_text()
     assert str(tmp_path / "f" / "####.exr") in text or manager == "openjd"
     assert submit.job.command.startswith(starts) and "3 frames in 2 tasks" in submit.job.text
+    assert f"Info: {submit.job.command}" in capfd.readouterr().out, "without a window it is printed"
     assert "16" in text and submit.job.error == ""
     if manager == "slurm":
         assert "#SBATCH --partition=farm" in text and "#SBATCH --mem=8G" in text and ">= 7" in text

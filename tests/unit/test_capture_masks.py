@@ -500,3 +500,12 @@ def test_making_masks_can_be_cancelled(cv2, tmp_path):
     found, pictures = written(tmp_path, views, ball_points())
     with pytest.raises(Cancelled):
         run(tmp_path, "auto", found, pictures, cancelled=lambda: True)
+
+
+def test_a_camera_that_looks_away_sees_nothing_of_the_hull():
+    cv2 = pytest.importorskip("cv2")
+    views, masks = scene()
+    views[3].matrix = views[3].matrix @ np.diag([-1.0, 1, -1, 1])
+    hull = Hull(cv2, views, masks, ObjectBox(MIDDLE - 0.2, MIDDLE + 0.2, np.zeros((0, 3))))
+    found = check_masks(cv2, views, masks, hull)
+    assert found[3].outside == 1.0 and found[3].wrong

@@ -17,6 +17,7 @@ from drgs_blender.core.asset.model import PosedSurfels  # noqa: E402
 from drgs_blender.core.color import linear_to_srgb, srgb_to_linear  # noqa: E402
 from drgs_blender.core.errors import Cancelled, UsageError  # noqa: E402
 from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World  # noqa: E402
+from drgs_blender.formats.harmonics import SH_C0  # noqa: E402
 from drgs_blender.geometry.normals import VertexNormals, unit  # noqa: E402
 from drgs_blender.reconstruct.capture.capture import Capture, View  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.decoupled import Decoupled, Progress  # noqa: E402
@@ -24,7 +25,12 @@ from drgs_blender.reconstruct.inverse_rendering.domain import mesh_domain  # noq
 from drgs_blender.reconstruct.inverse_rendering.environment import LearnedLight, colour_cast  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.estimator import Points  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.gatherer import Gatherer  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.losses import blotches, dullness, log_loss, unbiased_loss  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.losses import (  # noqa: E402
+    log_loss,
+    metal_albedo_prior,
+    metal_smoothness_prior,
+    unbiased_loss,
+)
 from drgs_blender.reconstruct.inverse_rendering.materials import Materials, from_specular  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.pixels import pixels_of  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.radiance_cache import edges_of, radiance_cache  # noqa: E402
@@ -253,12 +259,12 @@ def test_albedo_along_edges_of_metal_is_evened_out_but_for_its_patterns_and_pain
     ends = torch.tensor([[0.6, 0.5, 0.3], [0.9, 0.5, 0.3]]).repeat(4, 1, 1).requires_grad_(True)
     metallic = torch.tensor([[1.0, 1.0], [0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
     alike = torch.tensor([1.0, 1.0, 1.0, 0.0])  # the last edge crosses a line that the photographs show
-    loss = blotches((ends[:, 0] - ends[:, 1]).abs(), metallic, alike[:, None])
+    loss = metal_smoothness_prior((ends[:, 0] - ends[:, 1]).abs(), metallic, alike[:, None])
     (slope,) = torch.autograd.grad(loss, ends)
     assert slope[0, 0, 0] < 0 < slope[0, 1, 0]
     assert float(slope[1:].abs().max()) == 0
     metallic.requires_grad_(True)  # not by being less of a metal
-    assert not blotches((ends[:, 0] - ends[:, 1]).abs().detach(), metallic, alike[:, None]).requires_grad
+    assert not metal_smoothness_prior((ends[:, 0] - ends[:, 1]).abs().detach(), metallic, alike[:, None]).requires_grad
 
 
 @pytest.mark.parametrize("weight", ["metal_smoothness", pytest.param("metal_albedo_prior", marks=pytest.mark.slow)])
@@ -330,7 +336,7 @@ def test_pixels_beside_clipped_ones_count_whole_as_long_as_photographs_weigh(bal
 
 def test_metals_are_pulled_to_be_bright_keep_their_hue_and_paint_is_let_alone():
     albedo = torch.tensor([[0.4, 0.3, 0.1], [0.95, 0.7, 0.4], [1.0, 1.0, 1.0], [0.4, 0.3, 0.1]], requires_grad=True)
-    loss = dullness(albedo, torch.tensor([1.0, 1.0, 1.0, 0.4]))
+    loss = metal_albedo_prior(albedo, torch.tensor([1.0, 1.0, 1.0, 0.4]))
     (slope,) = torch.autograd.grad(loss, albedo)
     step = -slope
     assert (step[0] > 0).all() and step[0] / step[0, 0] == pytest.approx(albedo[0].detach() / 0.4, rel=1e-5)
@@ -470,6 +476,24 @@ def test_only_pictures_whose_scale_says_nothing_are_brought_to_one_brightness(ca
     assert _gain(capture, 1e-3, 0.12) * 1e-3 == pytest.approx(0.2 * 0.12)  # darker than anybody would photograph it
 
 
+def test_light_and_errors_have_the_scale_of_the_photographs_and_the_domain_stays_as_it_is(ball, capture, monkeypatch):
+    """Whatever brightness losses are weighed at; a second run on the same domain finds the same."""
+    views = [replace(view, linear=True) for view in capture.views]
+    plain = decouple(replace(capture, views=views), ball, SMALL)
+    views = [
+        replace(view, colour=linear_to_srgb(srgb_to_linear(view.colour) / np.float32(64)), linear=True)
+        for view in capture.views
+    ]
+    dark = replace(capture, views=views)
+    domain = mesh_domain(dark, ball, SMALL)
+    before = domain.pixels.colour.copy()
+    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.run.domain_of", lambda *_: domain)
+    one, other = (decouple(dark, ball, SMALL) for _ in range(2))
+    assert np.array_equal(domain.pixels.colour, before) and np.array_equal(one.environment, other.environment)
+    assert 64 * one.environment.mean() == pytest.approx(plain.environment.mean(), rel=0.05)
+    assert one.report["psnr"] > plain.report["psnr"] + 6  # differences of dark pictures are smaller in sRGB
+
+
 @pytest.mark.slow
 def test_the_hue_of_all_photographs_is_that_of_the_object_not_of_the_light(ball):
     """Bronze in grey light: only a start from its own hue keeps the light, which learns faster, from turning bronze."""
@@ -590,6 +614,20 @@ def test_an_interrupted_run_ends_where_an_undisturbed_one_does(ball, capture, tm
     assert not np.array_equal(other.albedo, whole.albedo)
 
 
+def test_torchs_threads_change_nothing(ball, capture):
+    """A light of 128 rows has more numbers than torch sums on one thread by itself."""
+    settings, found = replace(SMALL, iterations=4, environment=128, coarse_to_fine=False), []
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 4):
+            torch.set_num_threads(threads)
+            found.append(decouple(capture, ball, settings))
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert all(np.array_equal(a, b) for a, b in zip(*map(arrays, found), strict=True))
+
+
 def test_a_run_whose_time_was_up_when_it_was_stopped_still_knows_how_good_it_is(ball, capture, tmp_path):
     clock, tick = [0.0], [1.0]
 
@@ -626,7 +664,7 @@ def test_cache_shows_what_was_photographed(ball, capture):
     pixels = domain.pixels
     constant = replace(pixels, colour=np.full((len(pixels), 3), 0.3, np.float32))
     harmonics, weight = radiance_cache(constant, len(ball.vertices), domain.edges)
-    assert harmonics[:, 0] * 0.28209479 == pytest.approx(0.3, abs=0.02)  # those that no photograph shows as well
+    assert harmonics[:, 0] * SH_C0 == pytest.approx(0.3, abs=0.02)  # those that no photograph shows as well
     assert (weight == 0).any()
     assert abs(harmonics[weight > 3, 1:]).max() < 0.05
     few = mesh_domain(capture, ball, replace(SMALL, most_pixels=140)).pixels

@@ -17,13 +17,15 @@ from drgs_blender.core.asset.model import Mesh  # noqa: E402
 from drgs_blender.core.color import linear_to_srgb, srgb_to_linear  # noqa: E402
 from drgs_blender.core.errors import Cancelled  # noqa: E402
 from drgs_blender.reconstruct.capture.capture import Capture, View  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering import run  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.regularisers import Regularisers  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.run import decouple  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.surface import Surface  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.surfel_domain import neighbours, surfel_domain  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.surface import Pairs, Surface  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.surfel_domain import _keep_heaviest, neighbours, surfel_domain  # noqa: E402
 from drgs_blender.reconstruct.model.contributors import strongest  # noqa: E402
 from drgs_blender.reconstruct.model.gaussians import Gaussians  # noqa: E402
+from drgs_blender.reconstruct.model.raster import WorldSurfels  # noqa: E402
 
 #: Half a side of the leaf, the light from above and below, and the albedos of its halves.
 HALF, ABOVE, BELOW, DARK, PALE = 0.8, 1.0, 0.25, 0.2, 0.6
@@ -87,13 +89,14 @@ def test_the_strongest_surfels_of_a_pixel_are_those_that_its_colour_blends(captu
     for view in capture.views[:3]:
         with torch.no_grad():
             shown = leaf.render(view.camera, torch.zeros(3), 0, reflections=False, materials=values)
-        index, weight, depth = strongest(leaf, view.camera, 64)
+        surfels = WorldSurfels(leaf.centres().detach().numpy(), *leaf.frames()[:2], leaf.opacities().detach().numpy())
+        index, weight, depth = strongest(surfels, view.camera, 64)
         assert (np.diff(weight, axis=-1) <= 0).all()
         assert weight.sum(-1) == pytest.approx(shown.maps.alpha.numpy(), abs=1e-5)
         blended = (weight[..., None] * values.numpy()[index]).sum(2)
         assert blended == pytest.approx(shown.materials.numpy(), abs=1e-5)
         assert (weight * depth).sum(-1) == pytest.approx(shown.maps.depth.numpy(), abs=1e-4)
-        for few, all_ in zip(strongest(leaf, view.camera, 4), (index, weight, depth), strict=True):
+        for few, all_ in zip(strongest(surfels, view.camera, 4), (index, weight, depth), strict=True):
             assert np.array_equal(few, all_[..., :4])
 
 
@@ -119,6 +122,23 @@ def test_rays_of_a_leaf_start_on_the_side_that_is_seen(capture, leaf):
     assert np.array_equal(pixels.colour, srgb_to_linear(shown[pixels.view, pixels.place]))
     facing = Surface(domain.points, domain.normals, SMALL, np.ones(3), True).at(pixels, domain.edges[:5])
     assert (facing.normal.numpy() * pixels.towards).sum(1).min() > 0
+
+
+def test_each_corner_of_a_sheet_belongs_to_its_surfel(capture, leaf):
+    domain = surfel_domain(capture, leaf, SMALL)
+    assert len(np.unique(domain.owner)) == len(domain.points)
+    away = np.linalg.norm(domain.occluder.vertices - domain.points[domain.owner], axis=1)
+    assert away.max() < 5 * 0.03
+
+
+def test_surfels_that_photographs_show_alike_are_held_more_than_vertices(capture, leaf, monkeypatch):
+    monkeypatch.setattr(run, "learned", lambda job, *_: job)
+    columns, pair = torch.tensor([[0.2] * 4, [0.6] * 4]), Pairs(torch.tensor([[0, 1]]), torch.ones(1))
+    weights = [
+        float(run.decouple(capture, tube(), SMALL, surfels=surfels)._regularisers.of_likeness(columns, pair))
+        for surfels in (leaf, None)
+    ]
+    assert weights[0] == pytest.approx(3 * weights[1], rel=1e-5)
 
 
 def leaves(share: float) -> Gaussians:
@@ -157,6 +177,14 @@ def test_a_single_surfel_and_two_in_one_place_have_no_neighbours():
     assert neighbours(np.zeros((2, 3)), up).tolist() in ([[0, 1]], [])
 
 
+def test_surfels_on_either_side_of_an_edge_are_no_neighbours():
+    line = np.linspace(0, 1, 20)[:, None]
+    floor, wall = line * (1.0, 0, 0), line * (0, 0, 1.0)
+    normals = np.repeat([[0.0, 0, 1], [1.0, 0, 0]], 20, axis=0)
+    edges = neighbours(np.concatenate([floor, wall]), normals)
+    assert len(edges) and ((edges < 20).all(1) | (edges >= 20).all(1)).all()
+
+
 def test_normals_of_neighbours_on_either_side_are_alike_when_they_turn_alike(capture, leaf):
     """Offsets of surfels that look up and down are opposite where the leaf bends."""
     domain = surfel_domain(capture, leaf, SMALL)
@@ -184,3 +212,27 @@ def test_a_stopped_run_on_surfels_goes_on_to_the_same_result(capture, leaf, tmp_
     for name in ("albedo", "roughness", "metallic", "normals"):
         assert np.array_equal(getattr(resumed.surfels, name), getattr(whole.surfels, name))
     assert np.array_equal(resumed.albedo, whole.albedo)
+
+
+def test_a_surfel_without_neighbours_is_learned(capture, leaf):
+    found = decouple(capture, tube(), replace(SMALL, iterations=2), surfels=leaf.select(torch.tensor([544])))
+    assert found.surfels is not None and np.isfinite(found.surfels.albedo).all()
+
+
+def test_a_mesh_that_no_photograph_shows_takes_the_materials_of_the_nearest_surfels(capture, leaf):
+    mesh = tube()
+    mesh.vertices = mesh.vertices + np.float32([100.0, 0, 0])
+    found = decouple(capture, mesh, replace(SMALL, iterations=2), surfels=leaf)
+    assert found.surfels is not None
+    assert found.albedo.min() >= found.surfels.albedo.min() > 0.05
+
+
+def test_the_heaviest_surface_is_where_most_weight_lies_within_reach():
+    rng = np.random.default_rng(0)
+    weight, depth, size = (rng.random((500, 16)).astype(np.float32) for _ in range(3))
+    size *= 0.3
+    beside = np.abs(depth[:, :, None] - depth[:, None]) <= size[..., None]
+    heaviest = np.einsum("nij,nj->ni", beside, weight).argmax(axis=1)
+    wanted = np.where(beside[np.arange(500), heaviest], weight, 0)
+    _keep_heaviest(weight, depth, size)
+    np.testing.assert_array_equal(weight, wanted)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from drgs_blender.cli.main import build_parser, join_values
+from drgs_blender.core.passes import PASSES
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -53,6 +54,7 @@ def test_names_of_the_code_exist() -> None:
     text = "\n".join(path.read_text(encoding="utf-8") for path in [*paths, ROOT / "pyproject.toml"])
     known = set(re.findall(r"[A-Za-z_]\w*", text)) | {path.stem for path in paths}
     known |= {"rgba_city", "MaxArraySize"}  # a file of TensoIR's, a limit of Slurm's
+    known |= {f"use_pass_{p.name.lower().replace(' ', '_')}" for p in PASSES}
     for page in PAGES:
         code = [c for c in re.findall(r"(?<!`)`([^`\n]+)`(?!`)", page.read_text(encoding="utf-8")) if " " not in c]
         named = {

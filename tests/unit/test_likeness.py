@@ -17,7 +17,7 @@ from drgs_blender.reconstruct.inverse_rendering.pixels import Pixels  # noqa: E4
 from drgs_blender.reconstruct.inverse_rendering.radiance_cache import edges_of  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.regularisers import Regularisers  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.surface import Pairs  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.surface import Pairs, Surface  # noqa: E402
 
 torch.set_num_threads(1)
 RED, BLUE = np.float32([0.4, 0.1, 0.1]), np.float32([0.1, 0.1, 0.4])
@@ -114,6 +114,17 @@ def test_pairs_of_other_looks_or_from_afar_do_not_count(ball):
     across = (left[pairs[:, 0]] & right[pairs[:, 1]]) | (right[pairs[:, 0]] & left[pairs[:, 1]])
     assert weight[across].sum() < 1e-3 * weight.sum()
     assert weight.mean() > 0.1
+
+
+def test_pairs_keep_their_weights_among_the_vertices_of_a_step(ball):
+    """Whatever pixels and edges use beside them."""
+    surface = Surface(ball.vertices, ball.vertices, Settings(coarse=0), np.ones(3), False)
+    surface.parameters["detail"][:] = torch.arange(len(ball.vertices))[:, None] / 100 - 3
+    pairs = Pairs(torch.tensor([[7, 300], [2, 511], [300, 9]]), torch.tensor([0.1, 0.5, 0.9]))
+    seen = pixels(ball, painted(ball)).select(np.arange(5))
+    samples = surface.at(seen, edges_of(ball.faces)[:4], pairs)
+    assert torch.equal(samples.pairs.weight, pairs.weight)
+    assert torch.equal(samples.columns[samples.pairs.ends], surface.materials.at(pairs.ends.flatten()).view(3, 2, -1))
 
 
 def test_likeness_makes_materials_of_pairs_alike_by_their_weight():

@@ -223,6 +223,13 @@ def test_a_run_with_masks_drawn_anew_a_retouched_pixel_or_another_program_is_ano
     assert fingerprint(other) == before
     other.views[4].mask[20, 25] = 1 - other.views[4].mask[20, 25].round()
     assert fingerprint(other) != before
+    layer = np.ones_like(capture.views[0].colour)
+    bright, normal, linear = (
+        replace(capture, views=[replace(capture.views[0], **changed), *capture.views[1:]])
+        for changed in ({"above_white": layer}, {"normals": layer}, {"linear": True})
+    )
+    cut = replace(capture, background=None), replace(capture, points=np.zeros((9, 3), np.float32))
+    assert len({before, *map(fingerprint, (bright, normal, linear, *cut))}) == 6
     monkeypatch.setattr("drgs_blender.reconstruct.checkpoint.__version__", "0.0.9")
     assert fingerprint(capture) != before
 

@@ -14,7 +14,7 @@ pytest.importorskip("skimage")
 
 from drgs_blender.core.errors import Cancelled  # noqa: E402
 from drgs_blender.geometry.normals import unit  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering import joint, pixels  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering import joint, pixels, schedule  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.decoupled import Decoupled  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.domain import mesh_domain  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.joint import JointJob, LearnedSurfels, decouple_jointly  # noqa: E402
@@ -50,7 +50,8 @@ def surfels(mesh) -> LearnedSurfels:
 
 
 def job_of(capture, mesh, settings: Settings) -> JointJob:
-    return JointJob(capture, mesh_domain(capture, mesh, settings), mesh, surfels(mesh), settings, None, lambda: 0.0)
+    domain, clock = mesh_domain(capture, mesh, settings), schedule.Schedule(settings, lambda: 0.0)
+    return JointJob(capture, domain, mesh, surfels(mesh), settings, None, clock)
 
 
 def arrays(found: Decoupled) -> list[np.ndarray]:
@@ -124,6 +125,18 @@ def test_an_interrupted_run_ends_where_an_undisturbed_one_does(mesh, capture, tm
         assert np.array_equal(a, b)
 
 
+def test_a_checkpoint_of_other_surfels_is_not_gone_on_from(mesh, capture, tmp_path, caplog):
+    path, steps, other = tmp_path / "materials.state", iter(range(9)), surfels(mesh)
+    with pytest.raises(Cancelled):
+        decouple_jointly(
+            capture, mesh, surfels(mesh), SMALL, cancelled=lambda: next(steps) == 3, checkpoint=path
+        )  # fmt: skip
+    other.gaussians.parameters["opacity"].data += 1
+    with caplog.at_level("INFO"):
+        decouple_jointly(capture, mesh, other, SMALL, checkpoint=path)
+    assert "going on" not in caplog.text
+
+
 def test_materials_of_surfels_begin_with_steps_as_long_as_any(mesh, capture):
     """Adam steps by the rate where gradients stay, by twice that where it forgets that moments began at 0."""
     settings = replace(SMALL, iterations=240, joint=0.5)
@@ -139,6 +152,21 @@ def test_materials_of_surfels_begin_with_steps_as_long_as_any(mesh, capture):
     for name in ("detail", "grid0"):
         assert (before[name] - learned[name]).numpy() == pytest.approx(20 * rates[name], rel=0.01)
     assert job._adam.steps == 140 and job._adam.first.keys() == {"light"}
+
+
+def test_each_round_of_steps_shows_every_view_once_and_surfels_have_pairs_of_their_own(mesh, capture, monkeypatch):
+    every = surfels(mesh)
+    few = replace(every, gaussians=every.gaussians.select(np.arange(0, len(mesh.vertices), 3)))
+    monkeypatch.setattr(joint, "learned", lambda job, *_: job)
+    job = decouple_jointly(capture, mesh, few, SMALL)
+    job._begin()
+    count = len(job._views)
+    shown = []
+    for job.schedule.iteration in range(2 * count):
+        shown.append(job._view())
+    assert sorted(shown[:count]) == sorted(shown[count:]) == list(job._views) and shown[:count] != shown[count:]
+    pairs = job._like.draw(np.random.default_rng(0))
+    assert int(pairs.ends.max()) < len(few.gaussians) and float(pairs.weight.mean()) > 0.05
 
 
 def test_close_surfels_have_as_fine_grids_as_close_vertices(mesh, capture, monkeypatch):

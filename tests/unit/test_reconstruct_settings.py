@@ -178,7 +178,7 @@ def test_the_asset_keeps_its_settings_and_a_run_can_be_repeated_from_it(tmp_path
     words = ["--voxels", "16", "--resolution", "30", "--test-every", "4", "--no-materials"]
     words += ["--set", "schedule.iterations=4", "--set", "schedule.surfels=300", "--set", "fixed=['offset']"]
     assert main(["reconstruct", str(photographs), "--out", str(first), *words]) == 0
-    assert "fixed: no effect with variant p" in capsys.readouterr().err
+    assert "fixed: no effect with the other settings" in capsys.readouterr().err
     kept = inspect_asset(first)["provenance"]["settings"]
     assert kept["schedule"]["iterations"] == 4 and kept["capture"]["resolution"] == 30 and kept["fixed"] == ["offset"]
     assert printed(capsys, "--config", str(first)) == printed(capsys, *words)
@@ -243,6 +243,25 @@ def test_settings_of_python_are_checked_too():
         Settings(schedule=Schedule(surfels=5)).check()
     changed = Settings(materials=False, decoupling=Decoupling(normals=True, exposure=True))
     assert changed.without_effect() == ["decoupling.exposure"] and not Settings().without_effect()
+
+
+@pytest.mark.parametrize(
+    ("more", "idle"),
+    [
+        ({"unbiased": False, "weight_by_prediction": False}, ["weight_by_prediction"]),
+        ({"weight_by_prediction": False, "clipped_neighbour_weight": 1.0}, ["clipped_neighbour_weight"]),
+        ({"parametrisation": "dielectric", "metal_smoothness": 1.0}, ["metal_smoothness"]),
+        ({"normals": False, "normal_smoothness": 1.0}, ["normal_smoothness"]),
+        ({"shadows": False, "indirect": False}, ["indirect"]),
+    ],
+)
+def test_settings_that_another_one_makes_idle_are_named(more, idle):
+    run = Settings(decoupling=Decoupling(**{"normals": True} | more))
+    assert run.without_effect() == [f"decoupling.{name}" for name in idle]
+    for name in idle:  # alone it has one
+        alone = Decoupling(**{"normals": True, name: more[name]})
+        assert not Settings(decoupling=alone).without_effect()
+    assert Settings(schedule=Schedule(median=0.5, consistency=0.0)).without_effect() == ["schedule.median"]
 
 
 def test_the_page_lists_every_setting():

@@ -12,7 +12,8 @@ from ...core.arrays import Array
 from .mask_view import MaskView
 from .object_box import ObjectBox
 
-#: Voxels along the longest side, part of views that may have a voxel outside, where nothing else is asked.
+#: Voxels along the longest side, where nothing else is asked; part of the views that see a voxel which may have it
+#: outside their mask.
 VOXELS, _TOLERANCE = 88, 0.1
 #: Margin of a box around the hull, in parts of its largest side.
 _MARGIN = 0.12
@@ -32,13 +33,11 @@ class Hull:
     box : ObjectBox
     voxels : int
         Along the longest side.
-    tolerance : float
-        Part of the views with a voxel in the picture that may have it outside their mask.
     """
 
     def __init__(self, cv2: Any, views: Sequence[MaskView], masks: Sequence[Array], box: ObjectBox,
-                 voxels: int = VOXELS, tolerance: float = _TOLERANCE):  # fmt: skip
-        self._cv2, self._tolerance = cv2, tolerance
+                 voxels: int = VOXELS):  # fmt: skip
+        self._cv2 = cv2
         self.cell = float((box.high - box.low).max()) / voxels
         counts = np.maximum(np.ceil((box.high - box.low) / self.cell).astype(int), 1)
         axes = [low + (np.arange(n) + 0.5) * self.cell for low, n in zip(box.low, counts, strict=True)]
@@ -72,7 +71,7 @@ class Hull:
             vote = self._votes[without]
             inside, seen = inside - (vote == 1), seen - (vote >= 0)
         out = seen - inside
-        kept = (seen >= _FEWEST) & (out <= np.maximum(self._tolerance * seen, seen >= _MANY))
+        kept = (seen >= _FEWEST) & (out <= np.maximum(_TOLERANCE * seen, seen >= _MANY))
         parts, count = label(kept.reshape(self._shape))
         if count > 1:
             parts = parts.ravel()
@@ -81,31 +80,31 @@ class Hull:
             kept = parts == weight[1:].argmax() + 1
         return kept
 
-    def box(self, outer: ObjectBox, grounded: bool = True) -> ObjectBox:
-        """The box around the hull with a margin, down to the ground where asked; `outer` where the hull is empty."""
+    def box(self, outer: ObjectBox) -> ObjectBox:
+        """The box around the hull with a margin, within `outer`; `outer` where the hull is empty."""
         places = self.places[self.solid()]
         if not len(places):
             return outer
         low, high = places.min(axis=0), places.max(axis=0)
         margin = _MARGIN * float((high - low).max()) + self.cell
         low, high = np.maximum(low - margin, outer.low), np.minimum(high + margin, outer.high)
-        if grounded:
-            low[2] = 0.0
         return ObjectBox(low, high, outer.points)
 
     def pixels(self, view: MaskView) -> int:
         """Pixels of a voxel in a view, about."""
         away = max(float(np.linalg.norm(view.centre - self._middle)), 1e-9)
-        return max(1, int(np.ceil(self.cell * view.lens.fx / away)))
+        return max(1, int(np.ceil(min(self.cell * view.lens.fx / away, max(view.shape)))))
 
     def seen_by(self, view: MaskView, solid: Array) -> Array:
         """(h, w) bool: the voxels' outline in a view."""
         height, width = view.shape
         at, depth = view.project(self.places[solid])
+        at, depth = at[depth > 0], depth[depth > 0]
         drawn = np.zeros((height, width), np.uint8)
         if not len(at):
             return drawn > 0
-        size = 1 | int(np.ceil(1.2 * self.cell * view.lens.fx / max(float(np.median(depth)), 1e-9)))
+        size = 1.2 * self.cell * view.lens.fx / max(float(np.median(depth)), 1e-9)
+        size = 1 | int(np.ceil(min(size, 2 * max(height, width))))
         at = np.nan_to_num(at, nan=-1e6)
         fits = (at > -size).all(axis=1) & (at[:, 0] < width + size) & (at[:, 1] < height + size)
         column, row = np.clip(at[fits].astype(int), 0, [width - 1, height - 1]).T

@@ -30,8 +30,7 @@ logger = logging.getLogger(__name__)
 EFFORTS = (Effort(160, 300, 16000), Effort(256, 900, 20000))
 #: Pixels of the longer side of masks, of the part around the object.
 PART = 640
-#: Surfels that an object has at least; views that show it (three
-#: make a hull, which a fourth is held against).
+#: Surfels that an object has at least; views that show it (three make a hull, which a fourth is held against).
 _FEWEST_SURFELS, _FEWEST_VIEWS = 30, 4
 #: Pixels of a side at which masks are looked at, and the part of the pictures' edges that an object may be at.
 _EDGE, _AT_EDGES = 64, 0.4

@@ -95,7 +95,7 @@ def hull_of_masks(cv2: Any, views: Sequence[MaskView], masks: list[Array], voxel
         hull = Hull(cv2, views, masks, box, voxels)
         if not hull.solid().any():
             return None
-        box = hull.box(box, grounded=False)
+        box = hull.box(box)
     return Hull(cv2, views, masks, box, voxels)
 
 

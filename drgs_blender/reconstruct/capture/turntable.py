@@ -58,7 +58,7 @@ def likeness_of_surroundings(views: list[View]) -> float | None:
             second = (first + stride) % len(views)
             alike = shown[first].known.shape == shown[second].known.shape
             if alike and (np.trace(facing[first].T @ facing[second]) - 1) / 2 < np.cos(np.radians(APART)):
-                found.append(_correlation(shown[first], shown[second]))
+                found.append(correlation(shown[first], shown[second]))
     known = [value for value in found if value is not None]
     return float(np.median(known)) if len(known) >= PAIRS else None
 
@@ -87,7 +87,7 @@ def _surroundings(view: View) -> Surroundings:
     return Surroundings((blurred(FINE) - blurred(COARSE)) * known, known)
 
 
-def _correlation(first: Surroundings, second: Surroundings) -> float | None:
+def correlation(first: Surroundings, second: Surroundings) -> float | None:
     """The largest over all shifts, of what both show; None where there is nothing to see.
 
     Padfield 2012, "Masked object registration in the Fourier domain".

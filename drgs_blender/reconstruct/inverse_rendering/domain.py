@@ -59,8 +59,7 @@ def mesh_domain(capture: Capture, mesh: Mesh, settings: Settings, normals: Array
     """The vertices of a mesh; parameters and errors are those of `run.decouple`, `normals` its `start`."""
     if not len(mesh.faces):
         raise AssetError("mesh", "has no faces", "Decoupling needs the surface")
-    tree = TriangleBVH()
-    tree.build(mesh.vertices, mesh.faces)
+    tree = TriangleBVH(mesh.vertices, mesh.faces)
     pixels = of_training_views(capture, settings, lambda k, view: pixels_of(k, view, mesh, tree))
     if normals is None:
         normals = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)

@@ -23,6 +23,7 @@ from ...core.asset.model import Mesh
 from ...core.color import srgb_to_linear
 from ...core.errors import UsageError
 from ...deform.binding import bind, clamp_weights
+from ...formats.harmonics import SH_C0
 from ...render.gbuffer.surfels import ALIKE
 from ...render.reference.brdf import dot, normalise
 from ..backend import CPU
@@ -30,7 +31,7 @@ from ..capture.capture import Capture
 from ..capture.training_views import background_of, full_targets
 from ..meshing.crops import corner_of
 from ..meshing.surfel_normals import with_surfel_normals
-from ..model.gaussians import SH0, Gaussians, RenderedView
+from ..model.gaussians import Gaussians, RenderedView
 from ..model.thin_structures import normals_of
 from ..optim.adam import Adam
 from ..optim.learner import Learner
@@ -43,6 +44,7 @@ from .materials import Materials, levels
 from .pixels import Pixels
 from .regularisers import Regularisers, fineness
 from .run import Job, domain_of, learned
+from .schedule import Schedule
 from .settings import Settings
 from .surface import Pairs, SurfaceSamples
 from .surfel_domain import carried, neighbours
@@ -113,8 +115,9 @@ def decouple_jointly(
     Decoupled
         With `Decoupled.surfels`, its mesh among them.
     """
-    began, domain = now(), domain_of(capture, mesh, settings, start, surfels.gaussians if on_surfels else None)
-    job = JointJob(capture, domain, mesh, surfels, settings, checkpoint, now, began)
+    schedule = Schedule(settings, now)
+    domain = domain_of(capture, mesh, settings, start, surfels.gaussians if on_surfels else None)
+    job = JointJob(capture, domain, mesh, surfels, settings, checkpoint, schedule)
     return learned(job, on_progress, cancelled)
 
 
@@ -129,14 +132,19 @@ class JointJob(Job):
 
     def __init__(
         self, capture: Capture, domain: Domain, mesh: Mesh, surfels: LearnedSurfels, settings: Settings,
-        checkpoint: Path | None, now: Callable[[], float], began: float | None = None,
+        checkpoint: Path | None, schedule: Schedule,
     ) -> None:  # fmt: skip
         #: Materials of the surfels, once they are learned.
         self._own: Materials | None = None
-        super().__init__(capture, domain, mesh, settings, checkpoint, CPU, now, began)
+        self._surfels = surfels
+        super().__init__(capture, domain, mesh, settings, checkpoint, CPU, schedule)
         self._fused = surfels.fused
         background = torch.tensor(background_of(capture), dtype=torch.float32)
         self.learner = Learner(surfels.gaussians, surfels.schedule, surfels.radius, background, CPU)
+
+    def _shape(self) -> list[Array]:
+        schedule = np.frombuffer(repr(self._surfels.schedule).encode(), np.uint8)
+        return [*super()._shape(), schedule, *self._surfels.gaussians.arrays().values()]
 
     def step(self) -> None:
         """One step of the optimiser."""
@@ -164,7 +172,7 @@ class JointJob(Job):
                 if self._shown is not None:
                     shown = blend(torch.from_numpy(self._shown), corners, shares).numpy()
                     self._like = LikePoints(shown, surfels.centre, settings.seed)
-        colours = srgb_to_linear(np.clip(0.5 + SH0 * surfels.sh[:, 0], 0, 1))
+        colours = srgb_to_linear(np.clip(0.5 + SH_C0 * surfels.sh[:, 0], 0, 1))
         self._regularisers = Regularisers(edges, colours, settings, finer)
         # Light and exposures go on; moments that begin at 0 need a count of steps that does, too.
         self._own, self._adam_of_own = own, Adam(own.parameters)

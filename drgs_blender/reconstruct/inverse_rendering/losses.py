@@ -24,7 +24,7 @@ def log_loss(predicted: Tensor, photographed: Tensor, clipped: Tensor) -> Tensor
     return torch.where(clipped, difference.clamp(min=0), difference.abs()).mean()
 
 
-def dullness(albedo: Tensor, metallic: Tensor) -> Tensor:
+def metal_albedo_prior(albedo: Tensor, metallic: Tensor) -> Tensor:
     """Metal albedo prior: mean squared difference of the colours of metals (n, 3), (n,) from polished ones.
 
     Where light is dim, only metal shows how dim: dark metal in a light that is too even looks almost the same.
@@ -36,7 +36,7 @@ def dullness(albedo: Tensor, metallic: Tensor) -> Tensor:
     return (_surely_metal(metallic)[:, None] * (albedo - known * (_POLISHED / brightest)) ** 2).sum(1).mean()
 
 
-def blotches(differences: Tensor, metallic: Tensor, likeness: Tensor) -> Tensor:
+def metal_smoothness_prior(differences: Tensor, metallic: Tensor, likeness: Tensor) -> Tensor:
     """Metal smoothness prior: unevenness of metal, mean over edges, summed over channels.
 
     The albedo of metal takes in what its normals are off, from vertex to vertex, as no diffuse light evens them out.

@@ -99,7 +99,7 @@ class Materials:
         return torch.sigmoid(value)
 
     def reflect(self, columns: Tensor, sums: Tensor, nv: Tensor, shading_model: str) -> Tensor:
-        """Radiance (n, 2, 3) of surfaces with `columns` (n, c), whose `sums` (n, 2, 4, 3) see gather.py."""
+        """Radiance (n, 2, 3) of surfaces with `columns` (n, c), whose `sums` (n, 2, 4, 3) are those of `Gatherer`."""
         colour, roughness = columns[:, None, :3], self.roughness(columns)
         white, mirror, edge, dielectric = sums.unbind(2)
         if shading_model == "principled":

@@ -165,8 +165,7 @@ def pixels_of(index: int, view: View, mesh: Mesh, tree: TriangleBVH) -> Pixels:
 
 def onto_vertices(mesh: Mesh, views: list[View], shown: Callable[[View], Array]) -> Array:
     """Sums (v, c) at a mesh's vertices of what is `shown` (h, w, c) of it in views cropped to it; see `Pixels.onto`."""
-    tree, total = TriangleBVH(), np.zeros(())
-    tree.build(mesh.vertices, mesh.faces)
+    tree, total = TriangleBVH(mesh.vertices, mesh.faces), np.zeros(())
     for index, view in enumerate(cropped_views(views, mesh.vertices)):
         pixels, picture = pixels_of(index, view, mesh, tree), shown(view)
         total = total + pixels.onto(picture.reshape(-1, picture.shape[-1])[pixels.place], len(mesh.vertices))

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from .environment import LearnedLight, colour_cast
-from .losses import blotches, dullness
+from .losses import metal_albedo_prior, metal_smoothness_prior
 from .settings import Settings
 from .surface import Pairs, SurfaceSamples, at_both
 
@@ -72,11 +72,13 @@ class Regularisers:
         loss = smoothness * ((likeness * differences).mean(0) * weights).sum()
         has_metals = has_metallic and knows_metals
         if s.metal_smoothness > 0 and has_metals:
-            loss = loss + s.metal_smoothness * smoothness * blotches(differences[:, :3], pair[:, :, 4], likeness)
+            loss = loss + s.metal_smoothness * smoothness * metal_smoothness_prior(
+                differences[:, :3], pair[:, :, 4], likeness
+            )
         if s.binary_metallic_prior > 0 and has_metallic:
             loss = loss + s.binary_metallic_prior * (samples.materials[:, 4] * (1 - samples.materials[:, 4])).mean()
         if s.metal_albedo_prior > 0 and has_metals:
-            loss = loss + s.metal_albedo_prior * dullness(samples.materials[:, :3], samples.materials[:, 4])
+            loss = loss + s.metal_albedo_prior * metal_albedo_prior(samples.materials[:, :3], samples.materials[:, 4])
         return loss
 
     def of_likeness(self, columns: Tensor, pairs: Pairs) -> Tensor:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ...core.asset.model import Mesh
 from ...core.errors import Cancelled
+from ...formats.harmonics import SH_C0
 from ...render.reference.brdf import MIN_GGX_ALPHA, dot
 from ...render.scene.triangle_bvh import TriangleBVH
 from .. import checkpoint as states
@@ -23,6 +24,7 @@ from ..backend import CPU, LearningBackend
 from ..capture.capture import Capture
 from ..model.gaussians import Gaussians
 from ..optim.adam import Adam
+from ..torch_threads import one_thread
 from .decoupled import Decoupled, DecoupledSurfels, Progress
 from .domain import Domain, mesh_domain
 from .lighting import Lighting
@@ -96,9 +98,9 @@ def decouple(
         The mesh has no faces.
     Cancelled
     """
-    began, domain = now(), domain_of(capture, mesh, settings, start, surfels)
-    job = Job(capture, domain, mesh, settings, checkpoint, backend, now, began)
-    return learned(job, on_progress, cancelled)
+    schedule = Schedule(settings, now)
+    domain = domain_of(capture, mesh, settings, start, surfels)
+    return learned(Job(capture, domain, mesh, settings, checkpoint, backend, schedule), on_progress, cancelled)
 
 
 def domain_of(
@@ -118,7 +120,8 @@ def learned(
         if cancelled is not None and cancelled():
             job.save()
             raise Cancelled()
-        job.step()
+        with one_thread():
+            job.step()
         if on_progress is not None and (schedule.iteration % _REPORT == 0 or not schedule.going()):
             score = job.score
             on_progress(Progress(schedule.iteration, min(schedule.part, 1.0), score.loss, score.psnr, job.result))
@@ -148,16 +151,15 @@ class Job:
         settings: Settings,
         checkpoint: Path | None,
         backend: LearningBackend,
-        now: Callable[[], float],
-        began: float | None = None,
+        schedule: Schedule,
     ) -> None:
         if domain.surfels is not None:
             settings = replace(settings, same_material=_ALIKE * settings.same_material)
         self._domain, self._mesh, self._settings, self._capture = domain, mesh, settings, capture
-        self.schedule, self.score = Schedule(settings, now, began), Score()
-        self._pixels, points, edges = domain.pixels, domain.points, domain.edges
-        self._gain = _gain(capture, float(self._pixels.colour.mean()), settings.brightness)
-        self._pixels.colour *= np.float32(self._gain)
+        self.schedule, self.score = schedule, Score()
+        points, edges = domain.points, domain.edges
+        self._gain = _gain(capture, float(domain.pixels.colour.mean()), settings.brightness)
+        self._pixels = replace(domain.pixels, colour=domain.pixels.colour * np.float32(self._gain))
         cache, self._weight = radiance_cache(self._pixels, len(points), edges)
         counts = (settings.cosine, settings.ggx, settings.light)
         sent = cache[domain.owner] if settings.indirect else None
@@ -178,14 +180,17 @@ class Job:
         if settings.same_material > 0:
             self._shown = features(self._pixels, len(points), edges)
             self._like = LikePoints(self._shown, points, settings.seed)
-        colours = np.maximum(cache[:, 0] * 0.28209479, 0)
+        colours = np.maximum(cache[:, 0] * SH_C0, 0)
         self._regularisers = Regularisers(edges, colours, settings, finer)
         #: Logarithm of the brightness of the photographs, one each.
         self._exposure = torch.zeros(len(capture.training)) if settings.exposure else None
         self._adam = Adam(self._learned())
-        shape = _digest(domain.occluder.vertices, domain.occluder.faces, domain.normals)
-        key = states.fingerprint(capture, mesh=shape, **asdict(settings))
-        self.checkpoint = states.Checkpoint(checkpoint, key, _SAVE, now)
+        key = states.fingerprint(capture, shape=_digest(*self._shape()), **asdict(settings))
+        self.checkpoint = states.Checkpoint(checkpoint, key, _SAVE, schedule.now)
+
+    def _shape(self) -> list[Array]:
+        """What its states belong to, beside photographs and settings."""
+        return [self._domain.occluder.vertices, self._domain.occluder.faces, self._domain.normals]
 
     def go_on(self) -> None:
         """Go on from the checkpoint, if there is one."""

@@ -23,27 +23,24 @@ class Schedule:
     ----------
     settings : Settings
     now : callable
-        Monotonic clock, seconds.
-    began : float, optional
-        When the run began by it; None: now.
+        Monotonic clock, seconds. The run begins when this is made.
 
     Attributes
     ----------
+    now : callable
     iteration : int
         Steps that are done.
     """
 
-    def __init__(
-        self, settings: Settings, now: Callable[[], float] = time.monotonic, began: float | None = None
-    ) -> None:
-        self._settings, self._now = settings, now
-        self._spent, self._began = 0.0, now() if began is None else began
+    def __init__(self, settings: Settings, now: Callable[[], float] = time.monotonic) -> None:
+        self._settings, self.now = settings, now
+        self._spent, self._began = 0.0, now()
         self.iteration = 0
 
     @property
     def elapsed(self) -> float:
         """Seconds, those before an interruption among them."""
-        return self._spent + self._now() - self._began
+        return self._spent + self.now() - self._began
 
     @property
     def part(self) -> float:

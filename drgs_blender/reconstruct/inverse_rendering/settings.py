@@ -20,7 +20,7 @@ class Settings:
     seconds : float
         Stop after so much time of the wall clock, the schedule squeezed to fit; 0 is no limit.
     pixels : int
-        Drawn in each step, over all training views.
+        Drawn in each step, over all training views; in the `joint` part from the one view of the step.
     cosine, ggx, light : int
         Directions that this strategy draws at a pixel.
     shading_model : {"principled", "paper"}
@@ -55,27 +55,29 @@ class Settings:
     binary_metallic_prior : float
         Weight that pulls metallic to 0 or 1.
     metal_albedo_prior : float
-        Weight that pulls the colours of metals towards as bright as polished metals are.
+        Weight that pulls the brightest channel of the albedo of metals towards .95, that of polished metals.
     metal_smoothness : float
         How much more than other albedo that of metals is smoothed, in parts of `smoothness`: there, errors of normals
         leave blotches.
     same_material : float
         Weight of the differences of materials between vertices that photographs show alike, up to about a quarter of
-        the object apart; between surfels three times as much, as each is seen by fewer pixels.
+        the object apart. Three times as much between surfels that carry the materials from the first step on, as each
+        is seen by fewer pixels.
     unbiased : bool
         Compare two independent estimates of each pixel, so that their noise is not learned from.
     weight_by_prediction : bool
-        Weigh differences by what is shown, once that is near the photographs; else by the photographs, which finds
-        polished metal and the light in it too dark where the mesh is a little off.
+        Divide differences by the rendered brightness, from .3 of the steps on; else by the photographed one, by which
+        polished metal and the light it mirrors come out too dark where the mesh is a little off. Only with `unbiased`.
     clipped_neighbour_weight : float
-        Weight per channel of pixels next to clipped ones, once differences are weighed by what is shown. Small errors
-        of normals let them mirror a neighbouring highlight; clipped pixels cannot contradict that, so the light would
-        be found too dim.
+        Weight, in each channel, of pixels next to clipped ones, once `weight_by_prediction` counts. Where normals are a
+        little off they mirror the highlight next to them and are photographed darker than it. Clipped pixels set no
+        upper bound, so nothing balances them and the light would be found too dim.
     parametrisation : {"metallic", "specular", "dielectric"}
         "metallic" learns albedo and metallic; "specular" diffuse and specular colour, turned into the former at the
         end; "dielectric" albedo alone, metallic is 0.
     normals : bool
-        Also learn an offset of each normal, of vertices or of thin things of surfels, held by `normal_smoothness`.
+        Also learn an offset for the normal of each vertex, or of each surfel where these carry the materials, kept
+        smooth by `normal_smoothness`. Not learned in the `joint` part.
     normal_smoothness : float
         Weight of the squared differences of these offsets along edges, as `smoothness` more on finer meshes.
     domain : {"auto", "mesh", "surfels"}

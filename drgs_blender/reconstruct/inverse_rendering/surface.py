@@ -69,7 +69,7 @@ class SurfaceSamples:
 
 def at_both(values: Tensor, pairs: Tensor) -> Tensor:
     """Rows of values (u, k) at pairs (p, 2) of their numbers, (p, 2, k)."""
-    return values.index_select(0, pairs.flatten()).view(len(pairs), 2, -1)
+    return values.index_select(0, pairs.flatten()).view(len(pairs), 2, values.shape[1])
 
 
 class Surface:

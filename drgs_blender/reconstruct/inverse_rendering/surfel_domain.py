@@ -6,10 +6,13 @@ A pixel shows the blend of the surfels that cover most of it, those of its heavi
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from ...compute.jit import njit
 from ...core.arrays import Array
 from ...core.asset.model import Mesh
 from ...geometry.normals import unit
@@ -21,10 +24,13 @@ from ..capture.capture import Capture, View
 from ..meshing.crops import corner_of, cropped_views
 from ..model.contributors import strongest
 from ..model.gaussians import Gaussians
+from ..model.raster import WorldSurfels
 from .domain import Domain
 from .pixels import Pixels, check_size, of_training_views, onto_vertices, photographed, within_mask
 from .radiance_cache import edges_of, filled
 from .settings import Settings
+
+log = logging.getLogger(__name__)
 
 #: Neighbours of a surfel along which its materials are smooth, and the least cosine between their planes.
 _NEIGHBOURS, _COPLANAR = 6, 0.5
@@ -54,13 +60,13 @@ def surfel_domain(capture: Capture, gaussians: Gaussians, settings: Settings) ->
     occluder = Mesh(vertices, faces, np.zeros_like(vertices), blank, blank)
     scale = np.sqrt(np.maximum((u * u).sum(1), (v * v).sum(1)))
     parts = cropped_views(capture.training, vertices)
+    shown = WorldSurfels(*(np.ascontiguousarray(a, np.float32) for a in (centres, u, v, opacities)))
     pixels = of_training_views(
-        capture, settings, lambda k, view: _surfel_pixels(k, view, parts[k], gaussians, normals, scale)
+        capture, settings, lambda k, view: _surfel_pixels(k, view, parts[k], shown, normals, scale)
     )
     owner = np.repeat(np.arange(len(centres)), len(vertices) // max(len(centres), 1))
     edges = neighbours(centres, normals)
-    tree = TriangleBVH()
-    tree.build(vertices, faces)
+    tree = TriangleBVH(vertices, faces)
     return Domain(centres, normals.astype(np.float32), edges, pixels, occluder, tree, owner, gaussians)
 
 
@@ -76,6 +82,9 @@ def carried(values: Array, mesh: Mesh, gaussians: Gaussians, views: list[View]) 
 
     total = onto_vertices(mesh, views, shown)
     seen = total[:, -1] > 1e-3
+    if not seen.any():  # as of rods of two pixels: a pixel away from the outline nothing is left
+        log.warning("no photograph shows the mesh of the surfels: it takes the materials of the nearest")
+        return columns.numpy()[cKDTree(gaussians.centres().numpy(force=True)).query(mesh.vertices)[1]], seen
     return np.clip(filled(total[:, :-1] / np.maximum(total[:, -1:], 1e-9), seen, edges_of(mesh.faces)), 0, 1), seen
 
 
@@ -89,32 +98,48 @@ def neighbours(centres: Array, normals: Array) -> Array:
     return np.unique(np.sort(pairs[coplanar], axis=1), axis=0).astype(np.int64)
 
 
-def _surfel_pixels(number: int, view: View, part: View, gaussians: Gaussians, axes: Array, scale: Array) -> Pixels:
+@njit
+def _keep_heaviest(weight, depth, size):  # type: ignore[no-untyped-def]
+    """Of the heaviest surface alone, as when the asset is rendered: others would be lit in between.
+
+    Sets the weights (n, k) of what is farther than `size` from the depth at which most weight is to 0, in place.
+    """
+    for pixel in range(len(weight)):
+        place, most = 0, np.float32(-1.0)
+        for i in range(weight.shape[1]):
+            total = np.float32(0.0)
+            for j in range(weight.shape[1]):
+                if abs(depth[pixel, i] - depth[pixel, j]) <= size[pixel, i]:
+                    total += weight[pixel, j]
+            if total > most:
+                place, most = i, total
+        for j in range(weight.shape[1]):
+            if abs(depth[pixel, place] - depth[pixel, j]) > size[pixel, place]:
+                weight[pixel, j] = 0
+
+
+def _surfel_pixels(number: int, view: View, part: View, surfels: WorldSurfels, axes: Array, scale: Array) -> Pixels:
     """The pixels of the view `number` that show surfels, found in its cropped `part`.
 
     `axes` (n, 3) and `scale` (n,) are the surfels' normals and larger standard deviations.
     """
     check_size(view)
     camera = part.camera
-    index, weight, depth = strongest(gaussians, camera, _MOST)
+    index, weight, depth = strongest(surfels, camera, _MOST)
     alpha = weight.sum(axis=-1)
     # Surfels of few steps may cover nothing whole.
     seen = (alpha > min(_COVERED, _COVERED * float(alpha.max()))) & within_mask(part)
     row = np.flatnonzero(seen)
     index, weight, depth = (array.reshape(-1, _MOST)[row] for array in (index, weight, depth))
-    # Of the heaviest surface alone, as when the asset is rendered: others would be lit in between.
     size = WINDOW_SCALES * scale[index]
-    beside = np.abs(depth[:, :, None] - depth[:, None]) <= size[..., None]
-    heaviest = np.einsum("nij,nj->ni", beside, weight).argmax(axis=1)
-    weight = np.where(beside[np.arange(len(row)), heaviest], weight, 0)
+    _keep_heaviest(weight, depth, size)
     share = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
     origin, direction = (a.numpy().astype(np.float32)[row] for a in camera_rays(camera, pixel_centres(camera)))
     towards = -direction / np.linalg.norm(direction, axis=1, keepdims=True)
     own = axes[index]
     facing = np.sign(np.einsum("nkc,nc->nk", own, towards))
     normal = unit(np.einsum("nk,nkc->nc", share * facing, own), (0, 0, 0)).astype(np.float32)
-    along = direction @ -np.asarray(camera.matrix_world, np.float32)[:3, 2]
-    place = origin + ((share * depth).sum(axis=1) / along)[:, None] * direction
+    place = origin + (share * depth).sum(axis=1, keepdims=True) * direction  # of unit depth
     left, top = corner_of(camera, view.camera)
     y, x = np.divmod(row, camera.width)
     found = Pixels(

@@ -72,8 +72,7 @@ def blended_as(
     (n, c) float32 array
         Not held to the range of `values`: a blend that is as sharp may need more contrast.
     """
-    tree = TriangleBVH()
-    tree.build(mesh.vertices, mesh.faces)
+    tree = TriangleBVH(mesh.vertices, mesh.faces)
     still = gaussians.like({name: tensor.detach().clone() for name, tensor in gaussians.parameters.items()})
     for tensor in still.parameters.values():
         tensor.requires_grad_(False)

@@ -12,13 +12,18 @@ from ...render.surfels.blending import MIN_TRANSMITTANCE
 from ...render.surfels.raster import gaussian
 from ...render.surfels.splats import MAX_ALPHA, TILE
 from .blend import strength
-from .gaussians import Gaussians
 from .projection import splat_of
 from .raster import WorldSurfels, arranged, view_of
 
 
-def strongest(gaussians: Gaussians, camera: Camera, most: int) -> tuple[Array, Array, Array]:
+def strongest(surfels: WorldSurfels, camera: Camera, most: int) -> tuple[Array, Array, Array]:
     """The `most` surfels that cover most of each pixel of a view.
+
+    Parameters
+    ----------
+    surfels : WorldSurfels
+    camera : Camera
+    most : int
 
     Returns
     -------
@@ -30,10 +35,8 @@ def strongest(gaussians: Gaussians, camera: Camera, most: int) -> tuple[Array, A
         Metres along the view.
     """
     parameters, (width, height) = view_of(camera)
-    u, v, _ = gaussians.frames()
-    numbers = gaussians.centres().numpy(force=True), u, v, gaussians.opacities().numpy(force=True)
-    surfels = WorldSurfels(*(np.ascontiguousarray(a, np.float32) for a in numbers))
-    order, splats, tiles = arranged(surfels, np.zeros((len(gaussians), 0), np.float32), parameters, (width, height))
+    none = np.zeros((len(surfels.opacity), 0), np.float32)
+    order, splats, tiles = arranged(surfels, none, parameters, (width, height))
     index = np.zeros((height, width, most), np.int32)
     weight, depth = np.zeros((2, height, width, most), np.float32)
     over_strided(_list_tiles, len(tiles.start) - 1, splats, tiles, order, index, weight, depth)

@@ -13,6 +13,7 @@ from ...core.arrays import Array
 from ...core.asset.model import Surfels
 from ...core.color import srgb_to_linear
 from ...core.frame import Camera
+from ...formats.harmonics import SH_C0
 from ...geometry.normals import quaternions
 from ..backend import CPU, LearningBackend
 from ..capture.training_views import pixel_rays
@@ -20,8 +21,6 @@ from .attributes import COEFFICIENTS, COLOUR, NORMAL, frames
 from .raster import GradientStatistics, Maps
 from .reflection_probe import dark_cube, pyramid
 
-#: Value of the constant harmonic.
-SH0 = 0.28209479177387814
 #: Logit of the tint of surfels that nothing is known of.
 MATT = -3.0
 
@@ -81,7 +80,7 @@ class Gaussians:
         u = np.cross(helper, normals)
         u /= np.linalg.norm(u, axis=1, keepdims=True)
         sh = np.zeros((n, COEFFICIENTS[degree], 3))
-        sh[:, 0] = (colours - 0.5) / SH0
+        sh[:, 0] = (colours - 0.5) / SH_C0
         values = {
             "centre": points,
             "scale": np.full((n, 2), math.log(size)),
@@ -177,8 +176,8 @@ class Gaussians:
             sh = raw["sh"].copy()
             if self.light is not None:
                 # Harmonics know no mirrors: the mean of what is mirrored.
-                sh[:, 0] += torch.sigmoid(self.parameters["tint"]).numpy() * self.light.exp().mean().item() / SH0
-            albedo = srgb_to_linear(np.clip(0.5 + SH0 * sh[:, 0], 0, 1))
+                sh[:, 0] += torch.sigmoid(self.parameters["tint"]).numpy() * self.light.exp().mean().item() / SH_C0
+            albedo = srgb_to_linear(np.clip(0.5 + SH_C0 * sh[:, 0], 0, 1))
             return Surfels(
                 self.centres().numpy().copy(), scale, quaternions(frame.astype(np.float64)),
                 self.opacities().numpy(), albedo, np.full(n, 0.5), np.zeros(n), sh,

@@ -43,8 +43,7 @@ def normals_of(gaussians: Gaussians) -> Normals:
 
 def is_thin(gaussians: Gaussians, mesh: Mesh, views: list[View]) -> bool:
     """Whether normals of the mesh and of the surfels that it was made from have little to do with each other."""
-    tree = TriangleBVH()
-    tree.build(mesh.vertices, mesh.faces)
+    tree = TriangleBVH(mesh.vertices, mesh.faces)
     smooth = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
     cosines, shown = [], normals_of(gaussians)
     sampled = cropped_views(views[:: math.ceil(len(views) / SAMPLED_VIEWS)], mesh.vertices)

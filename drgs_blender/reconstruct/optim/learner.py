@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
@@ -17,6 +16,7 @@ from ..losses.patches import Pair
 from ..model.attributes import TINT
 from ..model.gaussians import Gaussians, RenderedView
 from ..model.raster import GradientStatistics, Maps
+from ..torch_threads import one_thread
 from .adam import Adam
 from .densification import densify
 from .schedule import LIGHT_RATE, Schedule, learning_rates
@@ -92,7 +92,7 @@ class Learner:
         """
         # Also when done again, after a device has left it half-done.
         self.optimiser.steps = self.light.steps = self.iteration
-        with _one_thread():
+        with one_thread():
             rendered, rays = self._render(target, part, materials)
             loss = self._loss(rendered, target, rays, part)
             if beside is not None:
@@ -228,14 +228,3 @@ def _importance(features: Tensor) -> Tensor:
     """
     # A sum: the mean of no channels is none.
     return (MATTE + MIRRORED / 3 * features.detach()[..., TINT : TINT + 3].sum(-1)).clamp(max=1)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Without torch's threads: what is left to it is so little that waking them takes longer."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

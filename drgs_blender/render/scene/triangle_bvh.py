@@ -18,6 +18,8 @@ from .ray import Rays, ray_at
 
 Array = np.ndarray
 
+#: Neither vertices nor faces.
+_NONE = np.empty((0, 3), np.int32)
 #: A mask that every ray meets, and that meets every group.
 ALL = -1
 
@@ -270,17 +272,15 @@ class TriangleBVH:
         How often a group's tree was built from scratch.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, vertices: Array = _NONE, faces: Array = _NONE) -> None:
         self._lib = embree.library()
         self.intersect_address = embree.address(self._lib.rtcIntersect1)
         self.occluded_address = embree.address(self._lib.rtcOccluded1)
         self.scene: int = 0
-        self.vertices: Array = np.empty((0, 3), np.float32)
-        self.faces: Array = np.empty((0, 3), np.int32)
         self.first_face: Array = np.zeros(1, np.int32)
         self.rebuilds = 0
         self._parts: list[_Part] = []
-        self.build(self.vertices, self.faces)
+        self.build(vertices, faces)
 
     def build(self, vertices: Array, faces: Array, groups: Sequence[Group] | None = None, take: bool = False) -> None:
         """Rebuild the trees from (n, 3) vertices and (m, 3) faces.
