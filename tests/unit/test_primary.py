@@ -48,7 +48,7 @@ def check_contract(buffer: GBuffer, subpixels: int) -> None:
     assert np.allclose(points.weight, covered / subpixels)
 
 
-@pytest.mark.parametrize("offset", [-0.1, -0.02, -0.004, 0.0, 0.004, 0.02, 0.1])
+@pytest.mark.parametrize("offset", [-0.4, -0.1, -0.02, -0.004, 0.0, 0.004, 0.02, 0.1])
 def test_surfels_off_their_mesh_do_not_shadow_themselves(offset: float) -> None:
     """In a uniform white world a convex object is lit alike wherever it is looked at: no sample may be dark."""
     scene = scene_of(sphere_mesh(3))
@@ -71,8 +71,11 @@ def test_surfels_off_their_mesh_do_not_shadow_themselves(offset: float) -> None:
         assert np.median(white_light(scene, naive)[frontal]) < 0.1 * reference
 
 
-def test_a_thin_front_surface_takes_the_light_of_its_own_side() -> None:
-    """Two sheets, closer than the window and turned apart: surfels snap to the sheet that is turned as they are."""
+def test_a_thin_wall_takes_the_light_of_the_side_that_is_seen() -> None:
+    """Two sheets, closer than the window and turned apart: whichever way surfels are turned, they snap to the front.
+
+    Behind it lies the inside of the wall, which is black.
+    """
     square = np.array([[-3, 0, -3], [3, 0, -3], [3, 0, 3], [-3, 0, 3]], np.float32)
     front = (square + np.float32([0, -0.02, 0]), np.array([[0, 1, 2], [0, 2, 3]], np.int32))
     back = (square + np.float32([0, 0.02, 0]), np.array([[0, 2, 1], [0, 3, 2]], np.int32))
@@ -80,7 +83,7 @@ def test_a_thin_front_surface_takes_the_light_of_its_own_side() -> None:
     line = np.linspace(-1, 1, 41)
     x, z = (a.ravel() for a in np.meshgrid(line, line))
     n = len(x)
-    for normal_y, expected in ((-1.0, -0.02), (1.0, 0.02)):
+    for normal_y in (-1.0, 1.0):
         posed = PosedSurfels(
             np.stack([x, np.full(n, 0.01), z], -1).astype(np.float32),
             np.tile(np.float32([0.04, 0, 0]), (n, 1)),
@@ -90,10 +93,25 @@ def test_a_thin_front_surface_takes_the_light_of_its_own_side() -> None:
             np.zeros(n, np.int32),
         )
         buffer = surfel_buffer(posed, scene, look_along_y(24), SETTINGS)
-        assert np.allclose(buffer.points.origin[:, 1], expected, atol=1e-4)
-        # Whichever side they belong to, the normals face the camera.
+        assert np.allclose(buffer.points.origin[:, 1], -0.02, atol=1e-4)
         assert np.allclose(buffer.points.normal, (0, -1, 0), atol=1e-4)
         check_contract(buffer, 2)
+        assert white_light(scene, buffer.points).min() > 0.4
+
+
+def test_a_sheet_that_is_seen_from_behind_is_met_from_behind() -> None:
+    """Of an open mesh, surfels and face turned away: nothing is before them, and the back is what is seen."""
+    square = np.array([[-3, 0, -3], [3, 0, -3], [3, 0, 3], [-3, 0, 3]], np.float32)
+    scene = scene_of((square + np.float32([0, 0.02, 0]), np.array([[0, 2, 1], [0, 3, 2]], np.int32)))
+    line = np.linspace(-1, 1, 41)
+    x, z = (a.ravel() for a in np.meshgrid(line, line))
+    n = len(x)
+    flat = [np.full((n, *s), 0.9, np.float32) for s in ((), (3,), (), ())]
+    wide = (np.tile(np.float32(axis), (n, 1)) for axis in ([0.04, 0, 0], [0, 0, 0.04], [0, 1, 0]))
+    posed = PosedSurfels(np.stack([x, np.zeros(n), z], -1).astype(np.float32), *wide, *flat, np.zeros(n, np.int32))
+    points = surfel_buffer(posed, scene, look_along_y(24), SETTINGS).points
+    assert np.allclose(points.origin[:, 1], 0.02, atol=1e-4) and np.allclose(points.normal, (0, -1, 0), atol=1e-4)
+    assert white_light(scene, points).min() > 0.4
 
 
 def test_without_a_mesh_points_stay_and_are_lit() -> None:

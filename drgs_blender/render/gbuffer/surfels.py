@@ -5,12 +5,14 @@ the mesh is blocked by its own surface, one that starts above misses contact sha
 the mesh point that belongs to it:
 
 1. along the camera ray, within a window of depths around the surfel: the first face that is turned as the surfel is,
-   and to the viewer, unless the surfel is clearly seen from behind;
+   and to the viewer, unless the surfel is clearly seen from behind and no face before it is turned to the viewer;
 2. else the first face along it that is turned to the viewer: the surfel overhangs a fold, and what is seen beyond the
    fold is lit as the face there, with that face's normal;
 3. else (the surfel overhangs the mesh's silhouette) within the window along its normal, inwards, then outwards;
-4. else the nearest face along the camera ray within the window, whichever way it is turned;
-5. else (no mesh near) the point stays where it is, lifted by the window along its normal.
+4. else where the way back to the viewer leaves the mesh, however far: the surfel lies deep inside of it, or behind a
+   wall that the mesh has and the surfels have not;
+5. else the nearest face along the camera ray within the window, whichever way it is turned;
+6. else (no mesh near) the point stays where it is, lifted by the window along its normal.
 
 Where light meets the surfels themselves, points stay where they are, and say which surfels are their own. Those of an
 object whose light meets sheets (`surfels.sheets`) are lifted by the window along their normals: sheets lie at all
@@ -63,6 +65,8 @@ _BLOCK = 256
 
 # How a surfel's mesh point was found.
 NOWHERE, ALONG_VIEW, ALONG_NORMAL, ANY_SIDE, FACING = 0, 1, 2, 3, 4
+#: Part of the way to the viewer along which the outside of a mesh is sought, and faces that are passed on it.
+_BACK, _WALLS = 0.999, 3
 
 
 def snap_windows(scene: TraceScene, object_count: int) -> Array:
@@ -202,8 +206,8 @@ def _shoot(tracer, x, y, z, dx, dy, dz, reach):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _find(tracer, point, normal, view, ahead, window):  # type: ignore[no-untyped-def]
-    """Mesh point of a surfel's `point` and `normal`, seen from the direction `view`.
+def _find(tracer, point, normal, view, ahead, window, away):  # type: ignore[no-untyped-def]
+    """Mesh point of a surfel's `point` and `normal`, seen from the direction `view` and from `away`, metres.
 
     How it was found, point, face normal, and the face with u and v (-1: none).
     """
@@ -222,7 +226,8 @@ def _find(tracer, point, normal, view, ahead, window):  # type: ignore[no-untype
             break
         sx, sy, sz = sx - t * vx, sy - t * vy, sz - t * vz
         facing = fx * vx + fy * vy + fz * vz > 0.0
-        agrees = fx * nx + fy * ny + fz * nz > ALIKE and (facing or turned)
+        # behind a face that is turned to the viewer lies the inside: a surfel seen from behind there is a wrong one
+        agrees = fx * nx + fy * ny + fz * nz > ALIKE and (facing or (turned and how != FACING))
         if agrees or how == NOWHERE or (facing and how == ANY_SIDE):
             how = ALONG_VIEW if agrees else FACING if facing else ANY_SIDE
             hx, hy, hz, gx, gy, gz = sx, sy, sz, fx, fy, fz
@@ -239,6 +244,18 @@ def _find(tracer, point, normal, view, ahead, window):  # type: ignore[no-untype
             if hit >= 0 and fx * nx + fy * ny + fz * nz > ALIKE:
                 t *= side
                 return ALONG_NORMAL, x + t * nx, y + t * ny, z + t * nz, fx, fy, fz, hit, u, v
+    if how in (NOWHERE, ANY_SIDE):
+        sx, sy, sz, left = x, y, z, _BACK * away
+        for _ in range(_WALLS):
+            t, fx, fy, fz, hit, u, v = _shoot(tracer, sx, sy, sz, vx, vy, vz, left)
+            if hit < 0:
+                break
+            sx, sy, sz = sx + t * vx, sy + t * vy, sz + t * vz
+            if fx * vx + fy * vy + fz * vz > 0.0:
+                return FACING, sx, sy, sz, fx, fy, fz, hit, u, v
+            past = 1e-3 * window
+            left -= t + past
+            sx, sy, sz = sx + past * vx, sy + past * vy, sz + past * vz
     return how, hx, hy, hz, gx, gy, gz, face, a, b
 
 
@@ -294,7 +311,7 @@ def attach_points(thread, stride, scratch, tracer, rules, view_of, samples, keys
             face, u, v = np.int32(-1), np.float32(0.0), np.float32(0.0)
             if any_mesh:
                 how, hx, hy, hz, gx, gy, gz, face, u, v = _find(
-                    tracer, (x, y, z), (nx, ny, nz), (vx, vy, vz), ahead, window
+                    tracer, (x, y, z), (nx, ny, nz), (vx, vy, vz), ahead, window, s * slope
                 )  # fmt: skip
             if loose:  # the face says how the point moves, nothing else
                 how, hx, hy, hz, gx, gy, gz = NOWHERE, x, y, z, nx, ny, nz
