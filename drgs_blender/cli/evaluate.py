@@ -24,6 +24,7 @@ from .output import check_writable
 from .progress import WORK_SECONDS, FractionBar
 
 if TYPE_CHECKING:
+    from ..core.asset.model import Asset
     from ..engine.session import Session
     from ..evaluate.compare import Renderer
     from ..evaluate.scenes import Plan
@@ -53,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--test-every",
         type=sampling.int_range(2, 10**6),
         metavar="N",
-        help="views left out, if the capture does not say",
+        help="views left out, if the capture does not say; default: as the asset was reconstructed",
     )
     parser.add_argument(
         "--resolution", type=sampling.int_range(8, 65536), metavar="N", help="longer side of the views left out"
@@ -174,7 +175,8 @@ def score(args: argparse.Namespace) -> int:
     lpips = Lpips(*args.lpips) if args.lpips else None
     session = Session()
     key = session.load_asset(args.asset)
-    capture = read_capture(args.capture, args.resolution, args.test_every, args.axes, args.up, turntable=args.turntable)
+    test_every = args.test_every or left_out_by(session.asset(key))
+    capture = read_capture(args.capture, args.resolution, test_every, args.axes, args.up, turntable=args.turntable)
     truth = read_truth(args.capture)
     relit = [read_relit(folder, light, args.resolution, args.axes, args.up) for folder, light in args.relit]
     if relit:
@@ -194,6 +196,14 @@ def score(args: argparse.Namespace) -> int:
     report = {"asset": digest_asset(key), "capture": capture.name, "samples": settings.samples, **report}
     print(json.dumps(report, indent=1) if args.json else "\n".join(table(report)))
     return 0
+
+
+def left_out_by(asset: Asset) -> int | None:
+    """The `capture.test_every` with which an asset was reconstructed, where it says that."""
+    settings = asset.provenance.get("settings")
+    reading = settings.get("capture") if isinstance(settings, dict) else None
+    every = reading.get("test_every") if isinstance(reading, dict) else None
+    return every if isinstance(every, int) and every >= 2 else None
 
 
 def session_renderer(

@@ -1,8 +1,9 @@
 """Render an asset under an environment, without Blender: a picture, or those of a simulation, from a camera in a file.
 
-The camera file holds matrix_world (4 rows of 4 numbers, camera to world, metres: the world is Z up; the camera looks
-along its own -Z, its own Y is up), width, height, and fov_x in degrees or fx, fy, cx, cy in pixels; optionally
-orthographic, clip_start, clip_end. docs/command-line.md has a script that writes it in Blender.
+Without a camera file the picture frames the asset from the front, or from all around. The file holds matrix_world (4
+rows of 4 numbers, camera to world, metres: the world is Z up; the camera looks along its own -Z, its own Y is up),
+width, height, and fov_x in degrees or fx, fy, cx, cy in pixels; optionally orthographic, clip_start, clip_end.
+docs/command-line.md has a script that writes it in Blender.
 """
 
 from __future__ import annotations
@@ -21,13 +22,14 @@ import numpy as np
 from ..core import cryptomatte
 from ..core.asset import Asset
 from ..core.errors import UsageError
-from ..core.frame import Frame, ObjectState, RenderSettings, World
+from ..core.frame import Camera, Frame, ObjectState, RenderSettings, World
 from ..core.frame_sequences import frame_path
 from ..core.loading import many_imports
 from ..core.particle_cache import ParticleCache
 from . import sampling
-from .camera_file import read_camera
+from .camera_file import LARGEST_SIDE, read_camera
 from .frame_range import check_template, parse_frames
+from .framing import SIZE, framing_camera, sees_any
 from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_preview
 from .pose_file import add_vertex_order, check_vertex_order, in_asset_order, is_point_cache, read_poses, read_vertices
@@ -36,6 +38,8 @@ from .progress import FractionBar
 logger = logging.getLogger(__name__)
 
 EXAMPLES = """examples:
+  drgs relight helmet.drgs --env studio.hdr --out helmet.png
+  drgs relight helmet.drgs --env studio.hdr --orbit 24 --out 'around/####.png'
   drgs relight helmet.drgs --env studio.hdr --camera front.json --out helmet.exr
   drgs relight helmet.drgs --env city.exr --env-rotation 90 --camera front.json --samples 128 --denoise svgf \\
       --passes all --transparent --out helmet.exr
@@ -49,7 +53,16 @@ EXAMPLES = """examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs relight``."""
     parser.add_argument("asset", type=Path, metavar="ASSET", help=".drgs file")
-    parser.add_argument("--camera", type=Path, required=True, metavar="CAMERA.json", help="camera")
+    parser.add_argument(
+        "--camera", type=Path, metavar="CAMERA.json", help="camera; default: one in front (-Y) that frames the asset"
+    )
+    parser.add_argument(
+        "--orbit", type=sampling.int_range(2, 100_000), metavar="N", help="N pictures from all around, numbered"
+    )
+    parser.add_argument(
+        "--size", type=sampling.int_range(1, LARGEST_SIDE), metavar="N",
+        help=f"pixels of a side where no camera is given; default {SIZE}",
+    )  # fmt: skip
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FILE",
         help="EXR frame (linear), or PNG to look at (sRGB, without Blender's view transform AgX)",
@@ -98,9 +111,9 @@ def positive(text: str) -> float:
 def run(args: argparse.Namespace) -> int:
     """Render."""
     check_suffix(args.out, (".exr", ".png"))
-    camera = read_camera(args.camera)
+    given = _given_camera(args)
     settings = sampling.override(RenderSettings(), args)
-    sampling.check_size(camera, args.passes)
+    sampling.check_size(given or framing_camera(np.zeros((1, 3)), size=args.size or SIZE), args.passes)
     check_vertex_order(args)
     poses, (tear, grain) = _poses(args)
     for number, _ in poses:
@@ -123,6 +136,12 @@ def run(args: argparse.Namespace) -> int:
         if vertices is not None and args.vertices:
             vertices = in_asset_order(args, session.asset(key).mesh, vertices)
         shape = session.asset(key).mesh.vertices if vertices is None else vertices
+        shape = shape if len(shape) else asset.surfels.centre
+        camera = given or framing_camera(shape, 360.0 * (number - 1) / (args.orbit or 1), args.size or SIZE)
+        if not warned and not camera.panorama and not sees_any(camera, shape):
+            logger.warning("%s is not in the picture: it lies %s. Point the camera there, or leave --camera out",
+                           args.asset.stem, place_of(shape))  # fmt: skip
+            warned = True
         if not warned and not args.captured and (size := size_around(camera.matrix_world[:3, 3], shape)) is not None:
             logger.warning("the camera is inside %s (a box of %s m): move it back", args.asset.stem, size)
             warned = True
@@ -154,6 +173,22 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def place_of(vertices: np.ndarray) -> str:
+    """Where (n, 3) world vertices are, such as "between (-1, -1, 0) and (1, 1, 2) m"."""
+    low, high = (", ".join(f"{x:.3g}" for x in corner) for corner in (vertices.min(axis=0), vertices.max(axis=0)))
+    return f"between ({low}) and ({high}) m"
+
+
+def _given_camera(args: argparse.Namespace) -> Camera | None:
+    """The camera of the file; None where the asset is to be framed. UsageError where both are wanted."""
+    if args.camera is None:
+        return None
+    for name in ("orbit", "size"):
+        if getattr(args, name) is not None:
+            raise UsageError(f"--{name}", "is of pictures without --camera", "Leave one of them out")
+    return read_camera(args.camera)
+
+
 def size_around(position: np.ndarray, vertices: np.ndarray) -> str | None:
     """Size of the bounding box of `vertices` where `position` lies in it, such as "0.4 x 0.4 x 0.7"; otherwise None.
 
@@ -175,10 +210,15 @@ def _poses(
     args: argparse.Namespace,
 ) -> tuple[Sequence[tuple[int, Callable[[], np.ndarray | None]]], tuple[float, float]]:
     """Number of each picture with what gives its pose, and `tear` and `grain` of the object."""
-    if is_point_cache(args.vertices):
+    if is_point_cache(args.vertices) and args.orbit is None:
         poses = read_poses(args.vertices, parse_frames(args.frames) if args.frames else None)
         check_template(str(args.out), [frame for frame, _ in poses])
         return poses, (0.0, 0.0)
+    if args.orbit is not None:
+        if args.cache is not None or args.vertices is not None or args.frames:
+            raise UsageError("--orbit", "is of an asset at rest", "Leave --cache, --vertices and --frames out")
+        check_template(str(args.out), list(range(1, args.orbit + 1)))
+        return [(number, lambda: None) for number in range(1, args.orbit + 1)], (0.0, 0.0)
     if args.cache is None:
         if args.frames:
             problem = "are those of a cache"

@@ -192,7 +192,7 @@ def reconstruct(
             surfels = replace(surfels, **{name: getattr(own, name)[visible] for name in BASE_CHANNELS})
         environment, origin = Environment(found.environment), "separated from the lighting"
         done, of = report["steps"]["materials"]
-        if _are_few(done, of):
+        if done < FEW_STEPS:
             origin = f"hardly separated from the lighting, in {done} of {of} steps: unreliable"
         work.on_progress(Progress("materials", 1.0, len(surfels)))
     learned = [view.name for view in capture.training]

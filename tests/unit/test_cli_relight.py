@@ -167,6 +167,53 @@ def test_png_preview(folder, tmp_path, capsys):
     assert capsys.readouterr() == (f"{out}: 40 x 30, 4 samples\n", "")
 
 
+def test_without_a_camera_the_asset_is_framed(folder, tmp_path):
+    """All of it is in the picture and fills much of it, also far from the origin and from all around."""
+    out = tmp_path / "####.exr"
+    given = ["relight", str(folder / "lit.drgs"), "--out", str(out), "--samples", "2", "--size", "32"]
+    given += ["--transparent", "--camera-sees", "mesh"]
+    assert main([*given, "--orbit", "4"]) == 0
+    bright = []
+    for number in range(1, 5):
+        picture = read_frame(tmp_path / f"{number:04d}.exr")[0]["Combined"]
+        alpha = picture[..., 3]
+        assert picture.shape[:2] == (32, 32) and 0.2 < alpha.mean() < 0.8
+        assert max(alpha[0].max(), alpha[-1].max(), alpha[:, 0].max(), alpha[:, -1].max()) == 0
+        bright.append((picture[..., :3].sum(-1) * np.linspace(-1, 1, 32)).sum())
+    # The light stands at +X: right of a camera in front, left of one behind, and before or behind the others.
+    assert bright[0] > 5 * abs(bright[1]) and bright[2] < -5 * abs(bright[3])
+
+
+def test_an_object_outside_the_picture_is_told(folder, relight, tmp_path, capsys):
+    away = np.array(FRONT["matrix_world"], float)
+    away[0, 3] = 50.0
+    (tmp_path / "away.json").write_text(json.dumps(FRONT | {"fov_x": 30, "matrix_world": away.tolist()}))
+    relight("--camera", str(tmp_path / "away.json"))
+    said = capsys.readouterr().err
+    assert "lit is not in the picture: it lies between (-1, -1, -1) and (1, 1, 1) m" in said
+    relight()
+    assert "not in the picture" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [(["--size", "64"], "--size"), (["--orbit", "4"], "--orbit")],
+)
+def test_what_frames_the_asset_excludes_a_camera(folder, tmp_path, capsys, more, message):
+    given = [
+        "relight",
+        str(folder / "lit.drgs"),
+        "--camera",
+        str(folder / "front.json"),
+        "--out",
+        str(tmp_path / "o.exr"),
+    ]
+    assert main([*given, *more]) == 64
+    assert f"{message}: is of pictures without --camera" in capsys.readouterr().err
+    assert main([*given[:2], "--out", str(tmp_path / "o.exr"), "--orbit", "4"]) == 64
+    assert "has no # for the frame's number" in capsys.readouterr().err
+
+
 def test_a_camera_inside_the_object_is_said_once(folder, relight, tmp_path, capsys):
     matrix = [[1, 0, 0, 0], [0, 0, -1, -0.5], [0, 1, 0, 0], [0, 0, 0, 1]]
     (tmp_path / "inside.json").write_text(json.dumps(FRONT | {"fov_x": 30, "matrix_world": matrix}))
