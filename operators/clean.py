@@ -13,7 +13,7 @@ from ..addon.viewport.surfels import posed_centres
 from ..drgs_blender.core.asset import Asset
 from ..drgs_blender.core.asset.part import taken
 from ..drgs_blender.core.errors import UsageError
-from ..drgs_blender.core.floaters import find_floaters
+from ..drgs_blender.core.floaters import distance_from_mesh, find_floaters
 from . import selection
 from .base import DrgsOperator
 
@@ -121,7 +121,7 @@ class DRGS_OT_select_surfels(DrgsOperator, bpy.types.Operator):
                 raise UsageError("Selection", "holds no surfel whose colour is meant", "Select one or several")
             shown = surfels.albedo.clip(0, 1)[rows] ** (1 / 2.2)
             return np.linalg.norm(shown - shown[before].mean(axis=0), axis=1) <= self.tolerance
-        away = distances(asset)
+        away = distance_from_mesh(asset)
         if self.criterion == "DISTANCE":
             return np.zeros(len(rows), bool) if away is None else (away > self.distance * typical)[rows]
         left = np.unique(rows)
@@ -265,16 +265,6 @@ def in_box(box: bpy.types.Object, obj: bpy.types.Object, places: Array) -> Array
     inverse = np.array(box.matrix_world.inverted_safe(), np.float64)
     local = world @ inverse[:3, :3].T + inverse[:3, 3]
     return ((local >= low) & (local <= high)).all(axis=1)
-
-
-def distances(asset: Asset) -> Array | None:
-    """(n,) metres of the surfels from the mesh, along the normal of the face that each hangs on; None without one."""
-    binding, mesh = asset.binding, asset.mesh
-    if binding is None:
-        return None
-    corners = mesh.vertices[mesh.faces[binding.face]].astype(np.float64)
-    foot = np.einsum("nk,nkc->nc", binding.barycentric.clip(0, 1), corners)
-    return np.linalg.norm(asset.surfels.centre - foot, axis=1)
 
 
 def faces_of(obj: bpy.types.Object, asset: Asset, removed: Array) -> Array:

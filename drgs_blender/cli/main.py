@@ -48,6 +48,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("reconstruct", "reconstruct", "make an asset from photographs"),
     Command("capture", "capture", "find the cameras of photographs or of a video"),
     Command("markers", "markers", "print a sheet of markers to photograph objects on"),
+    Command("clean", "clean", "remove floaters and what lies outside a box from an asset"),
     Command("convert", "convert", "write an asset, splats, a mesh or a light in a format of other programs"),
     Command("bake", "bake", "bake the light on the objects of a frame to their vertices or to images"),
     Command(
@@ -66,7 +67,7 @@ COMMANDS: tuple[Command, ...] = (
 )
 
 #: Options whose values may begin with a dash.
-_SIGNED = ("--up", "--from-up", "--frames", "--sequence", "--gravity", "--velocity", "--floor")
+_SIGNED = ("--up", "--from-up", "--frames", "--sequence", "--gravity", "--velocity", "--floor", "--box")
 
 
 class Parser(argparse.ArgumentParser):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .asset.model import Array, Surfels
+from .asset.model import Array, Asset, Surfels
 
 #: Side of the cells in which surfels are connected, in medians of their larger deviation.
 CELL = 3.0
@@ -53,6 +53,16 @@ def find_floaters(surfels: Surfels, away: Array | None = None, strength: float =
     if away is not None:
         doubtful |= away > OFF / strength * typical
     return small | (alone & doubtful)
+
+
+def distance_from_mesh(asset: Asset) -> Array | None:
+    """(n,) metres of the surfels from the place where each hangs on the mesh, at rest; None of unbound ones."""
+    binding, mesh = asset.binding, asset.mesh
+    if binding is None:
+        return None
+    corners = mesh.vertices[mesh.faces[binding.face]].astype(np.float64)
+    foot = np.einsum("nk,nkc->nc", binding.barycentric.clip(0, 1), corners)
+    return np.linalg.norm(asset.surfels.centre - foot, axis=1)
 
 
 def connected_parts(count: int, first: Array, second: Array) -> Array:

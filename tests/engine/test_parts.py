@@ -9,23 +9,15 @@ import pytest
 from pictures import assert_same_bits, fresh
 
 from drgs_blender.core.asset.container import read_asset, write_asset
-from drgs_blender.core.asset.part import Part, part_of
+from drgs_blender.core.asset.part import Part, part_of, part_of_faces
 from drgs_blender.core.errors import AssetError
 from drgs_blender.engine.session import Session
-
-
-def kept(mesh, faces):
-    """The part of some faces, with the vertices that they use."""
-    rows = np.unique(mesh.faces[faces])
-    number = np.full(len(mesh.vertices), -1, np.int32)
-    number[rows] = np.arange(len(rows))
-    return Part(rows.astype(np.int32), number[mesh.faces[faces]], np.flatnonzero(faces).astype(np.int32))
 
 
 @pytest.fixture
 def upper(asset_path):
     asset = read_asset(asset_path)
-    return kept(asset.mesh, asset.mesh.vertices[asset.mesh.faces][..., 2].min(axis=1) > -0.2)
+    return part_of_faces(asset.mesh, asset.mesh.vertices[asset.mesh.faces][..., 2].min(axis=1) > -0.2)
 
 
 def test_a_part_has_the_surfels_of_its_faces_in_order(asset_path, upper):
@@ -68,7 +60,7 @@ def test_a_part_is_rendered_as_an_asset_of_it_alone(asset_path, make_frame, uppe
     expected = fresh(alone, replace(frame, objects=[replace(state, asset=str(alone.resolve()), **arrays)]))
     assert_same_bits(of_part, expected)
     assert of_part["Combined"][..., 3].sum() < 0.9 * whole["Combined"][..., 3].sum()
-    fewer = kept(asset.mesh, np.isin(np.arange(len(asset.mesh.faces)), upper.face[::2]))
+    fewer = part_of_faces(asset.mesh, np.isin(np.arange(len(asset.mesh.faces)), upper.face[::2]))
     arrays = {"vertices": state.vertices[fewer.vertices]}
     again = replace(frame, objects=[replace(state, part=fewer, **arrays)])
     assert_same_bits(session.render(again), fresh(asset_path, again))

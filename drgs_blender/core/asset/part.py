@@ -73,6 +73,14 @@ def part_of(asset: Asset, part: Part, subject: str = "part") -> Asset:
     return replace(asset, mesh=cut, surfels=surfels, binding=binding)
 
 
+def part_of_faces(mesh: Mesh, faces: Array) -> Part:
+    """The part of some faces of a mesh, (m,) bool, with the vertices that they use."""
+    rows = np.unique(mesh.faces[faces])
+    number = np.full(len(mesh.vertices), -1, np.int32)
+    number[rows] = np.arange(len(rows))
+    return Part(rows.astype(np.int32), number[mesh.faces[faces]], np.flatnonzero(faces).astype(np.int32))
+
+
 def vertices_of(mesh: Mesh, rows: Array) -> Mesh:
     """A mesh without faces of the vertices `rows`, (n,) int32, with their channels and groups."""
     values: dict[str, Any] = {name: getattr(mesh, name) for name in ("vertices", *_MATERIALS, *OPTIONAL_CHANNELS)}
