@@ -17,6 +17,11 @@ from .scene_frames import NUMBER, SceneFrames, draw_colour
 _HELD = {"splats": "Splats", "mesh": "Mesh with materials", "environment": "The World"}
 # Blender evaluates annotations apart from this module: no loops in them.
 _FORMATS = tuple((name, f"{name} ({t.extensions[0]})", _HELD[t.kind]) for name, t in WRITTEN.items())
+_SPZ_VERSIONS = (
+    ("4", "4", "The newest; smallest and read fastest"),
+    ("3", "3", "For programs that do not know version 4"),
+    ("2", "2", "For the oldest programs; coarser rotations"),
+)
 _ENDINGS = tuple(dict.fromkeys(e for t in WRITTEN.values() for e in t.extensions))
 #: Endings of what other programs export, or of what is only read. Others may be parts of a name.
 _FOREIGN = {".abc", ".blend", ".bvh", ".drgs", ".fbx", ".mdd", ".pc2", ".svg", ".vdb", ".wrl", ".x3d"}
@@ -51,6 +56,7 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
         items=UP_ITEMS,
         default="auto",
     )
+    spz_version: EnumProperty(name="Version", description="Version of the SPZ format", items=_SPZ_VERSIONS, default="4")
     use_animation: BoolProperty(
         name="Animation", description="A file for each frame of the scene; its number ends the name", default=False
     )
@@ -90,6 +96,8 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
                 layout.prop(self, "up")
         if kind.kind == "splats":
             draw_colour(layout, self)
+        for option in kind.options:
+            layout.prop(self, option)
         layout.prop(self, "use_animation")
         if self.use_animation:
             column = layout.column(align=True)
@@ -114,6 +122,11 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
             arguments = self.describe(context, target, kind.kind, frames)
         if kind.kind != "environment":
             arguments.append(f"--scale={self.scale:.9g}")
+        for option in kind.options:
+            value = getattr(self, option)
+            if value is not False:
+                name = f"--{option.replace('_', '-')}"
+                arguments.append(name if value is True else f"{name}={value}")
         if not kind.fixed and self.up != "auto":
             arguments.append(f"--up={self.up}")
         files = [frame_path(str(target), n) for n in ([context.scene.frame_current] if frames is None else frames)]

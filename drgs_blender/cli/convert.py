@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import UsageError
-from ..core.file_types import Held
+from ..core.file_types import SPZ_VERSIONS, Held
 from ..core.frame_sequences import frame_path
 from ..formats.axes import UP_AXES
 from ..formats.point_cache import SUFFIXES as POINT_CACHES
@@ -26,6 +26,8 @@ from .sampling import int_range
 
 logger = logging.getLogger(__name__)
 
+#: Options that go to the writers of formats that take them.
+OPTIONS = ("spz_version",)
 EXAMPLES = """examples:
   drgs convert capture.ply capture.spz
   drgs convert helmet.drgs helmet.glb
@@ -35,6 +37,7 @@ EXAMPLES = """examples:
   drgs convert robot.drgs robot.pc2 --vertices source.mdd
   drgs convert 'in/####.ply' 'out/####.spz' --frames
   drgs convert splats.spz splats.ply --up=-y
+  drgs convert splats.ply splats.spz --spz-version 3
   drgs convert lego.drgs light.exr
 """
 
@@ -64,6 +67,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--frames", nargs="?", const="",
         help="frames, one file each: #### in IN, OUT and V becomes the number; 1-24, or nothing for those of IN or V",
+    )  # fmt: skip
+    formats = parser.add_argument_group("what single formats leave open")
+    formats.add_argument(
+        "--spz-version", type=int, choices=SPZ_VERSIONS,
+        help="of an SPZ file: older programs read 2 and 3, of which 2 has coarser rotations; default 4",
     )  # fmt: skip
     splats = parser.add_argument_group("colour of splats")
     splats.add_argument(
@@ -170,6 +178,7 @@ def convert(args: argparse.Namespace) -> None:
     kind = writer.kind
     if writer.fixed and args.up not in (None, writer.up):
         raise UsageError("--up", f"is {args.up}, but {writer.name} is {writer.up} up", "Leave --up out")
+    options = writer.chosen({name: getattr(args, name) for name in OPTIONS})
     check_writable(args.output, (args.input, args.vertices, args.env))
     up = args.up or writer.up
     if kind == "environment":
@@ -195,7 +204,7 @@ def convert(args: argparse.Namespace) -> None:
         from ..formats.splats import scaled, splats_from_z_up
 
         splats, shown = source.splats()
-        writer.write(args.output, splats_from_z_up(scaled(splats, args.scale), up))
+        writer.write(args.output, splats_from_z_up(scaled(splats, args.scale), up), **options)
         print(f"{args.output}: {len(splats)} splats, {writer.name}, {up} up, showing the {shown}")
     for note in source.notes:
         print(f"  {note}")

@@ -39,12 +39,15 @@ class WriteType:
         The up axis that the format prescribes, or that is written unless asked otherwise.
     fixed : bool
         No other up axis can be asked for.
+    options : tuple of str
+        Options of `drgs convert` that it takes, as keywords of its writer.
     """
 
     extensions: tuple[str, ...]
     kind: Held
     up: Literal["z", "y"]
     fixed: bool
+    options: tuple[str, ...] = ()
 
 
 READ: dict[str, ReadType] = {
@@ -70,9 +73,12 @@ READ: dict[str, ReadType] = {
     "NeRO materials": ReadType((".npy",), "materials"),
 }
 
+#: Versions of SPZ that are read and written; the last one is written unless asked otherwise.
+SPZ_VERSIONS = (2, 3, 4)
+
 WRITTEN: dict[str, WriteType] = {
     "3DGS PLY": WriteType((".ply",), "splats", "z", False),
-    "SPZ": WriteType((".spz",), "splats", "y", True),
+    "SPZ": WriteType((".spz",), "splats", "y", True, ("spz_version",)),
     "SOG": WriteType((".sog",), "splats", "z", False),
     "glTF splats": WriteType((".glb",), "splats", "y", True),
     "USD splats": WriteType((".usd", ".usda", ".usdc"), "splats", "z", True),

@@ -165,8 +165,8 @@ def test_the_dialogs_show_what_goes_with_the_format(ball, scene):
     operator = part("operators.export").DRGS_OT_export
     values = {"colour": "relit", "use_animation": True}
     for format_, wanted, unwanted in (
-        ("SPZ", {"samples", "scale", "use_selection", "frame_end"}, {"up"}),
-        ("3DGS PLY", {"up", "colour"}, set()),
+        ("SPZ", {"samples", "scale", "use_selection", "frame_end", "spz_version"}, {"up"}),
+        ("3DGS PLY", {"up", "colour"}, {"spz_version"}),
         ("glTF mesh", {"scale"}, {"colour", "up"}),
         ("OpenEXR", {"format"}, {"scale", "use_selection", "colour"}),
     ):
@@ -215,6 +215,13 @@ def test_the_file_browser_keeps_a_foreign_ending_to_be_refused(scene, tmp_path, 
     assert export.check(stand_in, bpy.context) and stand_in.filepath == "chair.v2.ply"
     with pytest.raises(RuntimeError, match=r"cannot be written; understood: \.ply \.spz"):
         bpy.ops.drgs.export(filepath=str(tmp_path / name))
+
+
+@pytest.mark.parametrize("version", ["3", "4"])
+def test_spz_is_of_the_version_that_is_chosen(ball, scene, tmp_path, version):
+    path = tmp_path / "a.spz"
+    assert bpy.ops.drgs.export(filepath=str(path), format="SPZ", spz_version=version) == {"FINISHED"}
+    assert path.read_bytes()[:2] == (b"NG" if version == "4" else b"\x1f\x8b")
 
 
 def test_an_ending_of_another_format_is_told(ball, scene, tmp_path):
