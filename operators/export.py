@@ -56,6 +56,11 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
         items=UP_ITEMS,
         default="auto",
     )
+    materials: BoolProperty(
+        name="Materials",
+        description="Albedo, roughness, metallic and normals of the splats, too, for programs that light them",
+        default=False,
+    )
     spz_version: EnumProperty(name="Version", description="Version of the SPZ format", items=_SPZ_VERSIONS, default="4")
     use_animation: BoolProperty(
         name="Animation", description="A file for each frame of the scene; its number ends the name", default=False

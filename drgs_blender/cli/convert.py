@@ -27,7 +27,7 @@ from .sampling import int_range
 logger = logging.getLogger(__name__)
 
 #: Options that go to the writers of formats that take them.
-OPTIONS = ("spz_version",)
+OPTIONS = ("materials", "spz_version")
 EXAMPLES = """examples:
   drgs convert capture.ply capture.spz
   drgs convert helmet.drgs helmet.glb
@@ -39,6 +39,7 @@ EXAMPLES = """examples:
   drgs convert splats.spz splats.ply --up=-y
   drgs convert splats.ply splats.spz --spz-version 3
   drgs convert lego.drgs light.exr
+  drgs convert helmet.drgs helmet.glb --as splats --materials
 """
 
 
@@ -69,6 +70,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="frames, one file each: #### in IN, OUT and V becomes the number; 1-24, or nothing for those of IN or V",
     )  # fmt: skip
     formats = parser.add_argument_group("what single formats leave open")
+    formats.add_argument(
+        "--materials", action="store_true",
+        help="of PLY, glTF and USD with splats: add albedo, roughness, metallic, normals (docs/relightable-splats.md)",
+    )  # fmt: skip
     formats.add_argument(
         "--spz-version", type=int, choices=SPZ_VERSIONS,
         help="of an SPZ file: older programs read 2 and 3, of which 2 has coarser rotations; default 4",
@@ -205,6 +210,7 @@ def convert(args: argparse.Namespace) -> None:
 
         splats, shown = source.splats()
         writer.write(args.output, splats_from_z_up(scaled(splats, args.scale), up), **options)
-        print(f"{args.output}: {len(splats)} splats, {writer.name}, {up} up, showing the {shown}")
+        extra = ", with materials" if args.materials else ""
+        print(f"{args.output}: {len(splats)} splats, {writer.name}, {up} up, showing the {shown}{extra}")
     for note in source.notes:
         print(f"  {note}")

@@ -77,11 +77,11 @@ READ: dict[str, ReadType] = {
 SPZ_VERSIONS = (2, 3, 4)
 
 WRITTEN: dict[str, WriteType] = {
-    "3DGS PLY": WriteType((".ply",), "splats", "z", False),
+    "3DGS PLY": WriteType((".ply",), "splats", "z", False, ("materials",)),
     "SPZ": WriteType((".spz",), "splats", "y", True, ("spz_version",)),
     "SOG": WriteType((".sog",), "splats", "z", False),
-    "glTF splats": WriteType((".glb",), "splats", "y", True),
-    "USD splats": WriteType((".usd", ".usda", ".usdc"), "splats", "z", True),
+    "glTF splats": WriteType((".glb",), "splats", "y", True, ("materials",)),
+    "USD splats": WriteType((".usd", ".usda", ".usdc"), "splats", "z", True, ("materials",)),
     "glTF mesh": WriteType((".glb",), "mesh", "y", True),
     "USD mesh": WriteType((".usdz",), "mesh", "z", True),
     "OpenEXR": WriteType((".exr",), "environment", "z", True),

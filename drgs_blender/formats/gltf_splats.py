@@ -18,11 +18,13 @@ from .glb import Glb
 from .gltf_document import Document
 from .gltf_nodes import NodeTree
 from .splat_scene import Piece, join_pieces
-from .splats import Splats, writable
+from .splats import SplatMaterials, Splats, normals, writable
 
 Array = np.ndarray
 
 EXTENSION = "KHR_gaussian_splatting"
+#: Attributes of our own, as glTF names what no specification does; docs/relightable-splats.md.
+ALBEDO, ROUGHNESS, METALLIC = "_ALBEDO", "_ROUGHNESS", "_METALLIC"
 _WIDTHS = (1, 3, 5, 7)
 _LINEAR = "lin_rec709_display"
 #: Bytes that any instance counts for: each costs time, however small it is.
@@ -97,11 +99,18 @@ def _primitive(document: Document, primitive: dict[str, Any], settings: dict[str
         read(f"{EXTENSION}:ROTATION", "VEC4", n)[:, [3, 0, 1, 2]],
         read(f"{EXTENSION}:OPACITY", "SCALAR", n)[:, 0],
         np.stack([read(name, "VEC3", n) for name in names], axis=1),
+        None
+        if ALBEDO not in attributes
+        else SplatMaterials(
+            read(ALBEDO, "VEC3", n), read(ROUGHNESS, "SCALAR", n)[:, 0], read(METALLIC, "SCALAR", n)[:, 0]
+        ),
     )
 
 
-def write_gltf_splats(path: Path, splats: Splats) -> None:
+def write_gltf_splats(path: Path, splats: Splats, materials: bool = False) -> None:
     """Write a GLB with `splats`, which are Y up; viewers that do not know the extension show coloured points.
+
+    With `materials`, normals, albedo, roughness and metallic are attributes, too.
 
     Raises UsageError (nothing to write, or too much for a GLB), AssetError (see `splats.writable`) or WriteError.
     """
@@ -118,6 +127,10 @@ def write_gltf_splats(path: Path, splats: Splats) -> None:
         f"{EXTENSION}:SCALE": glb.accessor(splats.scale),
         f"{EXTENSION}:OPACITY": glb.accessor(splats.opacity),
     }
+    if materials and splats.materials is not None:
+        values = (normals(splats.rotation), *splats.materials.arrays())
+        names = ("NORMAL", ALBEDO, ROUGHNESS, METALLIC)
+        attributes |= {name: glb.accessor(array) for name, array in zip(names, values, strict=True)}
     first = 0
     for degree, width in enumerate(_WIDTHS):
         for i in range(width if first + width <= splats.sh.shape[1] else 0):

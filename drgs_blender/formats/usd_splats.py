@@ -16,10 +16,11 @@ from . import usd_stage
 from .axes import UP_AXES
 from .files import SurfelFile
 from .splat_scene import Piece, join_pieces
-from .splats import Splats, writable
+from .splats import SplatMaterials, Splats, writable
 from .subprocess_reader import PATIENCE, SECONDS, read_in_subprocess
 from .usd_crate import check_crate
-from .usd_stage import DEGREE, HARMONICS, NO_SPLATS, SCHEMA, SPACE, UP
+from .usd_primvars import write_primvars
+from .usd_stage import DEGREE, HARMONICS, MATERIALS, NO_SPLATS, SCHEMA, SPACE, UP
 
 Array = np.ndarray
 
@@ -52,12 +53,14 @@ def read_usd_splats(path: Path) -> SurfelFile:
     pieces = []
     for i in range(sum(name.endswith("/matrix") for name in arrays)):
         of = {name: arrays[f"{i}/{name}"] for name in ("centre", "scale", "rotation", "opacity", "sh")}
-        pieces.append(Piece(Splats(**of), arrays[f"{i}/matrix"], bool(arrays[f"{i}/linear"][0])))
+        values = [arrays[f"{i}/{name}"] for name in MATERIALS if f"{i}/{name}" in arrays]
+        materials = SplatMaterials(*values) if len(values) == len(MATERIALS) else None
+        pieces.append(Piece(Splats(**of, materials=materials), arrays[f"{i}/matrix"], bool(arrays[f"{i}/linear"][0])))
     return join_pieces(pieces, path, "USD", up if up in UP_AXES else "y")
 
 
-def write_usd_splats(path: Path, splats: Splats) -> None:
-    """Write a stage with `splats`, which are Z up, in metres.
+def write_usd_splats(path: Path, splats: Splats, materials: bool = False) -> None:
+    """Write a stage with `splats`, which are Z up, in metres; with `materials`, see `usd_primvars`.
 
     Raises DeviceError (usd-core is not installed), AssetError (see `splats.writable`) or WriteError.
     """
@@ -93,6 +96,8 @@ def write_usd_splats(path: Path, splats: Splats) -> None:
         prim.AddAppliedSchema("ColorSpaceAPI")
         space = prim.CreateAttribute(SPACE, types.Token, custom=False, variability=Sdf.VariabilityUniform)
         space.Set("srgb_rec709_scene")  # of the names that USD knows; without one, colours are linear to it
+        if materials:
+            write_primvars(prim, geometry, splats)
     except RuntimeError as error:
         raise WriteError(str(path), f"cannot be written ({error})", "Report it") from error
     replace_by(path, lambda temporary: stage.GetRootLayer().Export(str(temporary)))

@@ -20,6 +20,8 @@ DEGREE = "radiance:sphericalHarmonicsDegree"
 HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 #: Attribute of UsdColorSpaceAPI, and how the names of linear light with our primaries start.
 SPACE, LINEAR = "colorSpace:name", "lin_rec709"
+#: Primvars of materials, with their widths, by the names that their arrays have.
+MATERIALS = {"albedo": ("primvars:Cd", 3), "roughness": ("primvars:rough", 1), "metallic": ("primvars:metallic", 1)}
 #: Limit of splats that references repeat: bytes, and bytes per byte of the files.
 _SPLATS, _RATIO = 64 << 20, 32
 #: Name of the text that says which axis is up.
@@ -115,9 +117,12 @@ def _splats(prim: Any, time: Any, subject: str) -> dict[str, Array]:
 
     def values_of(name: str, width: int, each: int = 1) -> Array | None:
         for attribute in (prim.GetAttribute(name), prim.GetAttribute(name + "h")):  # float before half
-            value = attribute.Get(time) if attribute else None
+            value = attribute.Get(time) if attribute and attribute.GetTypeName().isArray else None
             if value is not None and len(value):
-                table = np.array(value, np.float32).reshape(len(value), width)
+                numbers = np.array(value, np.float32)
+                if numbers.size != len(value) * width:  # a primvar of that name may be anything
+                    return None
+                table = numbers.reshape(len(value), width)
                 return table if name == "positions" or len(table) >= n * each else None
         return None
 
@@ -132,7 +137,13 @@ def _splats(prim: Any, time: Any, subject: str) -> dict[str, Array]:
     rotation, scale, opacity = values_of("orientations", 4), values_of("scales", 3), values_of("opacities", 1)
     sh = np.zeros((n, 1, 3), np.float32) if harmonics is None else harmonics[: n * count].reshape(n, count, 3)
     identity = np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1))
-    return {
+    given = {name: values_of(attribute, width) for name, (attribute, width) in MATERIALS.items()}
+    materials = {
+        name: array[:n].squeeze(1) if array.shape[1] == 1 else array[:n]
+        for name, array in given.items()
+        if array is not None
+    }
+    return materials | {
         "centre": centre,
         "scale": np.ones((n, 3), np.float32) if scale is None else scale[:n],
         # In memory the imaginary part of a quaternion comes first.

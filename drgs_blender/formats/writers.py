@@ -90,12 +90,15 @@ _TEXTURES = (
     "vertices to 1/510 (base colour as sRGB), halfway between vertices as different as can be to 1/4"
 )
 
+#: What is lost of splats.
+_MATERIALS = "materials, unless with `--materials` ([names](relightable-splats.md))"
+
 WRITERS: tuple[Writer, ...] = (
     Writer(
         "3DGS PLY",
         write_splat_ply,
         "centres, scales, rotations, opacities, colour with harmonics, as 32-bit numbers",
-        "materials; opacity within 1e-6 of 0 and 1",
+        f"{_MATERIALS}; opacity within 1e-6 of 0 and 1",
     ),
     Writer(
         "SPZ",
@@ -117,13 +120,13 @@ WRITERS: tuple[Writer, ...] = (
         "glTF splats",
         write_gltf_splats,
         "everything, as KHR_gaussian_splatting and 32-bit numbers; coloured points for viewers that do not know it",
-        "materials",
+        _MATERIALS,
     ),
     Writer(
         "USD splats",
         write_usd_splats,
         "everything, as ParticleField3DGaussianSplat and 32-bit numbers; needs usd-core",
-        "materials",
+        _MATERIALS,
     ),
     Writer(
         "glTF mesh",

@@ -166,7 +166,7 @@ def test_the_dialogs_show_what_goes_with_the_format(ball, scene):
     values = {"colour": "relit", "use_animation": True}
     for format_, wanted, unwanted in (
         ("SPZ", {"samples", "scale", "use_selection", "frame_end", "spz_version"}, {"up"}),
-        ("3DGS PLY", {"up", "colour"}, {"spz_version"}),
+        ("3DGS PLY", {"up", "colour", "materials"}, {"spz_version"}),
         ("glTF mesh", {"scale"}, {"colour", "up"}),
         ("OpenEXR", {"format"}, {"scale", "use_selection", "colour"}),
     ):
@@ -222,6 +222,13 @@ def test_spz_is_of_the_version_that_is_chosen(ball, scene, tmp_path, version):
     path = tmp_path / "a.spz"
     assert bpy.ops.drgs.export(filepath=str(path), format="SPZ", spz_version=version) == {"FINISHED"}
     assert path.read_bytes()[:2] == (b"NG" if version == "4" else b"\x1f\x8b")
+
+
+@pytest.mark.parametrize("materials", [False, True])
+def test_splats_have_materials_where_they_are_asked_for(ball, scene, tmp_path, materials):
+    path = tmp_path / "a.ply"
+    assert bpy.ops.drgs.export(filepath=str(path), format="3DGS PLY", materials=materials) == {"FINISHED"}
+    assert (b"property float albedo_r" in path.read_bytes()) == materials
 
 
 def test_an_ending_of_another_format_is_told(ball, scene, tmp_path):

@@ -25,7 +25,7 @@ from drgs_blender.formats.harmonics import rotate_harmonics
 from drgs_blender.formats.registry import find_format, read_surfels
 from drgs_blender.formats.sog_writer import write_sog
 from drgs_blender.formats.splat_ply import write_splat_ply
-from drgs_blender.formats.splats import Splats, splats_of
+from drgs_blender.formats.splats import SplatMaterials, Splats, splats_of
 from drgs_blender.formats.spz_writer import write_spz
 
 FOLDER = Path(os.environ.get("DRGS_NODE", Path(__file__).resolve().parents[2] / ".venv-node"))
@@ -207,7 +207,9 @@ SPLAT_ATTRIBUTES = [
 def test_khronos_finds_nothing_wrong(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "a.glb"
     if kind == "splats":
-        write_gltf_splats(path, random_splats(50))
+        n = 50
+        materials = SplatMaterials(np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n))
+        write_gltf_splats(path, replace(random_splats(n), materials=materials), materials=True)
         assert find_format(path).name == "glTF splats"
     else:
         vertices, faces = sphere_mesh(2)
