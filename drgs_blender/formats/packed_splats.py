@@ -164,5 +164,6 @@ def decode_arrays(
         columns |= {name: table[:, i] for i, name in enumerate(names)}
     element = Element("vertex", len(position), tuple(Property(name, "f4") for name in columns))
     file = decode_splats(Header((element,), "<", 0), Rows(element, columns), str(path), sh)
-    file.layout = layout
+    if materials is None:  # else the layout is that of splats with materials
+        file.layout = layout
     return file

@@ -14,6 +14,7 @@ import pytest
 from splat_files import random_splats
 from test_formats_exchange import asset_on_a_square
 
+from drgs_blender.build.importer import import_asset
 from drgs_blender.cli.main import main
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.errors import AssetError
@@ -82,8 +83,10 @@ def test_materials_there_and_back(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(file.surfels.sh, splats.sh, atol=1e-6)  # the captured colour stays beside them
     np.testing.assert_allclose(normals(file.surfels.rotation), normals(splats.rotation), atol=1e-5)
     assert not any("no materials" in note for note in file.notes) and set(file.surfels.extras) == {"thickness"}
-    if suffix == ".ply":
-        assert file.layout == "DR-GS"
+    assert file.layout == "DR-GS"
+    asset = import_asset(tmp_path / f"a{suffix}", meshless=True)
+    np.testing.assert_array_equal(asset.surfels.albedo, splats.materials.albedo)
+    assert asset.provenance["materials"] == "of the surfels"
 
 
 def test_without_the_option_files_are_as_they_were(tmp_path: Path) -> None:
