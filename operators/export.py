@@ -18,6 +18,7 @@ _HELD = {"splats": "Splats", "mesh": "Mesh with materials", "environment": "The 
 # Blender evaluates annotations apart from this module: no loops in them.
 _FORMATS = tuple((name, f"{name} ({t.extensions[0]})", _HELD[t.kind]) for name, t in WRITTEN.items())
 _SPZ_VERSIONS = (
+    ("auto", "Default", "4 in SPZ files, 2 in glTF"),
     ("4", "4", "The newest; smallest and read fastest"),
     ("3", "3", "For programs that do not know version 4"),
     ("2", "2", "For the oldest programs; coarser rotations"),
@@ -61,7 +62,12 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
         description="Albedo, roughness, metallic and normals of the splats, too, for programs that light them",
         default=False,
     )
-    spz_version: EnumProperty(name="Version", description="Version of the SPZ format", items=_SPZ_VERSIONS, default="4")
+    compress: BoolProperty(
+        name="Compress", description="Pack the splats of a glTF as SPZ, which not every viewer unpacks", default=False
+    )
+    spz_version: EnumProperty(
+        name="Version", description="Version of the SPZ format", items=_SPZ_VERSIONS, default="auto"
+    )
     use_animation: BoolProperty(
         name="Animation", description="A file for each frame of the scene; its number ends the name", default=False
     )
@@ -101,7 +107,7 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
                 layout.prop(self, "up")
         if kind.kind == "splats":
             draw_colour(layout, self)
-        for option in kind.options:
+        for option in _options(self):
             layout.prop(self, option)
         layout.prop(self, "use_animation")
         if self.use_animation:
@@ -127,15 +133,21 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
             arguments = self.describe(context, target, kind.kind, frames)
         if kind.kind != "environment":
             arguments.append(f"--scale={self.scale:.9g}")
-        for option in kind.options:
+        for option in _options(self):
             value = getattr(self, option)
-            if value is not False:
+            if value not in (False, "auto"):
                 name = f"--{option.replace('_', '-')}"
                 arguments.append(name if value is True else f"{name}={value}")
         if not kind.fixed and self.up != "auto":
             arguments.append(f"--up={self.up}")
         files = [frame_path(str(target), n) for n in ([context.scene.frame_current] if frames is None else frames)]
         return self.start(context, arguments, target.name, f"Writing {target.name}", "could not be written", files)
+
+
+def _options(operator: DRGS_OT_export) -> list[str]:
+    """Options of the chosen format; that of SPZ in glTF only where there is some."""
+    names = WRITTEN[operator.format].options
+    return [n for n in names if n != "spz_version" or operator.format == "SPZ" or operator.compress]
 
 
 CLASSES = (DRGS_OT_export,)

@@ -27,7 +27,7 @@ from .sampling import int_range
 logger = logging.getLogger(__name__)
 
 #: Options that go to the writers of formats that take them.
-OPTIONS = ("materials", "spz_version")
+OPTIONS = ("materials", "compress", "spz_version")
 EXAMPLES = """examples:
   drgs convert capture.ply capture.spz
   drgs convert helmet.drgs helmet.glb
@@ -75,8 +75,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of PLY, glTF and USD with splats: add albedo, roughness, metallic, normals (docs/relightable-splats.md)",
     )  # fmt: skip
     formats.add_argument(
+        "--compress", action="store_true",
+        help="of glTF with splats: pack them as SPZ (KHR_gaussian_splatting_compression_spz_2)",
+    )  # fmt: skip
+    formats.add_argument(
         "--spz-version", type=int, choices=SPZ_VERSIONS,
-        help="of an SPZ file: older programs read 2 and 3, of which 2 has coarser rotations; default 4",
+        help="of SPZ: older programs read 2 and 3, of which 2 has coarser rotations; default 4, in glTF 2",
     )  # fmt: skip
     splats = parser.add_argument_group("colour of splats")
     splats.add_argument(

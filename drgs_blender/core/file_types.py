@@ -80,7 +80,7 @@ WRITTEN: dict[str, WriteType] = {
     "3DGS PLY": WriteType((".ply",), "splats", "z", False, ("materials",)),
     "SPZ": WriteType((".spz",), "splats", "y", True, ("spz_version",)),
     "SOG": WriteType((".sog",), "splats", "z", False),
-    "glTF splats": WriteType((".glb",), "splats", "y", True, ("materials",)),
+    "glTF splats": WriteType((".glb",), "splats", "y", True, ("materials", "compress", "spz_version")),
     "USD splats": WriteType((".usd", ".usda", ".usdc"), "splats", "z", True, ("materials",)),
     "glTF mesh": WriteType((".glb",), "mesh", "y", True),
     "USD mesh": WriteType((".usdz",), "mesh", "z", True),

@@ -14,6 +14,7 @@ import numpy as np
 from ..core.asset import Environment
 from ..core.errors import AssetError
 from ..core.file_types import READ, Kind
+from .drafts import DRAFTS
 from .environment import read_exr_environment, read_hdr_environment, read_picture_environment
 from .files import EnvironmentFile, MaterialsFile, MeshFile, SurfelFile
 from .gaussian_ply import LAYOUTS, is_gaussian, read_gaussian_ply
@@ -142,7 +143,7 @@ FORMATS: tuple[Format, ...] = (
         "glTF splats",
         lambda head, path: _sniff_gltf(head, path) and has_splats(head),
         read_gltf_splats,
-        "KHR_gaussian_splatting; 3D splats, flattened; Y up, turned to Z up on import; not compressed ones",
+        "KHR_gaussian_splatting, also packed as SPZ; 3D splats, flattened; Y up, turned to Z up on import",
     ),
     Format(
         "USD",
@@ -356,6 +357,10 @@ def document() -> str:
             f"| {w.kept} | {w.lost} |"
             for w in WRITERS
         ),
+        "",
+        "## Drafts",
+        "",
+        *DRAFTS,
         "",
         "## Gaussian PLY layouts",
         "",

@@ -119,7 +119,8 @@ WRITERS: tuple[Writer, ...] = (
     Writer(
         "glTF splats",
         write_gltf_splats,
-        "everything, as KHR_gaussian_splatting and 32-bit numbers; coloured points for viewers that do not know it",
+        "everything, as KHR_gaussian_splatting and 32-bit numbers; coloured points for viewers that do not know it; "
+        "with `--compress` what SPZ keeps, for viewers that know [its extension](#drafts)",
         _MATERIALS,
     ),
     Writer(

@@ -111,6 +111,8 @@ def kinds() -> dict[str, Callable[[], Kind]]:
     for suffix, write in ((".ply", write_splat_ply), (".glb", write_gltf_splats)):
         of = partial(write, materials=True)
         made[f"materials{suffix}"] = lambda w=of, n=f"a{suffix}": Kind(n, {"file": written(w, n, lit)})
+    packed = partial(write_gltf_splats, compress=True)
+    made["packed.glb"] = lambda: Kind("a.glb", {"file": written(packed, "a.glb", splats)})
     for version in (2, 3):
         made[f"version{version}.spz"] = lambda v=version: Kind(
             "a.spz", {"file": old_spz(made["splats.spz"]().parts["file"], v)}

@@ -19,6 +19,7 @@ from splat_files import covariance, random_splats
 
 from drgs_blender.core.asset import Mesh
 from drgs_blender.formats.axes import multiply_quaternions, vectors_from_z_up
+from drgs_blender.formats.gltf_document import Document
 from drgs_blender.formats.gltf_mesh import write_gltf_mesh
 from drgs_blender.formats.gltf_splats import EXTENSION, write_gltf_splats
 from drgs_blender.formats.harmonics import rotate_harmonics
@@ -58,7 +59,8 @@ def splat_transform(source: Path, target: Path) -> None:
 _READ = """
 import fs from 'fs';
 const spz = await (await import('@adobe/spz')).default();
-const cloud = await spz.loadSpzFromBuffer(fs.readFileSync(process.argv[1]), {to: spz.CoordinateSystem.RUB});
+const to = spz.CoordinateSystem[process.argv[3] ?? 'RUB'];
+const cloud = await spz.loadSpzFromBuffer(fs.readFileSync(process.argv[1]), {to});
 const parts = ['positions', 'scales', 'rotations', 'alphas', 'colors', 'sh'].map(name => cloud[name]);
 fs.writeFileSync(process.argv[2], Buffer.concat(parts.map(a => Buffer.from(a.buffer, a.byteOffset, a.byteLength))));
 console.log(cloud.numPoints, cloud.shDegree);
@@ -99,6 +101,25 @@ def test_the_library_of_spz_reads_what_we_write(tmp_path: Path, version: int, de
     np.testing.assert_allclose(1 / (1 + np.exp(-opacity[:, 0])), splats.opacity, atol=1.01 / 510)
     np.testing.assert_allclose(colour, splats.sh[:, 0], atol=1.01 / (510 * 0.15))
     np.testing.assert_allclose(sh.reshape(n, k - 1, 3), splats.sh[:, 1:], atol=0.5 / 8 + 0.01)
+
+
+@needs("@adobe/spz")
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_library_of_spz_reads_what_lies_in_gltf(tmp_path: Path, version: int) -> None:
+    """To LUF, as the draft of the extension says: what glTF without compression has."""
+    splats = random_splats(200, 16)
+    write_gltf_splats(tmp_path / "a.glb", splats, compress=True, spz_version=version)
+    data, place = Document(tmp_path / "a.glb").view(0)
+    assert place == (0, 0)
+    data.tofile(tmp_path / "a.spz")
+    node(_READ, tmp_path / "a.spz", tmp_path / "a.bin", "LUF")
+    sizes = np.cumsum([200 * width for width in (3, 3, 4, 1, 3)])
+    parts = np.split(np.fromfile(tmp_path / "a.bin", np.float32), sizes)
+    centre, scale, rotation, _, _, sh = (part.reshape(200, -1) for part in parts)
+    np.testing.assert_allclose(centre, splats.centre, atol=1.001 / 8192)
+    same_shapes(replace(splats, rotation=rotation[:, [3, 0, 1, 2]], scale=np.exp(scale)), splats, 0.11)
+    apart = sh.reshape(200, 15, 3) - splats.sh[:, 1:]
+    assert np.sqrt(np.square(apart).mean()) < 0.06  # in other axes it would be ten times as much
 
 
 @needs("@adobe/spz")
@@ -203,13 +224,15 @@ SPLAT_ATTRIBUTES = [
 
 
 @needs("gltf-validator")
-@pytest.mark.parametrize("kind", ["splats", "plain mesh", "painted mesh"])
+@pytest.mark.parametrize("kind", ["splats", "packed splats", "plain mesh", "painted mesh"])
 def test_khronos_finds_nothing_wrong(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "a.glb"
-    if kind == "splats":
+    if kind.endswith("splats"):
         n = 50
         materials = SplatMaterials(np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n))
-        write_gltf_splats(path, replace(random_splats(n), materials=materials), materials=True)
+        write_gltf_splats(
+            path, replace(random_splats(n), materials=materials), materials=True, compress=kind != "splats"
+        )
         assert find_format(path).name == "glTF splats"
     else:
         vertices, faces = sphere_mesh(2)
@@ -220,4 +243,6 @@ def test_khronos_finds_nothing_wrong(tmp_path: Path, kind: str) -> None:
     # It does not know the extension for splats, whose attributes it takes for misspelt ones. 2 and 3 are remarks.
     worse = [m for m in issues["messages"] if m["severity"] < 2 and EXTENSION not in m["pointer"]]
     assert not worse
-    assert issues["numErrors"] == (len(SPLAT_ATTRIBUTES) if kind == "splats" else 0) and not issues["numWarnings"]
+    assert (
+        issues["numErrors"] == (len(SPLAT_ATTRIBUTES) if kind.endswith("splats") else 0) and not issues["numWarnings"]
+    )
