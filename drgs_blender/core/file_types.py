@@ -55,6 +55,7 @@ READ: dict[str, ReadType] = {
     "compressed PLY": ReadType((".ply",), "surfels"),
     "SPZ": ReadType((".spz",), "surfels"),
     "SOG": ReadType((".sog", ".json"), "surfels"),
+    "streamed SOG": ReadType((".json",), "surfels"),
     "glTF splats": ReadType((".glb", ".gltf"), "surfels"),
     "USD": ReadType((".usd", ".usda", ".usdc", ".usdz"), "surfels"),
     "splat": ReadType((".splat",), "surfels"),

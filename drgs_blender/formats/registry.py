@@ -31,6 +31,7 @@ from .ply import HEADER_LIMIT, parse_header
 from .ply_mesh import read_ply_mesh
 from .scene_mesh import read_scene_mesh, sniff_3mf, sniff_collada
 from .sog import read_sog, sniff_sog
+from .sog_stream import read_streamed_sog, sniff_streamed_sog
 from .spz import read_spz, sniff_spz
 from .stl_off import read_off, read_stl, sniff_off, sniff_stl
 from .tiff import MAGIC as TIFF
@@ -138,6 +139,13 @@ FORMATS: tuple[Format, ...] = (
         sniff_sog,
         read_sog,
         "PlayCanvas, versions 1 and 2, zipped or meta.json beside its pictures; 3D splats, flattened",
+    ),
+    Format(
+        "streamed SOG",
+        sniff_streamed_sog,
+        read_streamed_sog,
+        "PlayCanvas, lod-meta.json with folders of SOG: the finest level of detail; 3D splats, flattened; not the "
+        "environment beside it",
     ),
     Format(
         "glTF splats",

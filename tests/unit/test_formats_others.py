@@ -46,12 +46,11 @@ def node(script: str, *arguments: object) -> str:
     return done.stdout
 
 
-def splat_transform(source: Path, target: Path) -> None:
+def splat_transform(*arguments: Path | str) -> None:
+    """Its command line: inputs with their options, then the output."""
     program = FOLDER / "node_modules" / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
-    done = subprocess.run(
-        ["node", program, "-w", "-g", "cpu", source, target], capture_output=True, text=True, timeout=120
-    )
-    assert not done.returncode and target.exists(), done.stdout[-1000:] + done.stderr[-2000:]
+    done = subprocess.run(["node", program, "-w", "-g", "cpu", *arguments], capture_output=True, text=True, timeout=120)
+    assert not done.returncode and Path(arguments[-1]).exists(), done.stdout[-1000:] + done.stderr[-2000:]
 
 
 # the library of SPZ
