@@ -23,6 +23,10 @@ _SPZ_VERSIONS = (
     ("3", "3", "For programs that do not know version 4"),
     ("2", "2", "For the oldest programs; coarser rotations"),
 )
+_KERNELS = (
+    ("ellipsoid", "Ellipsoids", "Flat 3D Gaussians, which viewers of splats show"),
+    ("surflet", "Surflets", "2D Gaussians, as surfels are; few programs show them yet"),
+)
 _ENDINGS = tuple(dict.fromkeys(e for t in WRITTEN.values() for e in t.extensions))
 #: Endings of what other programs export, or of what is only read. Others may be parts of a name.
 _FOREIGN = {".abc", ".blend", ".bvh", ".drgs", ".fbx", ".mdd", ".pc2", ".svg", ".vdb", ".wrl", ".x3d"}
@@ -68,6 +72,7 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
     spz_version: EnumProperty(
         name="Version", description="Version of the SPZ format", items=_SPZ_VERSIONS, default="auto"
     )
+    kernel: EnumProperty(name="Kernel", description="What a splat is in USD", items=_KERNELS, default="ellipsoid")
     use_animation: BoolProperty(
         name="Animation", description="A file for each frame of the scene; its number ends the name", default=False
     )

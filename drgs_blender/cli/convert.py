@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import UsageError
-from ..core.file_types import SPZ_VERSIONS, Held
+from ..core.file_types import SPZ_VERSIONS, USD_KERNELS, Held
 from ..core.frame_sequences import frame_path
 from ..formats.axes import UP_AXES
 from ..formats.point_cache import SUFFIXES as POINT_CACHES
@@ -27,7 +27,7 @@ from .sampling import int_range
 logger = logging.getLogger(__name__)
 
 #: Options that go to the writers of formats that take them.
-OPTIONS = ("materials", "compress", "spz_version")
+OPTIONS = ("materials", "compress", "spz_version", "kernel")
 EXAMPLES = """examples:
   drgs convert capture.ply capture.spz
   drgs convert helmet.drgs helmet.glb
@@ -81,6 +81,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     formats.add_argument(
         "--spz-version", type=int, choices=SPZ_VERSIONS,
         help="of SPZ: older programs read 2 and 3, of which 2 has coarser rotations; default 4, in glTF 2",
+    )  # fmt: skip
+    formats.add_argument(
+        "--kernel", choices=USD_KERNELS,
+        help="of USD with splats: ellipsoid (default), which viewers show, or surflet, flat as surfels are",
     )  # fmt: skip
     splats = parser.add_argument_group("colour of splats")
     splats.add_argument(

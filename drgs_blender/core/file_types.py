@@ -77,12 +77,15 @@ READ: dict[str, ReadType] = {
 #: Versions of SPZ that are read and written; the last one is written unless asked otherwise.
 SPZ_VERSIONS = (2, 3, 4)
 
+#: Kernels of splats in USD; the first one is written unless asked otherwise.
+USD_KERNELS = ("ellipsoid", "surflet")
+
 WRITTEN: dict[str, WriteType] = {
     "3DGS PLY": WriteType((".ply",), "splats", "z", False, ("materials",)),
     "SPZ": WriteType((".spz",), "splats", "y", True, ("spz_version",)),
     "SOG": WriteType((".sog",), "splats", "z", False),
     "glTF splats": WriteType((".glb",), "splats", "y", True, ("materials", "compress", "spz_version")),
-    "USD splats": WriteType((".usd", ".usda", ".usdc"), "splats", "z", True, ("materials",)),
+    "USD splats": WriteType((".usd", ".usda", ".usdc"), "splats", "z", True, ("materials", "kernel")),
     "glTF mesh": WriteType((".glb",), "mesh", "y", True),
     "USD mesh": WriteType((".usdz",), "mesh", "z", True),
     "OpenEXR": WriteType((".exr",), "environment", "z", True),

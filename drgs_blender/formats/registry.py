@@ -157,8 +157,8 @@ FORMATS: tuple[Format, ...] = (
         "USD",
         sniff_usd,
         read_usd_splats,
-        "ParticleField3DGaussianSplat; 3D splats, flattened; turned to Z up on import; a .usdz reads no file "
-        "but itself; needs usd-core",
+        "ParticleField3DGaussianSplat, 3D splats, flattened; fields of Gaussian surflets; turned to Z up on import; a "
+        ".usdz reads no file but itself; needs usd-core",
         MESHES,
     ),
     Format("splat", sniff_splat, read_splat, "32 bytes a splat; 3D splats, flattened"),

@@ -16,6 +16,13 @@ from .subprocess_reader import limit, write_arrays
 Array = np.ndarray
 
 SCHEMA = "ParticleField3DGaussianSplat"
+#: A field of particles of any kernel, the two kernels that are Gaussian, and the APIs of such a field's attributes.
+FIELD = "ParticleField"
+ELLIPSOID, SURFLET = "ParticleFieldKernelGaussianEllipsoidAPI", "ParticleFieldKernelGaussianSurfletAPI"
+_KERNEL = "ParticleFieldKernel"
+ATTRIBUTES = tuple(
+    f"ParticleField{name}AttributeAPI" for name in ("Position", "Orientation", "Scale", "Opacity", "SphericalHarmonics")
+)
 DEGREE = "radiance:sphericalHarmonicsDegree"
 HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 #: Attribute of UsdColorSpaceAPI, and how the names of linear light with our primaries start.
@@ -46,7 +53,7 @@ def read_stage(subject: str, usd: Any, geometry: Any) -> dict[str, Array]:
     """Arrays of each piece, "0/centre" and so on, at the earliest time, with its matrix to the stage in metres."""
     package = _check_package(subject)
     stage = usd.Stage.Open(subject)
-    prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == SCHEMA]
+    prims = [prim for prim in stage.Traverse() if prim.GetTypeName() in (SCHEMA, FIELD)]
     if not prims:
         raise AssetError(subject, NO_SPLATS)
     time = usd.TimeCode.EarliestTime()
@@ -58,6 +65,7 @@ def read_stage(subject: str, usd: Any, geometry: Any) -> dict[str, Array]:
     for i, prim in enumerate(prims):
         # USD's matrices take rows for vectors.
         arrays[f"{i}/matrix"] = metres @ np.array(places.GetLocalToWorldTransform(prim), np.float64).T
+        arrays[f"{i}/flat"] = np.array([_is_flat(prim, subject)])
         arrays[f"{i}/linear"] = np.array([_space(prim).startswith(LINEAR)])
         splats = _splats(prim, time, subject)
         room -= sum(array.nbytes for array in splats.values())
@@ -100,6 +108,15 @@ def _outer(identifier: str) -> str:
     from pxr import Ar
 
     return os.path.realpath(Ar.SplitPackageRelativePathOuter(identifier)[0])
+
+
+def _is_flat(prim: Any, subject: str) -> bool:
+    """Whether the kernel is a surflet: a Gaussian in the plane of X and Y, whatever the scale along Z."""
+    kernels = [str(name) for name in prim.GetAppliedSchemas() if str(name).startswith(_KERNEL)]
+    kernel = next((name for name in kernels if name != f"{_KERNEL}BaseAPI"), "none")  # the strongest comes first
+    if kernel not in (ELLIPSOID, SURFLET):
+        raise AssetError(subject, f"has {prim.GetPath()} with the kernel {kernel}; Gaussian ones are read")
+    return kernel == SURFLET
 
 
 def _space(prim: Any) -> str:

@@ -126,7 +126,8 @@ WRITERS: tuple[Writer, ...] = (
     Writer(
         "USD splats",
         write_usd_splats,
-        "everything, as ParticleField3DGaussianSplat and 32-bit numbers; needs usd-core",
+        "everything, as ParticleField3DGaussianSplat and 32-bit numbers, or with `--kernel surflet` as flat as surfels "
+        "are ([surflets](#drafts)); needs usd-core",
         _MATERIALS,
     ),
     Writer(

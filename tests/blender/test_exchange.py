@@ -168,6 +168,7 @@ def test_the_dialogs_show_what_goes_with_the_format(ball, scene):
         ("SPZ", {"samples", "scale", "use_selection", "frame_end", "spz_version"}, {"up"}),
         ("3DGS PLY", {"up", "colour", "materials"}, {"spz_version"}),
         ("glTF splats", {"materials", "compress", "spz_version"}, {"up"}),
+        ("USD splats", {"materials", "kernel"}, {"compress", "spz_version"}),
         ("glTF mesh", {"scale"}, {"colour", "up"}),
         ("OpenEXR", {"format"}, {"scale", "use_selection", "colour"}),
     ):

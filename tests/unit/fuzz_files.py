@@ -43,6 +43,7 @@ from drgs_blender.formats.gltf_splats import write_gltf_splats
 from drgs_blender.formats.registry import read
 from drgs_blender.formats.splat_ply import write_splat_ply
 from drgs_blender.formats.splats import SplatMaterials
+from drgs_blender.formats.usd_splats import write_usd_splats
 from drgs_blender.formats.writers import WRITERS
 from drgs_blender.render.film.frame_files import read_frame, write_frame
 
@@ -111,6 +112,8 @@ def kinds() -> dict[str, Callable[[], Kind]]:
     for suffix, write in ((".ply", write_splat_ply), (".glb", write_gltf_splats)):
         of = partial(write, materials=True)
         made[f"materials{suffix}"] = lambda w=of, n=f"a{suffix}": Kind(n, {"file": written(w, n, lit)})
+    surflets = partial(write_usd_splats, kernel="surflet")
+    made["surflets.usda"] = lambda: Kind("a.usda", {"file": written(surflets, "a.usda", splats)})
     packed = partial(write_gltf_splats, compress=True)
     made["packed.glb"] = lambda: Kind("a.glb", {"file": written(packed, "a.glb", splats)})
     for version in (2, 3):
