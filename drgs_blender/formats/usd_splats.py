@@ -58,7 +58,7 @@ def read_usd_splats(path: Path) -> SurfelFile:
         of = {name: arrays[f"{i}/{name}"] for name in ("centre", "scale", "rotation", "opacity", "sh")}
         values = [arrays[f"{i}/{name}"] for name in MATERIALS if f"{i}/{name}" in arrays]
         materials = SplatMaterials(*values) if len(values) == len(MATERIALS) else None
-        if arrays[f"{i}/flat"][0]:
+        if f"{i}/flat" in arrays:
             of["scale"] = np.column_stack([of["scale"][:, :2], THICKNESS * of["scale"][:, :2].min(axis=1)])
         pieces.append(Piece(Splats(**of, materials=materials), arrays[f"{i}/matrix"], bool(arrays[f"{i}/linear"][0])))
     return join_pieces(pieces, path, "USD", up if up in UP_AXES else "y")

@@ -65,7 +65,8 @@ def read_stage(subject: str, usd: Any, geometry: Any) -> dict[str, Array]:
     for i, prim in enumerate(prims):
         # USD's matrices take rows for vectors.
         arrays[f"{i}/matrix"] = metres @ np.array(places.GetLocalToWorldTransform(prim), np.float64).T
-        arrays[f"{i}/flat"] = np.array([_is_flat(prim, subject)])
+        if _is_flat(prim, subject):
+            arrays[f"{i}/flat"] = np.array([True])
         arrays[f"{i}/linear"] = np.array([_space(prim).startswith(LINEAR)])
         splats = _splats(prim, time, subject)
         room -= sum(array.nbytes for array in splats.values())
