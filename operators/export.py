@@ -17,6 +17,16 @@ from .scene_frames import NUMBER, SceneFrames, draw_colour
 _HELD = {"splats": "Splats", "mesh": "Mesh with materials", "environment": "The World"}
 # Blender evaluates annotations apart from this module: no loops in them.
 _FORMATS = tuple((name, f"{name} ({t.extensions[0]})", _HELD[t.kind]) for name, t in WRITTEN.items())
+_SPZ_VERSIONS = (
+    ("auto", "Default", "4 in SPZ files, 2 in glTF"),
+    ("4", "4", "The newest; smallest and read fastest"),
+    ("3", "3", "For programs that do not know version 4"),
+    ("2", "2", "For the oldest programs; coarser rotations"),
+)
+_KERNELS = (
+    ("ellipsoid", "Ellipsoids", "Flat 3D Gaussians, which viewers of splats show"),
+    ("surflet", "Surflets", "2D Gaussians, as surfels are; few programs show them yet"),
+)
 _ENDINGS = tuple(dict.fromkeys(e for t in WRITTEN.values() for e in t.extensions))
 #: Endings of what other programs export, or of what is only read. Others may be parts of a name.
 _FOREIGN = {".abc", ".blend", ".bvh", ".drgs", ".fbx", ".mdd", ".pc2", ".svg", ".vdb", ".wrl", ".x3d"}
@@ -51,6 +61,18 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
         items=UP_ITEMS,
         default="auto",
     )
+    materials: BoolProperty(
+        name="Materials",
+        description="Albedo, roughness, metallic and normals of the splats, too, for programs that light them",
+        default=False,
+    )
+    compress: BoolProperty(
+        name="Compress", description="Pack the splats of a glTF as SPZ, which not every viewer unpacks", default=False
+    )
+    spz_version: EnumProperty(
+        name="Version", description="Version of the SPZ format", items=_SPZ_VERSIONS, default="auto"
+    )
+    kernel: EnumProperty(name="Kernel", description="What a splat is in USD", items=_KERNELS, default="ellipsoid")
     use_animation: BoolProperty(
         name="Animation", description="A file for each frame of the scene; its number ends the name", default=False
     )
@@ -90,6 +112,8 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
                 layout.prop(self, "up")
         if kind.kind == "splats":
             draw_colour(layout, self)
+        for option in _options(self):
+            layout.prop(self, option)
         layout.prop(self, "use_animation")
         if self.use_animation:
             column = layout.column(align=True)
@@ -114,10 +138,21 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
             arguments = self.describe(context, target, kind.kind, frames)
         if kind.kind != "environment":
             arguments.append(f"--scale={self.scale:.9g}")
+        for option in _options(self):
+            value = getattr(self, option)
+            if value not in (False, "auto"):
+                name = f"--{option.replace('_', '-')}"
+                arguments.append(name if value is True else f"{name}={value}")
         if not kind.fixed and self.up != "auto":
             arguments.append(f"--up={self.up}")
         files = [frame_path(str(target), n) for n in ([context.scene.frame_current] if frames is None else frames)]
         return self.start(context, arguments, target.name, f"Writing {target.name}", "could not be written", files)
+
+
+def _options(operator: DRGS_OT_export) -> list[str]:
+    """Options of the chosen format; that of SPZ in glTF only where there is some."""
+    names = WRITTEN[operator.format].options
+    return [n for n in names if n != "spz_version" or operator.format == "SPZ" or operator.compress]
 
 
 CLASSES = (DRGS_OT_export,)

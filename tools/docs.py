@@ -36,7 +36,8 @@ NAVIGATION = {
         *("docs/gpu.md", "docs/benchmarks.md"),
     ),
     "Formats and farm": (
-        *("docs/formats.md", "docs/asset-format.md", "docs/farm/nodes.md", "docs/farm/slurm.md"),
+        *("docs/formats.md", "docs/relightable-splats.md", "docs/asset-format.md"),
+        *("docs/farm/nodes.md", "docs/farm/slurm.md"),
         *("docs/farm/openjd.md", "docs/farm/flamenco.md"),
     ),
     "Internals": (

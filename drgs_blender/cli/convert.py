@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import UsageError
-from ..core.file_types import Held
+from ..core.file_types import SPZ_VERSIONS, USD_KERNELS, Held
 from ..core.frame_sequences import frame_path
 from ..formats.axes import UP_AXES
 from ..formats.point_cache import SUFFIXES as POINT_CACHES
@@ -26,6 +26,8 @@ from .sampling import int_range
 
 logger = logging.getLogger(__name__)
 
+#: Options that go to the writers of formats that take them.
+OPTIONS = ("materials", "compress", "spz_version", "kernel")
 EXAMPLES = """examples:
   drgs convert capture.ply capture.spz
   drgs convert helmet.drgs helmet.glb
@@ -35,7 +37,9 @@ EXAMPLES = """examples:
   drgs convert robot.drgs robot.pc2 --vertices source.mdd
   drgs convert 'in/####.ply' 'out/####.spz' --frames
   drgs convert splats.spz splats.ply --up=-y
+  drgs convert splats.ply splats.spz --spz-version 3
   drgs convert lego.drgs light.exr
+  drgs convert helmet.drgs helmet.glb --as splats --materials
 """
 
 
@@ -64,6 +68,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--frames", nargs="?", const="",
         help="frames, one file each: #### in IN, OUT and V becomes the number; 1-24, or nothing for those of IN or V",
+    )  # fmt: skip
+    formats = parser.add_argument_group("what single formats leave open")
+    formats.add_argument(
+        "--materials", action="store_true",
+        help="of PLY, glTF and USD with splats: add albedo, roughness, metallic, normals (docs/relightable-splats.md)",
+    )  # fmt: skip
+    formats.add_argument(
+        "--compress", action="store_true",
+        help="of glTF with splats: pack them as SPZ (KHR_gaussian_splatting_compression_spz_2)",
+    )  # fmt: skip
+    formats.add_argument(
+        "--spz-version", type=int, choices=SPZ_VERSIONS,
+        help="of SPZ: older programs read 2 and 3, of which 2 has coarser rotations; default 4, in glTF 2",
+    )  # fmt: skip
+    formats.add_argument(
+        "--kernel", choices=USD_KERNELS,
+        help="of USD with splats: ellipsoid (default), which viewers show, or surflet, flat as surfels are",
     )  # fmt: skip
     splats = parser.add_argument_group("colour of splats")
     splats.add_argument(
@@ -170,6 +191,7 @@ def convert(args: argparse.Namespace) -> None:
     kind = writer.kind
     if writer.fixed and args.up not in (None, writer.up):
         raise UsageError("--up", f"is {args.up}, but {writer.name} is {writer.up} up", "Leave --up out")
+    options = writer.chosen({name: getattr(args, name) for name in OPTIONS})
     check_writable(args.output, (args.input, args.vertices, args.env))
     up = args.up or writer.up
     if kind == "environment":
@@ -195,7 +217,8 @@ def convert(args: argparse.Namespace) -> None:
         from ..formats.splats import scaled, splats_from_z_up
 
         splats, shown = source.splats()
-        writer.write(args.output, splats_from_z_up(scaled(splats, args.scale), up))
-        print(f"{args.output}: {len(splats)} splats, {writer.name}, {up} up, showing the {shown}")
+        writer.write(args.output, splats_from_z_up(scaled(splats, args.scale), up), **options)
+        extra = ", with materials" if args.materials else ""
+        print(f"{args.output}: {len(splats)} splats, {writer.name}, {up} up, showing the {shown}{extra}")
     for note in source.notes:
         print(f"  {note}")

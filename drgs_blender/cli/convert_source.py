@@ -80,7 +80,8 @@ def open_source(args: argparse.Namespace) -> Source:
     if isinstance(file, SurfelFile):
         surfels = surfels_to_z_up(file.surfels, args.from_up or file.up or "z")
         # Splats go out as they came in, unless it is their albedo that is wanted.
-        notes = [note for note in file.notes if args.colour == "albedo" or note not in file.assumed]
+        bare = args.colour != "albedo" and not args.materials
+        notes = [note for note in file.notes if not (bare and note in file.assumed)]
         return AssetSource(args, Asset(surfels, Mesh.empty()), notes)
     if isinstance(file, EnvironmentFile):
         return AssetSource(args, Asset(_nothing(), Mesh.empty(), environment=file.environment), file.notes)

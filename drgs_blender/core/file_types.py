@@ -39,12 +39,15 @@ class WriteType:
         The up axis that the format prescribes, or that is written unless asked otherwise.
     fixed : bool
         No other up axis can be asked for.
+    options : tuple of str
+        Options of `drgs convert` that it takes, as keywords of its writer.
     """
 
     extensions: tuple[str, ...]
     kind: Held
     up: Literal["z", "y"]
     fixed: bool
+    options: tuple[str, ...] = ()
 
 
 READ: dict[str, ReadType] = {
@@ -52,6 +55,7 @@ READ: dict[str, ReadType] = {
     "compressed PLY": ReadType((".ply",), "surfels"),
     "SPZ": ReadType((".spz",), "surfels"),
     "SOG": ReadType((".sog", ".json"), "surfels"),
+    "streamed SOG": ReadType((".json",), "surfels"),
     "glTF splats": ReadType((".glb", ".gltf"), "surfels"),
     "USD": ReadType((".usd", ".usda", ".usdc", ".usdz"), "surfels"),
     "splat": ReadType((".splat",), "surfels"),
@@ -70,12 +74,18 @@ READ: dict[str, ReadType] = {
     "NeRO materials": ReadType((".npy",), "materials"),
 }
 
+#: Versions of SPZ that are read and written; the last one is written unless asked otherwise.
+SPZ_VERSIONS = (2, 3, 4)
+
+#: Kernels of splats in USD; the first one is written unless asked otherwise.
+USD_KERNELS = ("ellipsoid", "surflet")
+
 WRITTEN: dict[str, WriteType] = {
-    "3DGS PLY": WriteType((".ply",), "splats", "z", False),
-    "SPZ": WriteType((".spz",), "splats", "y", True),
+    "3DGS PLY": WriteType((".ply",), "splats", "z", False, ("materials",)),
+    "SPZ": WriteType((".spz",), "splats", "y", True, ("spz_version",)),
     "SOG": WriteType((".sog",), "splats", "z", False),
-    "glTF splats": WriteType((".glb",), "splats", "y", True),
-    "USD splats": WriteType((".usd", ".usda", ".usdc"), "splats", "z", True),
+    "glTF splats": WriteType((".glb",), "splats", "y", True, ("materials", "compress", "spz_version")),
+    "USD splats": WriteType((".usd", ".usda", ".usdc"), "splats", "z", True, ("materials", "kernel")),
     "glTF mesh": WriteType((".glb",), "mesh", "y", True),
     "USD mesh": WriteType((".usdz",), "mesh", "z", True),
     "OpenEXR": WriteType((".exr",), "environment", "z", True),

@@ -21,14 +21,16 @@ from .axes import FARTHEST, multiply_quaternions
 from .files import SurfelFile
 from .harmonics import SH_C0
 from .ply import Header, Rows, read_ply
+from .ply_columns import Columns, beside, extra_columns, sanitised, stack
 
 Array = np.ndarray
-Columns = dict[str, Array]
 
 #: A splat whose shortest axis is more than this part of the next one is not nearly a surfel.
 FLAT = 0.3
 #: Largest SH degree in use has 16 coefficients; more is damage.
 SH_LIMIT = 64
+#: Materials of files that have none.
+ROUGHNESS, METALLIC = 0.5, 0.0
 #: Noted of a file without materials.
 CAPTURED_ALBEDO = (
     "albedo is the captured colour, with the light of the capture in it; `drgs import ... --env E.hdr --remove-light` "
@@ -65,6 +67,8 @@ class Layout:
         The albedo is sRGB-encoded after activation.
     known : str
         Other properties whose meaning is known, as a regular expression (kept in the extras, not "unknown").
+    derived : tuple of str
+        Properties that say again what others do.
     note : str
         Shown to the user.
     """
@@ -77,6 +81,7 @@ class Layout:
     metallic: Channel | None = None
     srgb: bool = False
     known: str = r"(?!)"
+    derived: tuple[str, ...] = ()
     note: str = ""
 
     def fits(self, names: set[str]) -> bool:
@@ -84,9 +89,18 @@ class Layout:
         return names.issuperset(self.has) and names.isdisjoint(self.lacks)
 
 
+def unit_range(x: Array) -> Array:
+    """Values that are activated already."""
+    return np.clip(x, 0.0, 1.0)
+
+
 def _three(prefix: str) -> tuple[str, ...]:
     return tuple(f"{prefix}{i}" for i in range(3))
 
+
+#: What splats of our own have besides those of 3DGS.
+OWN_ALBEDO, OWN_NUMBERS = ("albedo_r", "albedo_g", "albedo_b"), ("roughness", "metallic")
+OWN_NORMAL = ("nx", "ny", "nz")
 
 _BASE_COLOUR = _three("base_color_")
 _PLAIN = Channel(_BASE_COLOUR)
@@ -94,6 +108,15 @@ _NARROWED = Channel(_BASE_COLOUR, lambda x: 0.77 * sigmoid(x) + 0.03)
 
 #: Layouts in order of detection. GaussianMesh keeps its position relative to a face, see `_decode_face_positions`.
 LAYOUTS: tuple[Layout, ...] = (
+    Layout(
+        "DR-GS",
+        has=(*OWN_ALBEDO, *OWN_NUMBERS),
+        albedo=Channel(OWN_ALBEDO, unit_range),
+        roughness=Channel(OWN_NUMBERS[:1], unit_range),
+        metallic=Channel(OWN_NUMBERS[1:], unit_range),
+        derived=OWN_NORMAL,
+        note="materials as they are, linear (docs/relightable-splats.md)",
+    ),
     Layout(
         "Ref-Gaussian",
         has=("refl_strength",),
@@ -188,7 +211,7 @@ def decode_splats(header: Header, rows: Rows | None, subject: str, sh: Array | N
     layout = find_layout(names)
     notes = [layout.note] if layout.note else []
     assumed: list[str] = []
-    used = {*_GEOMETRY}
+    used = {*_GEOMETRY, *layout.derived}
 
     def take(wanted: tuple[str, ...]) -> Array:
         if missing := [n for n in wanted if n not in names]:
@@ -210,11 +233,11 @@ def decode_splats(header: Header, rows: Rows | None, subject: str, sh: Array | N
             sh = _harmonics(columns, names, used, subject)
         material = {
             "albedo": _albedo(layout, take, sh, assumed),
-            "roughness": _scalar(layout.roughness, take, 0.5, len(centre)),
-            "metallic": _scalar(layout.metallic, take, 0.0, len(centre)),
+            "roughness": _scalar(layout.roughness, take, ROUGHNESS, len(centre)),
+            "metallic": _scalar(layout.metallic, take, METALLIC, len(centre)),
         }
     if layout.roughness is None:
-        assumed.append("has no materials: roughness 0.5 and metallic 0 are used")
+        assumed.append(f"has no materials: roughness {ROUGHNESS:g} and metallic {METALLIC:g} are used")
     if axes.shape[1] == 3:
         extras["thickness"] = axes.min(axis=1)
         rotation, axes = _flatten(rotation, axes, assumed)
@@ -227,7 +250,7 @@ def decode_splats(header: Header, rows: Rows | None, subject: str, sh: Array | N
     near = np.abs(centre) <= FARTHEST
     if not near.all():
         finite &= near.all(axis=1)
-    extras |= _extras(columns, names - used)
+    extras |= extra_columns(columns, names - used)
     keep: Array | slice = slice(None)
     if dropped := int(np.count_nonzero(~finite)):
         keep = finite
@@ -243,33 +266,9 @@ def decode_splats(header: Header, rows: Rows | None, subject: str, sh: Array | N
         opacity[keep],
         **{name: array[keep] for name, array in material.items()},
         sh=None if sh is None else sh[keep],
-        extras=_sanitised({name: array[keep] for name, array in extras.items()}, notes),
+        extras=sanitised({name: array[keep] for name, array in extras.items()}, notes),
     )
     return SurfelFile(surfels, layout.name, unknown, notes, assumed=assumed)
-
-
-def stack(columns: Columns, names: tuple[str, ...]) -> Array:
-    """Columns side by side as (n, len(names)) float32."""
-    result = np.empty((len(columns[names[0]]), len(names)), np.float32)
-    beside = _beside(columns, names)
-    if beside is not None:
-        result[:] = beside
-    else:
-        for i, name in enumerate(names):
-            result[:, i] = columns[name]
-    return result
-
-
-def _beside(columns: Columns, names: tuple[str, ...]) -> Array | None:
-    """Columns that are neighbours in the file as one view of it, which is passed over once; None where they are not."""
-    arrays = [columns[name] for name in names]
-    first = arrays[0]
-    if not all(a.dtype == np.float32 and a.strides == first.strides for a in arrays):
-        return None
-    if not all(a.ctypes.data == first.ctypes.data + 4 * i for i, a in enumerate(arrays)):
-        return None
-    shape = (len(first), len(names))
-    return np.lib.stride_tricks.as_strided(first, shape, (*first.strides, 4), writeable=False)
 
 
 def _albedo(layout: Layout, take: Callable[[tuple[str, ...]], Array], sh: Array | None, notes: list[str]) -> Array:
@@ -303,10 +302,10 @@ def _harmonics(columns: Columns, names: set[str], used: set[str], subject: str) 
     sh = np.empty((len(columns["x"]), 1 + per_channel, 3), np.float32)
     sh[:, 0] = stack(columns, dc)
     if rest:
-        beside = _beside(columns, tuple(rest))
+        side = beside(columns, tuple(rest))
         for channel in range(3):
             names_of = slice(channel * per_channel, (channel + 1) * per_channel)
-            sh[:, 1:, channel] = stack(columns, tuple(rest[names_of])) if beside is None else beside[:, names_of]
+            sh[:, 1:, channel] = stack(columns, tuple(rest[names_of])) if side is None else side[:, names_of]
     return sh
 
 
@@ -347,35 +346,3 @@ def _decode_face_positions(columns: Columns, centre: Array, notes: list[str]) ->
 
 def _corner_names(k: int) -> tuple[tuple[str, str, str], ...]:
     return (f"v{k}x", f"v{k}y", f"v{k}z"), (f"v{k}_x", f"v{k}_y", f"v{k}_z"), (f"v{k}_0", f"v{k}_1", f"v{k}_2")
-
-
-def _extras(columns: Columns, names: set[str]) -> dict[str, Array]:
-    """Properties that a surfel cannot hold; normals and numbered ones (a_0, a_1, ...) joined into one array each."""
-    families: dict[str, list[tuple[int, str]]] = {}
-    for name in names:
-        match = re.fullmatch(r"(.+?)_?(\d{1,6})", name)
-        if match and match[1] not in names and not re.fullmatch("n[xyz]", match[1]):
-            families.setdefault(match[1], []).append((int(match[2]), name))
-    groups = {key: tuple(n for _, n in sorted(found)) for key, found in families.items() if len(found) > 1}
-    for suffix in ("", "2"):
-        axes = (f"nx{suffix}", f"ny{suffix}", f"nz{suffix}")
-        if names.issuperset(axes):
-            groups[f"normal{suffix}"] = axes
-    grouped = {name for members in groups.values() for name in members}
-    groups |= {name: (name,) for name in names - grouped}
-    extras: dict[str, Array] = {}
-    for key, members in sorted(groups.items()):
-        values = stack(columns, members)
-        if values.any():  # 3DGS and others write normals that are always zero
-            extras[key] = values if len(members) > 1 else values[:, 0]
-    return extras
-
-
-def _sanitised(extras: dict[str, Array], notes: list[str]) -> dict[str, Array]:
-    """Extras with non-finite values set to 0, and said so."""
-    for name, values in extras.items():
-        bad = ~np.isfinite(values)
-        if bad.any():
-            notes.append(f"{int(bad.sum())} values of {name} that were NaN or infinite set to 0")
-            values[bad] = 0.0
-    return extras

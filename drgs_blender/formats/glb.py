@@ -69,6 +69,17 @@ class Glb:
         self._accessors.append(entry)
         return len(self._accessors) - 1
 
+    def placeholder(self, count: int, width: int, bounds: tuple[Array, Array] | None = None) -> int:
+        """Index of a new accessor of `count` float32 rows without data: an extension provides it.
+
+        `bounds` are the least and greatest values (width,), which positions must have.
+        """
+        entry: dict[str, Any] = {"componentType": _COMPONENTS["f4"], "count": count, "type": _TYPES[width]}
+        if bounds is not None:
+            entry |= {"min": bounds[0].tolist(), "max": bounds[1].tolist()}
+        self._accessors.append(entry)
+        return len(self._accessors) - 1
+
     def write(self, path: Path) -> None:
         """Write the file.
 

@@ -136,6 +136,11 @@ class Document:
             return np.maximum(values.astype(np.float32) / np.float32(np.iinfo(dtype).max), -1.0)
         return values
 
+    def view(self, index: Any) -> tuple[Array, tuple[int, int]]:
+        """Bytes of a buffer view, uint8, and the place in which they start: (buffer, byte)."""
+        start, stop, buffer, _ = self._view(index)
+        return buffer[start:stop], (self.index(self.item("bufferViews", index), "buffer") or 0, start)
+
     def image(self, index: Any) -> tuple[bytes, str]:
         """(encoded bytes, name for messages) of an image."""
         entry = self.item("images", index)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core.errors import AssetError
 from .files import SurfelFile
-from .gaussian_ply import SH_C0, decode_splats
+from .gaussian_ply import OWN_ALBEDO, OWN_NUMBERS, SH_C0, decode_splats
 from .ply import Element, Header, Property, Rows, read_ply
 from .quaternions import from_smallest_three
 
@@ -136,11 +136,19 @@ def dc_of(colour: Array) -> Array:
 
 
 def decode_arrays(
-    position: Array, scale: Array, rotation: Array, opacity: Array, sh: Array, path: Path, layout: str
+    position: Array,
+    scale: Array,
+    rotation: Array,
+    opacity: Array,
+    sh: Array,
+    path: Path,
+    layout: str,
+    materials: tuple[Array, Array, Array] | None = None,
 ) -> SurfelFile:
     """Give the values the names of a 3DGS file and decode that.
 
-    `scale` is logarithmic, `opacity` in [0, 1], `rotation` wxyz, `sh` (n, k, 3) float32.
+    `scale` is logarithmic, `opacity` in [0, 1], `rotation` wxyz, `sh` (n, k, 3) float32, `materials` albedo (n, 3),
+    roughness and metallic in [0, 1].
     """
     clipped = np.clip(opacity.astype(np.float64), 1e-6, 1 - 1e-6)
     columns: dict[str, Array] = {"opacity": np.log(clipped / (1 - clipped)).astype(np.float32)}
@@ -149,10 +157,13 @@ def decode_arrays(
         (("scale_0", "scale_1", "scale_2"), scale),
         (("rot_0", "rot_1", "rot_2", "rot_3"), rotation),
     ]
+    if materials is not None:
+        groups += [(OWN_ALBEDO, materials[0]), (OWN_NUMBERS, np.stack(materials[1:], axis=1))]
     for names, values in groups:
         table = np.ascontiguousarray(values, np.float32)
         columns |= {name: table[:, i] for i, name in enumerate(names)}
     element = Element("vertex", len(position), tuple(Property(name, "f4") for name in columns))
     file = decode_splats(Header((element,), "<", 0), Rows(element, columns), str(path), sh)
-    file.layout = layout
+    if materials is None:  # else the layout is that of splats with materials
+        file.layout = layout
     return file

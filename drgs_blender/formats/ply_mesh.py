@@ -10,8 +10,8 @@ from ..compute.jit import njit
 from ..core.color import srgb_to_linear, to_unit
 from ..core.errors import AssetError
 from .files import MeshFile
-from .gaussian_ply import stack
 from .ply import Rows, read_ply
+from .ply_columns import stack
 
 Array = np.ndarray
 

@@ -14,6 +14,7 @@ import numpy as np
 from ..core.asset import Environment
 from ..core.errors import AssetError
 from ..core.file_types import READ, Kind
+from .drafts import DRAFTS
 from .environment import read_exr_environment, read_hdr_environment, read_picture_environment
 from .files import EnvironmentFile, MaterialsFile, MeshFile, SurfelFile
 from .gaussian_ply import LAYOUTS, is_gaussian, read_gaussian_ply
@@ -30,6 +31,7 @@ from .ply import HEADER_LIMIT, parse_header
 from .ply_mesh import read_ply_mesh
 from .scene_mesh import read_scene_mesh, sniff_3mf, sniff_collada
 from .sog import read_sog, sniff_sog
+from .sog_stream import read_streamed_sog, sniff_streamed_sog
 from .spz import read_spz, sniff_spz
 from .stl_off import read_off, read_stl, sniff_off, sniff_stl
 from .tiff import MAGIC as TIFF
@@ -139,17 +141,24 @@ FORMATS: tuple[Format, ...] = (
         "PlayCanvas, versions 1 and 2, zipped or meta.json beside its pictures; 3D splats, flattened",
     ),
     Format(
+        "streamed SOG",
+        sniff_streamed_sog,
+        read_streamed_sog,
+        "PlayCanvas, lod-meta.json with folders of SOG: the finest level of detail; 3D splats, flattened; not the "
+        "environment beside it",
+    ),
+    Format(
         "glTF splats",
         lambda head, path: _sniff_gltf(head, path) and has_splats(head),
         read_gltf_splats,
-        "KHR_gaussian_splatting; 3D splats, flattened; Y up, turned to Z up on import; not compressed ones",
+        "KHR_gaussian_splatting, also packed as SPZ; 3D splats, flattened; Y up, turned to Z up on import",
     ),
     Format(
         "USD",
         sniff_usd,
         read_usd_splats,
-        "ParticleField3DGaussianSplat; 3D splats, flattened; turned to Z up on import; a .usdz reads no file "
-        "but itself; needs usd-core",
+        "ParticleField3DGaussianSplat, 3D splats, flattened; fields of Gaussian surflets; turned to Z up on import; a "
+        ".usdz reads no file but itself; needs usd-core",
         MESHES,
     ),
     Format("splat", sniff_splat, read_splat, "32 bytes a splat; 3D splats, flattened"),
@@ -356,6 +365,10 @@ def document() -> str:
             f"| {w.kept} | {w.lost} |"
             for w in WRITERS
         ),
+        "",
+        "## Drafts",
+        "",
+        *DRAFTS,
         "",
         "## Gaussian PLY layouts",
         "",

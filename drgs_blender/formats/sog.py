@@ -22,6 +22,7 @@ from .gltf_document import is_name
 from .images import decode_image
 from .packed_splats import decode_arrays
 from .quaternions import from_smallest_three
+from .splats import Splats
 
 Array = np.ndarray
 
@@ -49,21 +50,33 @@ def read_sog(path: Path) -> SurfelFile:
     AssetError
         Something in it is missing or damaged.
     """
-    with _Files(path) as files:
-        meta = _Meta(files, str(path))
-        return meta.decode(path)
+    with _Files(path, str(path)) as files:
+        return decode_arrays(*_Meta(files, str(path)).values(), path, "SOG")
+
+
+def sog_splats(path: Path, subject: str) -> Splats:
+    """The splats of a SOG file, which errors call `subject`. Raises what `read_sog` does."""
+    with _Files(path, subject) as files:
+        centre, scale, rotation, opacity, sh = _Meta(files, subject).values()
+    with np.errstate(over="ignore"):  # what is not finite is dropped where splats are decoded
+        return Splats(centre, np.exp(scale), rotation, opacity, sh)
 
 
 class _Files:
     """The files of a SOG by name, from its zip or its folder."""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.subject = path, str(path)
+    def __init__(self, path: Path, subject: str) -> None:
+        self.path, self.subject = path, subject
         self._zip: zipfile.ZipFile | None = None
 
     def __enter__(self) -> _Files:
-        with open(self.path, "rb") as file:
-            zipped = file.read(4) == _ZIP
+        try:
+            if self.path.exists() and not self.path.is_file():
+                raise AssetError(self.subject, "is not a regular file", _REMEDY)
+            with open(self.path, "rb") as file:
+                zipped = file.read(4) == _ZIP
+        except OSError as error:
+            raise AssetError(self.subject, f"cannot be read ({error.strerror or error})", _REMEDY) from error
         if zipped:
             try:
                 self._zip = zipfile.ZipFile(self.path)
@@ -181,8 +194,8 @@ class _Meta:
         low, high = (self.numbers(entry, key, channels) for key in ("mins", "maxs"))
         return low + (high - low) * (stored / np.float32(255))
 
-    def decode(self, path: Path) -> SurfelFile:
-        """All splats."""
+    def values(self) -> tuple[Array, Array, Array, Array, Array]:
+        """Centres, logarithms of scales, rotations wxyz, opacities and harmonics (n, k, 3) of all splats."""
         low, high = (self._rows(data, "means") for data in self._means)
         start, stop = (self.numbers("means", key, 3) for key in ("mins", "maxs"))
         level = (low[:, :3] + high[:, :3].astype(np.uint16) * 256) / np.float32(65535)
@@ -198,7 +211,7 @@ class _Meta:
         sh = np.empty((self.count, 1 + rest.shape[1], 3), np.float32)
         sh[:, 0], sh[:, 1:] = dc, rest
         scale = self._values("scales", self._bytes("scales")[:, :3])
-        return decode_arrays(centre, scale, self._rotations(), opacity, sh, path, "SOG")
+        return centre, scale, self._rotations(), opacity, sh
 
     def _rotations(self) -> Array:
         """Smallest three of w, x, y, z; the fourth byte is 252 + the largest, anything else no rotation."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +47,8 @@ def join_pieces(pieces: list[Piece], path: Path, layout: str, up: str) -> Surfel
         transformed_pieces = [transformed(piece) for piece in pieces]
     whole = join_splats(transformed_pieces)
     scale = log_scale(whole.scale)
-    file = decode_arrays(whole.centre, scale, whole.rotation, whole.opacity, whole.sh, path, layout)
+    materials = None if whole.materials is None else whole.materials.arrays()
+    file = decode_arrays(whole.centre, scale, whole.rotation, whole.opacity, whole.sh, path, layout, materials)
     file.up = up
     if any(piece.linear for piece in pieces):
         file.notes.append("linear colours encoded as sRGB; where they depend on the direction, to first order")
@@ -60,9 +61,9 @@ def transformed(piece: Piece) -> Splats:
     sh = encoded(own.sh) if piece.linear else own.sh
     linear = matrix[:3, :3]
     if not len(own) or np.array_equal(matrix, np.eye(4)):
-        return Splats(own.centre, own.scale, own.rotation, own.opacity, sh)
+        return replace(own, sh=sh)
     if not (np.abs(matrix) <= FARTHEST).all() or not np.abs(np.linalg.det(linear)) > 0:
-        return Splats(np.full_like(own.centre, np.nan), own.scale, own.rotation, own.opacity, sh)
+        return replace(own, centre=np.full_like(own.centre, np.nan), sh=sh)
     left, size, right = np.linalg.svd(linear)
     turn = left @ right
     centre = (own.centre @ linear.T + matrix[:3, 3]).astype(np.float32)
@@ -77,7 +78,8 @@ def transformed(piece: Piece) -> Splats:
     frame[..., 2] *= np.sign(np.linalg.det(frame))[:, None]
     rotation = Rotation.from_matrix(frame).as_quat()[:, [3, 0, 1, 2]].astype(np.float32)
     rotation[~usable] = np.nan
-    return Splats(centre, scale.astype(np.float32), rotation, own.opacity, rotate_harmonics(sh, turn))
+    colours = rotate_harmonics(sh, turn)
+    return replace(own, centre=centre, scale=scale.astype(np.float32), rotation=rotation, sh=colours)
 
 
 def encoded(sh: Array) -> Array:

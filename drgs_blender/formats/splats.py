@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..core.asset import Surfels
-from ..core.color import linear_to_srgb
+from ..core.color import linear_to_srgb, srgb_to_linear
 from ..core.errors import AssetError
+from ..geometry.normals import rotation_matrices, unit
 from .axes import FARTHEST, from_z_up, multiply_quaternions, scaled_lengths, vectors_from_z_up
-from .gaussian_ply import SH_C0
+from .gaussian_ply import METALLIC, ROUGHNESS, SH_C0
 from .harmonics import rotate_harmonics, whole_bands
 
 Array = np.ndarray
@@ -22,6 +23,27 @@ SHORTEST = 1e-9
 #: Sizes whose logarithm comes back as a number of 32 bits; shorter quaternions are no rotation.
 THINNEST, WIDEST = np.float32(1e-37), np.float32(1e37)
 SHORT = 1e-15
+
+
+@dataclass(slots=True)
+class SplatMaterials:
+    """What light meets on splats; formats keep it as `docs/relightable-splats.md` says.
+
+    Attributes
+    ----------
+    albedo : (n, 3) float32 array
+        In [0, 1], linear Rec.709.
+    roughness, metallic : (n,) float32 array
+        In [0, 1].
+    """
+
+    albedo: Array
+    roughness: Array
+    metallic: Array
+
+    def arrays(self) -> tuple[Array, Array, Array]:
+        """All of it."""
+        return self.albedo, self.roughness, self.metallic
 
 
 @dataclass(slots=True)
@@ -40,6 +62,7 @@ class Splats:
         In [0, 1].
     sh : (n, k, 3) float32 array
         With k = 1, 4, 9 or 16: outgoing colour, display-referred, in the basis and order of 3DGS.
+    materials : SplatMaterials, optional
     """
 
     centre: Array
@@ -47,6 +70,7 @@ class Splats:
     rotation: Array
     opacity: Array
     sh: Array
+    materials: SplatMaterials | None = None
 
     def __len__(self) -> int:
         return len(self.centre)
@@ -75,7 +99,13 @@ def splats_of(surfels: Surfels, colour: Array | None = None) -> Splats:
         scale[:, 2] = scale[:, :2].min(axis=1) * THICKNESS
     else:
         scale[:, 2] = np.maximum(thickness, SHORTEST)
-    return Splats(surfels.centre, scale, surfels.rotation, surfels.opacity, sh)
+    materials = SplatMaterials(surfels.albedo, surfels.roughness, surfels.metallic)
+    return Splats(surfels.centre, scale, surfels.rotation, surfels.opacity, sh, materials)
+
+
+def normals(rotation: Array) -> Array:
+    """(n, 3) unit float32 normals of surfels: the third axes of rotations wxyz (n, 4)."""
+    return unit(rotation_matrices(rotation)[..., 2]).astype(np.float32)
 
 
 def scaled(splats: Splats, factor: float) -> Splats:
@@ -96,7 +126,9 @@ def writable(splats: Splats, subject: str) -> Splats:
     """
     with np.errstate(over="ignore"):
         length = np.linalg.norm(splats.rotation, axis=1)
-    numbers = (splats.centre, splats.scale, splats.rotation, splats.opacity, splats.sh)
+    numbers = [splats.centre, splats.scale, splats.rotation, splats.opacity, splats.sh]
+    if splats.materials is not None:
+        numbers += splats.materials.arrays()
     good = all(np.isfinite(f(array, initial=0)) for array in numbers for f in (np.min, np.max))  # NaN shows in both
     if len(splats) and not (
         good
@@ -112,11 +144,14 @@ def writable(splats: Splats, subject: str) -> Splats:
         splats = replace(splats, opacity=splats.opacity.clip(0, 1))
     if splats.scale.min(initial=1) < THINNEST or splats.scale.max(initial=1) > WIDEST:
         splats = replace(splats, scale=splats.scale.clip(THINNEST, WIDEST))
+    if splats.materials is not None:
+        inside = (array.clip(0, 1).astype(np.float32, copy=False) for array in splats.materials.arrays())
+        splats = replace(splats, materials=SplatMaterials(*inside))
     return splats
 
 
 def join_splats(parts: list[Splats]) -> Splats:
-    """All splats as one, harmonics filled up with zeros."""
+    """All splats as one, harmonics filled up with zeros, materials as `gaussian_ply` assumes them."""
     if len(parts) == 1:
         return parts[0]
     sh = np.zeros((sum(map(len, parts)), max(splats.sh.shape[1] for splats in parts), 3), np.float32)
@@ -128,7 +163,18 @@ def join_splats(parts: list[Splats]) -> Splats:
     def joined(name: str) -> Array:
         return np.concatenate([getattr(splats, name) for splats in parts])
 
-    return Splats(joined("centre"), joined("scale"), joined("rotation"), joined("opacity"), sh)
+    materials = None
+    if any(splats.materials is not None for splats in parts):
+        columns = zip(*((splats.materials or _assumed(splats)).arrays() for splats in parts), strict=True)
+        materials = SplatMaterials(*(np.concatenate(column) for column in columns))
+    return Splats(joined("centre"), joined("scale"), joined("rotation"), joined("opacity"), sh, materials)
+
+
+def _assumed(splats: Splats) -> SplatMaterials:
+    """Materials of splats that have none: the albedo is their mean colour."""
+    albedo = srgb_to_linear(np.clip(0.5 + SH_C0 * splats.sh[:, 0], 0.0, 1.0)).astype(np.float32)
+    numbers = (np.full(len(splats), value, np.float32) for value in (ROUGHNESS, METALLIC))
+    return SplatMaterials(albedo, *numbers)
 
 
 def splats_from_z_up(splats: Splats, up: str) -> Splats:

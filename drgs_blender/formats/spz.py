@@ -13,32 +13,26 @@ from types import ModuleType
 
 import numpy as np
 
-from ..core.asset.archive import replace_file
 from ..core.errors import AssetError, DeviceError
+from ..core.file_types import SPZ_VERSIONS
 from .files import SurfelFile
 from .packed_splats import decode_arrays
-from .quaternions import from_smallest_three, to_smallest_three
-from .splats import Splats, writable
+from .quaternions import from_smallest_three
+from .splats import Splats
 
 Array = np.ndarray
 
-_MAGIC = b"NGSP"
+MAGIC = b"NGSP"
 _GZIP = b"\x1f\x8b"
-_HEADER, _TABLE = struct.Struct("<4sIIBBBB"), struct.Struct("<QQ")
-_HEADER_4 = 32
+HEADER, TABLE = struct.Struct("<4sIIBBBB"), struct.Struct("<QQ")
+HEADER_4 = 32
 #: Attributes of a splat in file order: positions, opacities, colours, scales, rotations; then the harmonics.
 _BYTES = (9, 1, 3, 3, 4)
 _HARMONICS = (0, 9, 24, 45, 72)
 #: Harmonics of the fixed part of the colour are stored as 0.5 + 0.15 dc, to hold a little more than [0, 1].
-_COLOUR = 0.15
+COLOUR = 0.15
 #: No honest file is more compressed than this: numbers of captured splats look like noise. Deflate reaches 1032.
 _RATIO = 128
-#: Most fractional bits tried for positions; 24 bits hold the whole number.
-_FRACTION = 12
-#: Size below which all are the same, metres.
-_SMALLEST = float(np.exp(-10))
-#: Steps of the harmonics that are written: 5 bits for the first band, 4 for the others, as the reference does.
-_STEPS = (8, 16)
 _STEPS_OF_128 = (np.arange(256, dtype=np.float32) - 128) / 128
 #: The axes that an extension can name, from code 1: where X, Y and Z point (left, right, down, up, back, front).
 _AXES = (
@@ -57,7 +51,7 @@ def sniff_spz(head: bytes, path: Path) -> bool:
             head = zlib.decompressobj(31).decompress(head[:4096], 4)
         except zlib.error:
             return False
-    return head.startswith(_MAGIC)
+    return head.startswith(MAGIC)
 
 
 def read_spz(path: Path) -> SurfelFile:
@@ -70,12 +64,17 @@ def read_spz(path: Path) -> SurfelFile:
     DeviceError
         Version 4 without the package zstandard.
     """
-    data, subject = path.read_bytes(), str(path)
-    if data.startswith(_GZIP):
-        return _decode(_unpack_gzip(data, subject), path)
-    if len(data) >= 8 and struct.unpack_from("<I", data, 4)[0] >= 4:
-        return _decode(_unpack_zstd(data, subject), path)
-    return _decode(_split(data, _header(data, len(data) * _RATIO, subject), subject), path)
+    packed = _unpack(path.read_bytes(), str(path))
+    file = decode_arrays(*_values(packed), path, "SPZ")
+    file.up = packed.up
+    return file
+
+
+def spz_splats(data: bytes, subject: str) -> tuple[Splats, str]:
+    """The splats in the bytes of an SPZ file, in its axes, and its up axis. Raises what `read_spz` does."""
+    packed = _unpack(data, subject)
+    centre, scale, rotation, opacity, sh = _values(packed)
+    return Splats(centre, np.exp(scale), rotation, opacity, sh), packed.up
 
 
 class _Packed:
@@ -87,14 +86,22 @@ class _Packed:
         self.blocks: list[bytes | memoryview] = []
 
 
+def _unpack(data: bytes, subject: str) -> _Packed:
+    if data.startswith(_GZIP):
+        return _unpack_gzip(data, subject)
+    if len(data) >= 8 and struct.unpack_from("<I", data, 4)[0] >= 4:
+        return _unpack_zstd(data, subject)
+    return _split(data, _header(data, len(data) * _RATIO, subject), subject)
+
+
 def _header(data: bytes, limit: int, subject: str) -> _Packed:
     """What the header says; `limit` is the most bytes the attributes can have."""
-    if len(data) < _HEADER.size:
+    if len(data) < HEADER.size:
         raise AssetError(subject, "is truncated within its header", _REMEDY)
-    magic, version, count, degree, fraction, _, _ = _HEADER.unpack_from(data)
-    if magic != _MAGIC:
+    magic, version, count, degree, fraction, _, _ = HEADER.unpack_from(data)
+    if magic != MAGIC:
         raise AssetError(subject, "is no SPZ file", _REMEDY)
-    if not 2 <= version <= 4:
+    if version not in SPZ_VERSIONS:
         raise AssetError(subject, f"is of SPZ version {version}; 2, 3 and 4 are understood", _REMEDY)
     if degree >= len(_HARMONICS) or fraction > 30:
         raise AssetError(subject, f"has harmonics of degree {degree} and {fraction} fractional bits", _REMEDY)
@@ -106,9 +113,9 @@ def _header(data: bytes, limit: int, subject: str) -> _Packed:
 
 def _split(data: bytes, packed: _Packed, subject: str) -> _Packed:
     """Versions 2 and 3: the attributes lie one after the other behind the header."""
-    if len(data) < _HEADER.size + sum(packed.sizes):
+    if len(data) < HEADER.size + sum(packed.sizes):
         raise AssetError(subject, f"is truncated: {packed.count} splats need {sum(packed.sizes)} bytes", _REMEDY)
-    position = _HEADER.size
+    position = HEADER.size
     view = memoryview(data)
     for size in packed.sizes:
         packed.blocks.append(view[position : position + size])
@@ -119,7 +126,7 @@ def _split(data: bytes, packed: _Packed, subject: str) -> _Packed:
 def _unpack_gzip(data: bytes, subject: str) -> _Packed:
     stream = zlib.decompressobj(31)
     try:
-        start = stream.decompress(data, _HEADER.size)
+        start = stream.decompress(data, HEADER.size)
         packed = _header(start, len(data) * _RATIO, subject)
         wanted = sum(packed.sizes)
         rest = stream.decompress(stream.unconsumed_tail, wanted) if wanted else b""
@@ -129,18 +136,18 @@ def _unpack_gzip(data: bytes, subject: str) -> _Packed:
 
 
 def _unpack_zstd(data: bytes, subject: str) -> _Packed:
-    zstandard = _zstandard(subject)
+    zstandard = zstandard_library(subject)
     packed = _header(data, len(data) * _RATIO, subject)
-    table = struct.unpack_from("<I", data, 16)[0] if len(data) >= _HEADER_4 else 0
+    table = struct.unpack_from("<I", data, 16)[0] if len(data) >= HEADER_4 else 0
     wanted = packed.sizes if packed.degree else packed.sizes[:-1]
-    position = table + len(wanted) * _TABLE.size
-    if data[15] != len(wanted) or table < _HEADER_4 or position > len(data):
+    position = table + len(wanted) * TABLE.size
+    if data[15] != len(wanted) or table < HEADER_4 or position > len(data):
         raise AssetError(subject, "has a damaged table of contents", _REMEDY)
     if data[14] & _EXTENSIONS:
-        packed.up = _up_axis(data[_HEADER_4:table], subject)
+        packed.up = _up_axis(data[HEADER_4:table], subject)
     unpacker = zstandard.ZstdDecompressor(max_window_size=1 << 27)
     for i, size in enumerate(wanted):
-        stored, length = _TABLE.unpack_from(data, table + i * _TABLE.size)
+        stored, length = TABLE.unpack_from(data, table + i * TABLE.size)
         frame = memoryview(data)[position : position + stored]
         if length != size or len(frame) != stored:
             raise AssetError(subject, "has a table of contents that does not fit its splats", _REMEDY)
@@ -177,20 +184,19 @@ def _up_axis(records: bytes, subject: str) -> str:
     return "y"
 
 
-def _decode(packed: _Packed, path: Path) -> SurfelFile:
+def _values(packed: _Packed) -> tuple[Array, Array, Array, Array, Array]:
+    """Centres, logarithms of scales, rotations wxyz, opacities and harmonics (n, k, 3)."""
     n, (positions, opacities, colours, scales, rotations, harmonics) = packed.count, map(_array, packed.blocks)
     words = np.zeros((n * 3, 4), np.uint8)
     words[:, 1:] = positions.reshape(-1, 3)  # the sign is in the highest byte
     centre = ((words.view("<i4") >> 8).astype(np.float32) * np.float32(2.0**-packed.fraction)).reshape(n, 3)
     per_channel = _HARMONICS[packed.degree] // 3
     sh = np.empty((n, 1 + per_channel, 3), np.float32)
-    sh[:, 0] = (colours.reshape(n, 3) / np.float32(255) - np.float32(0.5)) / np.float32(_COLOUR)
+    sh[:, 0] = (colours.reshape(n, 3) / np.float32(255) - np.float32(0.5)) / np.float32(COLOUR)
     sh[:, 1:] = _STEPS_OF_128[harmonics.reshape(n, per_channel, 3)]
     rotation = _first_three(rotations) if packed.version < 3 else _smallest_three(rotations)
     scale = scales.reshape(n, 3) / np.float32(16) - np.float32(10)
-    file = decode_arrays(centre, scale, rotation, opacities / np.float32(255), sh, path, "SPZ")
-    file.up = packed.up
-    return file
+    return centre, scale, rotation, opacities / np.float32(255), sh
 
 
 def _array(block: bytes | memoryview) -> Array:
@@ -215,70 +221,7 @@ def _smallest_three(stored: Array) -> Array:
     return from_smallest_three(words >> np.uint32(30), others)[:, [3, 0, 1, 2]]
 
 
-@np.errstate(over="ignore")  # what is brighter than the format holds becomes the brightest that it does
-def write_spz(path: Path, splats: Splats) -> None:
-    """Write an SPZ file of version 4. `splats` are Y up.
-
-    Raises
-    ------
-    AssetError
-        The splats are too far apart for 24 bits a coordinate, or too small; see also `splats.writable`.
-    DeviceError
-        The package zstandard is missing.
-    WriteError
-        The file cannot be written.
-    """
-    subject = str(path)
-    splats = writable(splats, subject)
-    zstandard = _zstandard(subject)
-    if len(splats) and splats.scale.max() < _SMALLEST:
-        problem = f"would hold splats of {splats.scale.max():.2g} m at most, all below the {_SMALLEST:.2g} m of SPZ"
-        raise AssetError(subject, problem, "Choose another --scale or format")
-    far = float(np.abs(splats.centre).max(initial=0.0))
-    fraction = next((bits for bits in range(_FRACTION, -1, -1) if far * 2**bits < 2**23 - 1), None)
-    if fraction is None:
-        raise AssetError(subject, f"would hold a splat at {far:g} m, beyond the 8388 km of SPZ", "Remove far splats")
-    degree = {1: 0, 4: 1, 9: 2, 16: 3}[splats.sh.shape[1]]
-    blocks = [
-        np.rint(splats.centre * np.float32(2**fraction)).astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3],
-        _byte(splats.opacity * 255),
-        _byte((splats.sh[:, 0] * _COLOUR + 0.5) * 255),
-        _byte((np.log(splats.scale) + 10) * 16),
-        _pack_rotations(splats.rotation),
-        *([_pack_harmonics(splats.sh[:, 1:])] if degree else []),
-    ]
-    packer = zstandard.ZstdCompressor(level=6, threads=-1)
-    frames = [packer.compress(np.ascontiguousarray(block)) for block in blocks]
-    header = _HEADER.pack(_MAGIC, 4, len(splats), degree, fraction, 0, len(blocks))
-    table = [_TABLE.pack(len(frame), block.nbytes) for frame, block in zip(frames, blocks, strict=True)]
-    replace_file(path, [header.ljust(16, b"\0"), struct.pack("<I12x", _HEADER_4), *table, *frames])
-
-
-def _byte(values: Array) -> Array:
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
-
-
-def _pack_rotations(rotation: Array) -> Array:
-    largest, others = to_smallest_three(rotation[:, [1, 2, 3, 0]])
-    words = largest.astype(np.uint32)
-    size = np.minimum(np.rint(np.abs(others) * np.float32(511 / np.sqrt(0.5))), 511).astype(np.uint32)
-    size |= np.where(others < 0, np.uint32(512), np.uint32(0))
-    for i in range(3):
-        words = (words << np.uint32(10)) | size[:, i]
-    return words.astype("<u4")
-
-
-def _pack_harmonics(rest: Array) -> Array:
-    """Bytes (n, k, 3) around 128, rounded to few steps, which compress well."""
-    stored = np.empty(rest.shape, np.uint8)
-    for k in range(rest.shape[1]):  # one at a time: bounds the memory
-        step = np.float32(_STEPS[0] if k < 3 else _STEPS[1])
-        whole = np.rint(rest[:, k] * np.float32(128)) + 128
-        stored[:, k] = np.clip(np.floor((whole + step // 2) / step) * step, 0, 255)
-    return stored
-
-
-def _zstandard(subject: str) -> ModuleType:
+def zstandard_library(subject: str) -> ModuleType:
     try:
         import zstandard
     except ImportError as error:

@@ -1,6 +1,8 @@
 """Splats in OpenUSD: the schema ParticleField3DGaussianSplat of UsdVol, read and written with usd-core.
 
-https://openusd.org/release/user_guides/schemas/usdVol/ParticleField3DGaussianSplat.html
+https://openusd.org/release/user_guides/schemas/usdVol/ParticleField3DGaussianSplat.html, or a ParticleField whose
+kernel is the Gaussian surflet, a 2D Gaussian in the plane of its X and Y axes:
+https://openusd.org/release/user_guides/schemas/usdVol/ParticleFieldKernelGaussianSurfletAPI.html
 """
 
 from __future__ import annotations
@@ -12,14 +14,16 @@ import numpy as np
 
 from ..core.asset.archive import replace_by
 from ..core.errors import DeviceError, WriteError
+from ..core.file_types import USD_KERNELS
 from . import usd_stage
 from .axes import UP_AXES
 from .files import SurfelFile
 from .splat_scene import Piece, join_pieces
-from .splats import Splats, writable
+from .splats import THICKNESS, SplatMaterials, Splats, writable
 from .subprocess_reader import PATIENCE, SECONDS, read_in_subprocess
 from .usd_crate import check_crate
-from .usd_stage import DEGREE, HARMONICS, NO_SPLATS, SCHEMA, SPACE, UP
+from .usd_primvars import write_primvars
+from .usd_stage import ATTRIBUTES, DEGREE, FIELD, HARMONICS, MATERIALS, NO_SPLATS, SCHEMA, SPACE, SURFLET, UP
 
 Array = np.ndarray
 
@@ -52,12 +56,18 @@ def read_usd_splats(path: Path) -> SurfelFile:
     pieces = []
     for i in range(sum(name.endswith("/matrix") for name in arrays)):
         of = {name: arrays[f"{i}/{name}"] for name in ("centre", "scale", "rotation", "opacity", "sh")}
-        pieces.append(Piece(Splats(**of), arrays[f"{i}/matrix"], bool(arrays[f"{i}/linear"][0])))
+        values = [arrays[f"{i}/{name}"] for name in MATERIALS if f"{i}/{name}" in arrays]
+        materials = SplatMaterials(*values) if len(values) == len(MATERIALS) else None
+        if f"{i}/flat" in arrays:
+            of["scale"] = np.column_stack([of["scale"][:, :2], THICKNESS * of["scale"][:, :2].min(axis=1)])
+        pieces.append(Piece(Splats(**of, materials=materials), arrays[f"{i}/matrix"], bool(arrays[f"{i}/linear"][0])))
     return join_pieces(pieces, path, "USD", up if up in UP_AXES else "y")
 
 
-def write_usd_splats(path: Path, splats: Splats) -> None:
-    """Write a stage with `splats`, which are Z up, in metres.
+def write_usd_splats(path: Path, splats: Splats, materials: bool = False, kernel: str = USD_KERNELS[0]) -> None:
+    """Write a stage with `splats`, which are Z up, in metres; with `materials`, see `usd_primvars`.
+
+    The `kernel` is "ellipsoid" or "surflet": the latter has no extent along the third axis, as a surfel.
 
     Raises DeviceError (usd-core is not installed), AssetError (see `splats.writable`) or WriteError.
     """
@@ -84,7 +94,10 @@ def write_usd_splats(path: Path, splats: Splats) -> None:
         stage = usd.Stage.CreateInMemory()
         geometry.SetStageUpAxis(stage, "Z")
         geometry.SetStageMetersPerUnit(stage, 1.0)
-        prim = stage.DefinePrim("/Splats", SCHEMA)
+        flat = kernel != USD_KERNELS[0]
+        prim = stage.DefinePrim("/Splats", FIELD if flat else SCHEMA)
+        for name in (*ATTRIBUTES, SURFLET) if flat else ():
+            prim.AddAppliedSchema(name)
         stage.SetDefaultPrim(prim)
         for name, kind, value in values:
             prim.CreateAttribute(name, kind, custom=False).Set(value)
@@ -93,6 +106,8 @@ def write_usd_splats(path: Path, splats: Splats) -> None:
         prim.AddAppliedSchema("ColorSpaceAPI")
         space = prim.CreateAttribute(SPACE, types.Token, custom=False, variability=Sdf.VariabilityUniform)
         space.Set("srgb_rec709_scene")  # of the names that USD knows; without one, colours are linear to it
+        if materials:
+            write_primvars(prim, geometry, splats)
     except RuntimeError as error:
         raise WriteError(str(path), f"cannot be written ({error})", "Report it") from error
     replace_by(path, lambda temporary: stage.GetRootLayer().Export(str(temporary)))

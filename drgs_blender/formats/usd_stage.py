@@ -16,10 +16,19 @@ from .subprocess_reader import limit, write_arrays
 Array = np.ndarray
 
 SCHEMA = "ParticleField3DGaussianSplat"
+#: A field of particles of any kernel, the two kernels that are Gaussian, and the APIs of such a field's attributes.
+FIELD = "ParticleField"
+ELLIPSOID, SURFLET = "ParticleFieldKernelGaussianEllipsoidAPI", "ParticleFieldKernelGaussianSurfletAPI"
+_KERNEL = "ParticleFieldKernel"
+ATTRIBUTES = tuple(
+    f"ParticleField{name}AttributeAPI" for name in ("Position", "Orientation", "Scale", "Opacity", "SphericalHarmonics")
+)
 DEGREE = "radiance:sphericalHarmonicsDegree"
 HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 #: Attribute of UsdColorSpaceAPI, and how the names of linear light with our primaries start.
 SPACE, LINEAR = "colorSpace:name", "lin_rec709"
+#: Primvars of materials, with their widths, by the names that their arrays have.
+MATERIALS = {"albedo": ("primvars:Cd", 3), "roughness": ("primvars:rough", 1), "metallic": ("primvars:metallic", 1)}
 #: Limit of splats that references repeat: bytes, and bytes per byte of the files.
 _SPLATS, _RATIO = 64 << 20, 32
 #: Name of the text that says which axis is up.
@@ -44,7 +53,7 @@ def read_stage(subject: str, usd: Any, geometry: Any) -> dict[str, Array]:
     """Arrays of each piece, "0/centre" and so on, at the earliest time, with its matrix to the stage in metres."""
     package = _check_package(subject)
     stage = usd.Stage.Open(subject)
-    prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == SCHEMA]
+    prims = [prim for prim in stage.Traverse() if prim.GetTypeName() in (SCHEMA, FIELD)]
     if not prims:
         raise AssetError(subject, NO_SPLATS)
     time = usd.TimeCode.EarliestTime()
@@ -56,6 +65,8 @@ def read_stage(subject: str, usd: Any, geometry: Any) -> dict[str, Array]:
     for i, prim in enumerate(prims):
         # USD's matrices take rows for vectors.
         arrays[f"{i}/matrix"] = metres @ np.array(places.GetLocalToWorldTransform(prim), np.float64).T
+        if _is_flat(prim, subject):
+            arrays[f"{i}/flat"] = np.array([True])
         arrays[f"{i}/linear"] = np.array([_space(prim).startswith(LINEAR)])
         splats = _splats(prim, time, subject)
         room -= sum(array.nbytes for array in splats.values())
@@ -100,6 +111,15 @@ def _outer(identifier: str) -> str:
     return os.path.realpath(Ar.SplitPackageRelativePathOuter(identifier)[0])
 
 
+def _is_flat(prim: Any, subject: str) -> bool:
+    """Whether the kernel is a surflet: a Gaussian in the plane of X and Y, whatever the scale along Z."""
+    kernels = [str(name) for name in prim.GetAppliedSchemas() if str(name).startswith(_KERNEL)]
+    kernel = next((name for name in kernels if name != f"{_KERNEL}BaseAPI"), "none")  # the strongest comes first
+    if kernel not in (ELLIPSOID, SURFLET):
+        raise AssetError(subject, f"has {prim.GetPath()} with the kernel {kernel}; Gaussian ones are read")
+    return kernel == SURFLET
+
+
 def _space(prim: Any) -> str:
     """The colour space of a prim, which those below inherit; empty where none is given: the harmonics of captures."""
     while prim:
@@ -115,9 +135,12 @@ def _splats(prim: Any, time: Any, subject: str) -> dict[str, Array]:
 
     def values_of(name: str, width: int, each: int = 1) -> Array | None:
         for attribute in (prim.GetAttribute(name), prim.GetAttribute(name + "h")):  # float before half
-            value = attribute.Get(time) if attribute else None
+            value = attribute.Get(time) if attribute and attribute.GetTypeName().isArray else None
             if value is not None and len(value):
-                table = np.array(value, np.float32).reshape(len(value), width)
+                numbers = np.array(value, np.float32)
+                if numbers.size != len(value) * width:  # a primvar of that name may be anything
+                    return None
+                table = numbers.reshape(len(value), width)
                 return table if name == "positions" or len(table) >= n * each else None
         return None
 
@@ -132,7 +155,13 @@ def _splats(prim: Any, time: Any, subject: str) -> dict[str, Array]:
     rotation, scale, opacity = values_of("orientations", 4), values_of("scales", 3), values_of("opacities", 1)
     sh = np.zeros((n, 1, 3), np.float32) if harmonics is None else harmonics[: n * count].reshape(n, count, 3)
     identity = np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1))
-    return {
+    given = {name: values_of(attribute, width) for name, (attribute, width) in MATERIALS.items()}
+    materials = {
+        name: array[:n].squeeze(1) if array.shape[1] == 1 else array[:n]
+        for name, array in given.items()
+        if array is not None
+    }
+    return materials | {
         "centre": centre,
         "scale": np.ones((n, 3), np.float32) if scale is None else scale[:n],
         # In memory the imaginary part of a quaternion comes first.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from .gltf_mesh import write_gltf_mesh
 from .gltf_splats import write_gltf_splats
 from .sog_writer import write_sog
 from .splat_ply import write_splat_ply
-from .spz import write_spz
+from .spz_writer import write_spz
 from .usd_mesh import write_usd_mesh
 from .usd_splats import write_usd_splats
 
@@ -28,8 +28,8 @@ class Writer:
     name : str
         Shown to users; the key of its `file_types.WriteType`.
     write : callable
-        (path, what goes in) -> None, where what goes in is `splats.Splats`, `asset.Mesh` or `asset.Environment`; raises
-        WriteError.
+        (path, what goes in, options) -> None, where what goes in is `splats.Splats`, `asset.Mesh` or
+        `asset.Environment`; raises WriteError.
     kept, lost : str
         For the documentation.
     lost_channels : tuple of str
@@ -37,7 +37,7 @@ class Writer:
     """
 
     name: str
-    write: Callable[[Path, Any], None]
+    write: Callable[..., None]
     kept: str
     lost: str
     lost_channels: tuple[str, ...] = ()
@@ -62,6 +62,27 @@ class Writer:
         """Whether no other up axis can be asked for."""
         return WRITTEN[self.name].fixed
 
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Options of `drgs convert` that `write` takes as keywords."""
+        return WRITTEN[self.name].options
+
+    def chosen(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Keywords for `write` of the options that were `given`; None and False say nothing.
+
+        Raises
+        ------
+        UsageError
+            The format does not take one of them; names those that do.
+        """
+        chosen = {name: value for name, value in given.items() if value not in (None, False)}
+        for name in chosen:
+            if name not in self.options:
+                able = either([w.name for w in WRITERS if name in w.options])
+                option = f"--{name.replace('_', '-')}"
+                raise UsageError(option, f"is no option of {self.name}", f"Leave it out, or write {able}")
+        return chosen
+
 
 #: What is lost in the pictures of `atlas`.
 _TEXTURES = (
@@ -69,17 +90,20 @@ _TEXTURES = (
     "vertices to 1/510 (base colour as sRGB), halfway between vertices as different as can be to 1/4"
 )
 
+#: What is lost of splats.
+_MATERIALS = "materials, unless with `--materials` ([names](relightable-splats.md))"
+
 WRITERS: tuple[Writer, ...] = (
     Writer(
         "3DGS PLY",
         write_splat_ply,
         "centres, scales, rotations, opacities, colour with harmonics, as 32-bit numbers",
-        "materials; opacity within 1e-6 of 0 and 1",
+        f"{_MATERIALS}; opacity within 1e-6 of 0 and 1",
     ),
     Writer(
         "SPZ",
         write_spz,
-        "centres to 1/8192 m within 2 km of the origin, scales to 3.2 %, rotations to 0.4 degrees, "
+        "centres to 1/8192 m within 2 km of the origin, scales to 3.2 %, rotations to 0.4 degrees (version 2: 1.8), "
         "opacities to 1/510, colours to 1/270",
         "materials; scales below 0.05 mm or above 380 m; harmonics outside -1 to 1, and all finer than 1/16 (first "
         "band) or 1/8; colours outside -0.44 to 1.44",
@@ -95,14 +119,16 @@ WRITERS: tuple[Writer, ...] = (
     Writer(
         "glTF splats",
         write_gltf_splats,
-        "everything, as KHR_gaussian_splatting and 32-bit numbers; coloured points for viewers that do not know it",
-        "materials",
+        "everything, as KHR_gaussian_splatting and 32-bit numbers; coloured points for viewers that do not know it; "
+        "with `--compress` what SPZ keeps, for viewers that know [its extension](#drafts)",
+        _MATERIALS,
     ),
     Writer(
         "USD splats",
         write_usd_splats,
-        "everything, as ParticleField3DGaussianSplat and 32-bit numbers; needs usd-core",
-        "materials",
+        "everything, as ParticleField3DGaussianSplat and 32-bit numbers, or with `--kernel surflet` as flat as surfels "
+        "are ([surflets](#drafts)); needs usd-core",
+        _MATERIALS,
     ),
     Writer(
         "glTF mesh",

@@ -163,10 +163,12 @@ def test_the_dialogs_show_what_goes_with_the_format(ball, scene):
         column = lambda self, **_: self  # noqa: E731
 
     operator = part("operators.export").DRGS_OT_export
-    values = {"colour": "relit", "use_animation": True}
+    values = {"colour": "relit", "use_animation": True, "compress": True}
     for format_, wanted, unwanted in (
-        ("SPZ", {"samples", "scale", "use_selection", "frame_end"}, {"up"}),
-        ("3DGS PLY", {"up", "colour"}, set()),
+        ("SPZ", {"samples", "scale", "use_selection", "frame_end", "spz_version"}, {"up"}),
+        ("3DGS PLY", {"up", "colour", "materials"}, {"spz_version"}),
+        ("glTF splats", {"materials", "compress", "spz_version"}, {"up"}),
+        ("USD splats", {"materials", "kernel"}, {"compress", "spz_version"}),
         ("glTF mesh", {"scale"}, {"colour", "up"}),
         ("OpenEXR", {"format"}, {"scale", "use_selection", "colour"}),
     ):
@@ -215,6 +217,28 @@ def test_the_file_browser_keeps_a_foreign_ending_to_be_refused(scene, tmp_path, 
     assert export.check(stand_in, bpy.context) and stand_in.filepath == "chair.v2.ply"
     with pytest.raises(RuntimeError, match=r"cannot be written; understood: \.ply \.spz"):
         bpy.ops.drgs.export(filepath=str(tmp_path / name))
+
+
+@pytest.mark.parametrize("version", ["3", "4"])
+def test_spz_is_of_the_version_that_is_chosen(ball, scene, tmp_path, version):
+    path = tmp_path / "a.spz"
+    assert bpy.ops.drgs.export(filepath=str(path), format="SPZ", spz_version=version) == {"FINISHED"}
+    assert path.read_bytes()[:2] == (b"NG" if version == "4" else b"\x1f\x8b")
+
+
+@pytest.mark.parametrize("materials", [False, True])
+def test_splats_have_materials_where_they_are_asked_for(ball, scene, tmp_path, materials):
+    path = tmp_path / "a.ply"
+    assert bpy.ops.drgs.export(filepath=str(path), format="3DGS PLY", materials=materials) == {"FINISHED"}
+    assert (b"property float albedo_r" in path.read_bytes()) == materials
+
+
+@pytest.mark.parametrize(("compress", "version"), [(False, "3"), (True, "auto"), (True, "3")])
+def test_splats_in_gltf_are_packed_where_that_is_chosen(ball, scene, tmp_path, compress, version):
+    path = tmp_path / "a.glb"
+    chosen = {"format": "glTF splats", "compress": compress, "spz_version": version}
+    assert bpy.ops.drgs.export(filepath=str(path), **chosen) == {"FINISHED"}
+    assert (b"KHR_gaussian_splatting_compression_spz_2" in path.read_bytes()) == compress
 
 
 def test_an_ending_of_another_format_is_told(ball, scene, tmp_path):

@@ -23,7 +23,8 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -38,7 +39,11 @@ from drgs_blender.core.asset import Environment, Mesh
 from drgs_blender.core.asset.archive import read_archive
 from drgs_blender.core.asset.container import MANIFEST, check_asset, read_asset, write_asset
 from drgs_blender.core.errors import DrgsError
+from drgs_blender.formats.gltf_splats import write_gltf_splats
 from drgs_blender.formats.registry import read
+from drgs_blender.formats.splat_ply import write_splat_ply
+from drgs_blender.formats.splats import SplatMaterials
+from drgs_blender.formats.usd_splats import write_usd_splats
 from drgs_blender.formats.writers import WRITERS
 from drgs_blender.render.film.frame_files import read_frame, write_frame
 
@@ -102,6 +107,15 @@ def kinds() -> dict[str, Callable[[], Kind]]:
         for suffix in writer.extensions:
             name = f"{writer.kind}{suffix}"
             made[name] = lambda w=writer, n=name: Kind(n, {"file": written(w.write, n, given[w.kind])})
+    materials = SplatMaterials(np.full((60, 3), 0.3), np.full(60, 0.4), np.full(60, 0.2))
+    lit = replace(splats, materials=materials)
+    for suffix, write in ((".ply", write_splat_ply), (".glb", write_gltf_splats)):
+        of = partial(write, materials=True)
+        made[f"materials{suffix}"] = lambda w=of, n=f"a{suffix}": Kind(n, {"file": written(w, n, lit)})
+    surflets = partial(write_usd_splats, kernel="surflet")
+    made["surflets.usda"] = lambda: Kind("a.usda", {"file": written(surflets, "a.usda", splats)})
+    packed = partial(write_gltf_splats, compress=True)
+    made["packed.glb"] = lambda: Kind("a.glb", {"file": written(packed, "a.glb", splats)})
     for version in (2, 3):
         made[f"version{version}.spz"] = lambda v=version: Kind(
             "a.spz", {"file": old_spz(made["splats.spz"]().parts["file"], v)}

@@ -29,7 +29,7 @@ from drgs_blender.formats.registry import find_format, read_environment, read_me
 from drgs_blender.formats.sog_writer import write_sog
 from drgs_blender.formats.splat_ply import write_splat_ply
 from drgs_blender.formats.splats import Splats, splats_from_z_up, splats_of
-from drgs_blender.formats.spz import write_spz
+from drgs_blender.formats.spz_writer import write_spz
 from drgs_blender.geometry.normals import rotation_matrices
 
 WRITERS = {".ply": write_splat_ply, ".spz": write_spz, ".glb": write_gltf_splats}

@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +19,15 @@ from splat_files import covariance, random_splats
 
 from drgs_blender.core.asset import Mesh
 from drgs_blender.formats.axes import multiply_quaternions, vectors_from_z_up
+from drgs_blender.formats.gltf_document import Document
 from drgs_blender.formats.gltf_mesh import write_gltf_mesh
 from drgs_blender.formats.gltf_splats import EXTENSION, write_gltf_splats
 from drgs_blender.formats.harmonics import rotate_harmonics
 from drgs_blender.formats.registry import find_format, read_surfels
 from drgs_blender.formats.sog_writer import write_sog
 from drgs_blender.formats.splat_ply import write_splat_ply
-from drgs_blender.formats.splats import Splats, splats_of
-from drgs_blender.formats.spz import write_spz
+from drgs_blender.formats.splats import SplatMaterials, Splats, splats_of
+from drgs_blender.formats.spz_writer import write_spz
 
 FOLDER = Path(os.environ.get("DRGS_NODE", Path(__file__).resolve().parents[2] / ".venv-node"))
 WRITERS = {".ply": write_splat_ply, ".spz": write_spz, ".sog": write_sog}
@@ -44,12 +46,11 @@ def node(script: str, *arguments: object) -> str:
     return done.stdout
 
 
-def splat_transform(source: Path, target: Path) -> None:
+def splat_transform(*arguments: Path | str) -> None:
+    """Its command line: inputs with their options, then the output."""
     program = FOLDER / "node_modules" / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
-    done = subprocess.run(
-        ["node", program, "-w", "-g", "cpu", source, target], capture_output=True, text=True, timeout=120
-    )
-    assert not done.returncode and target.exists(), done.stdout[-1000:] + done.stderr[-2000:]
+    done = subprocess.run(["node", program, "-w", "-g", "cpu", *arguments], capture_output=True, text=True, timeout=120)
+    assert not done.returncode and Path(arguments[-1]).exists(), done.stdout[-1000:] + done.stderr[-2000:]
 
 
 # the library of SPZ
@@ -57,7 +58,8 @@ def splat_transform(source: Path, target: Path) -> None:
 _READ = """
 import fs from 'fs';
 const spz = await (await import('@adobe/spz')).default();
-const cloud = await spz.loadSpzFromBuffer(fs.readFileSync(process.argv[1]), {to: spz.CoordinateSystem.RUB});
+const to = spz.CoordinateSystem[process.argv[3] ?? 'RUB'];
+const cloud = await spz.loadSpzFromBuffer(fs.readFileSync(process.argv[1]), {to});
 const parts = ['positions', 'scales', 'rotations', 'alphas', 'colors', 'sh'].map(name => cloud[name]);
 fs.writeFileSync(process.argv[2], Buffer.concat(parts.map(a => Buffer.from(a.buffer, a.byteOffset, a.byteLength))));
 console.log(cloud.numPoints, cloud.shDegree);
@@ -78,11 +80,11 @@ fs.writeFileSync(process.argv[2], spz.saveSpzToBuffer(cloud, options));
 
 
 @needs("@adobe/spz")
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_the_library_of_spz_reads_what_we_write(tmp_path: Path, degree: int) -> None:
+@pytest.mark.parametrize(("version", "degree"), [(4, 0), (4, 1), (4, 2), (4, 3), (3, 3), (2, 0), (2, 3)])
+def test_the_library_of_spz_reads_what_we_write(tmp_path: Path, version: int, degree: int) -> None:
     n, k = 200, (degree + 1) ** 2
     splats = random_splats(n, k)
-    write_spz(tmp_path / "a.spz", splats)
+    write_spz(tmp_path / "a.spz", splats, version)
     said = node(_READ, tmp_path / "a.spz", tmp_path / "a.bin")
     assert said.split()[-2:] == [str(n), str(degree)]
     sizes = np.cumsum([n * width for width in (3, 3, 4, 1, 3, 3 * (k - 1))])
@@ -90,11 +92,33 @@ def test_the_library_of_spz_reads_what_we_write(tmp_path: Path, degree: int) -> 
     centre, scale, rotation, opacity, colour, sh = (part.reshape(n, -1) for part in parts[:6])
     assert not len(parts[6])
     np.testing.assert_allclose(centre, splats.centre, atol=1.001 / 8192)
-    np.testing.assert_allclose(scale, np.log(splats.scale), atol=1.001 / 32)
-    assert np.abs((rotation[:, [3, 0, 1, 2]] * splats.rotation).sum(axis=1)).min() > np.cos(np.radians(0.2))
+    if version == 2:  # the same ellipsoids, by other rotations
+        same_shapes(replace(splats, rotation=rotation[:, [3, 0, 1, 2]], scale=np.exp(scale)), splats, 0.1)
+    else:
+        np.testing.assert_allclose(scale, np.log(splats.scale), atol=1.001 / 32)
+        assert np.abs((rotation[:, [3, 0, 1, 2]] * splats.rotation).sum(axis=1)).min() > np.cos(np.radians(0.2))
     np.testing.assert_allclose(1 / (1 + np.exp(-opacity[:, 0])), splats.opacity, atol=1.01 / 510)
     np.testing.assert_allclose(colour, splats.sh[:, 0], atol=1.01 / (510 * 0.15))
     np.testing.assert_allclose(sh.reshape(n, k - 1, 3), splats.sh[:, 1:], atol=0.5 / 8 + 0.01)
+
+
+@needs("@adobe/spz")
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_library_of_spz_reads_what_lies_in_gltf(tmp_path: Path, version: int) -> None:
+    """To LUF, as the draft of the extension says: what glTF without compression has."""
+    splats = random_splats(200, 16)
+    write_gltf_splats(tmp_path / "a.glb", splats, compress=True, spz_version=version)
+    data, place = Document(tmp_path / "a.glb").view(0)
+    assert place == (0, 0)
+    data.tofile(tmp_path / "a.spz")
+    node(_READ, tmp_path / "a.spz", tmp_path / "a.bin", "LUF")
+    sizes = np.cumsum([200 * width for width in (3, 3, 4, 1, 3)])
+    parts = np.split(np.fromfile(tmp_path / "a.bin", np.float32), sizes)
+    centre, scale, rotation, _, _, sh = (part.reshape(200, -1) for part in parts)
+    np.testing.assert_allclose(centre, splats.centre, atol=1.001 / 8192)
+    same_shapes(replace(splats, rotation=rotation[:, [3, 0, 1, 2]], scale=np.exp(scale)), splats, 0.11)
+    apart = sh.reshape(200, 15, 3) - splats.sh[:, 1:]
+    assert np.sqrt(np.square(apart).mean()) < 0.06  # in other axes it would be ten times as much
 
 
 @needs("@adobe/spz")
@@ -199,11 +223,15 @@ SPLAT_ATTRIBUTES = [
 
 
 @needs("gltf-validator")
-@pytest.mark.parametrize("kind", ["splats", "plain mesh", "painted mesh"])
+@pytest.mark.parametrize("kind", ["splats", "packed splats", "plain mesh", "painted mesh"])
 def test_khronos_finds_nothing_wrong(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "a.glb"
-    if kind == "splats":
-        write_gltf_splats(path, random_splats(50))
+    if kind.endswith("splats"):
+        n = 50
+        materials = SplatMaterials(np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n))
+        write_gltf_splats(
+            path, replace(random_splats(n), materials=materials), materials=True, compress=kind != "splats"
+        )
         assert find_format(path).name == "glTF splats"
     else:
         vertices, faces = sphere_mesh(2)
@@ -214,4 +242,6 @@ def test_khronos_finds_nothing_wrong(tmp_path: Path, kind: str) -> None:
     # It does not know the extension for splats, whose attributes it takes for misspelt ones. 2 and 3 are remarks.
     worse = [m for m in issues["messages"] if m["severity"] < 2 and EXTENSION not in m["pointer"]]
     assert not worse
-    assert issues["numErrors"] == (len(SPLAT_ATTRIBUTES) if kind == "splats" else 0) and not issues["numWarnings"]
+    assert (
+        issues["numErrors"] == (len(SPLAT_ATTRIBUTES) if kind.endswith("splats") else 0) and not issues["numWarnings"]
+    )

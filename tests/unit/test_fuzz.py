@@ -24,7 +24,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks into /pro
 WHOLE = os.environ.get("DRGS_FAULTS") == "whole"
 COUNT = 1000 if WHOLE else 20
 #: Kinds for each of whose files a process is started.
-SLOW = ("splats.usd", "splats.usda", "splats.usdc", "mesh.3mf", "mesh.3mf inside", "mesh.dae")
+SLOW = ("surflets.usda", "splats.usd", "splats.usda", "splats.usdc", "mesh.3mf", "mesh.3mf inside", "mesh.dae")
 PROGRAM = Path(__file__).with_name("fuzz_files.py")
 KINDS = list(kinds())
 #: Kinds that are read by one process: a process takes longer to start than to read few files.
