@@ -90,7 +90,9 @@ class DRGS_OT_select_surfels(DrgsOperator, bpy.types.Operator):
         column.prop(self, "use_extend")
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        points, obj = edited(context)
+        pair = edited(context)
+        assert pair is not None, "poll has looked"
+        points, obj = pair
         asset = assets.load(assets.file_of(obj))
         mesh = bmesh.from_edit_mesh(points.data)
         layer = mesh.verts.layers.int.get(surfel_points.SURFEL)
@@ -150,7 +152,9 @@ class DRGS_OT_finish_surfels(DrgsOperator, bpy.types.Operator):
         return context.mode in ("EDIT_MESH", "OBJECT") and edited(context) is not None
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        points, obj = edited(context)
+        pair = edited(context)
+        assert pair is not None, "poll has looked"
+        points, obj = pair
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         mesh = points.data

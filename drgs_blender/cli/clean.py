@@ -78,10 +78,11 @@ def run(args: argparse.Namespace) -> int:
         found = rule(asset, value)
         print(f"{name}: {int(found.sum())} of {count} surfels")
         gone |= found
-    faces = np.ones(len(mesh.faces), bool)
+    faces: np.ndarray = np.ones(len(mesh.faces), bool)
     if args.box is not None:
         low, high = np.array(args.box[:3]), np.array(args.box[3:])
-        faces = ((mesh.vertices >= low) & (mesh.vertices <= high)).all(axis=1)[mesh.faces].all(axis=1)
+        inside = np.all((mesh.vertices >= low) & (mesh.vertices <= high), axis=1)
+        faces = np.all(inside[mesh.faces], axis=1)
         print(f"box: {int((~faces).sum())} of {len(faces)} faces")
     if gone.all() or (len(faces) and not faces.any()):
         raise UsageError(str(args.asset), "would be gone as a whole", "Remove less")
@@ -108,12 +109,12 @@ def _floaters(asset: Asset, strength: float) -> np.ndarray:
 
 
 def _faint(asset: Asset, least: float) -> np.ndarray:
-    return asset.surfels.opacity < least
+    return np.asarray(asset.surfels.opacity < least)
 
 
 def _wide(asset: Asset, factor: float) -> np.ndarray:
     size = asset.surfels.scale.max(axis=1)
-    return size > factor * _median(size)
+    return np.asarray(size > factor * _median(size))
 
 
 def _distant(asset: Asset, factor: float) -> np.ndarray:
@@ -123,12 +124,12 @@ def _distant(asset: Asset, factor: float) -> np.ndarray:
     if away is None:
         logger.warning("the surfels are bound to no mesh: --distance removes none")
         return np.zeros(len(asset.surfels), bool)
-    return away > factor * _median(asset.surfels.scale.max(axis=1))
+    return np.asarray(away > factor * _median(asset.surfels.scale.max(axis=1)))
 
 
 def _outside(asset: Asset, box: list[float]) -> np.ndarray:
     centre = asset.surfels.centre
-    return ~((centre >= box[:3]) & (centre <= box[3:])).all(axis=1)
+    return ~np.all((centre >= box[:3]) & (centre <= box[3:]), axis=1)
 
 
 def _median(values: np.ndarray) -> float:
