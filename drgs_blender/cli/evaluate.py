@@ -175,9 +175,10 @@ def score(args: argparse.Namespace) -> int:
     lpips = Lpips(*args.lpips) if args.lpips else None
     session = Session()
     key = session.load_asset(args.asset)
+    folder = capture_of(args.capture, args.asset)
     test_every = args.test_every or left_out_by(session.asset(key))
-    capture = read_capture(args.capture, args.resolution, test_every, args.axes, args.up, turntable=args.turntable)
-    truth = read_truth(args.capture)
+    capture = read_capture(folder, args.resolution, test_every, args.axes, args.up, turntable=args.turntable)
+    truth = read_truth(folder)
     relit = [read_relit(folder, light, args.resolution, args.axes, args.up) for folder, light in args.relit]
     if relit:
         truth = truth or Truth([])
@@ -196,6 +197,17 @@ def score(args: argparse.Namespace) -> int:
     report = {"asset": digest_asset(key), "capture": capture.name, "samples": settings.samples, **report}
     print(json.dumps(report, indent=1) if args.json else "\n".join(table(report)))
     return 0
+
+
+def capture_of(given: Path, asset: Path) -> Path:
+    """The capture to score with: `given`, or the one beside the asset that was made of photographs without cameras."""
+    from ..reconstruct.readers import has_cameras
+
+    beside = asset.with_name(f"{asset.stem}.capture")
+    if not given.exists() or has_cameras(given) or not has_cameras(beside):
+        return given
+    logger.info("%s has no cameras: those of %s are used", given, beside)
+    return beside
 
 
 def left_out_by(asset: Asset) -> int | None:

@@ -116,11 +116,22 @@ def inspect_capture(path: Path, axes: str = "opengl", up: str | None = None) -> 
         "format": find_layout(path).name,
         "photographs": len(cameras),
         "left_out": sum(one["test"] for one in cameras),
-        "masks": sum(one["mask"] is not None for one in cameras),
+        "masks": sum(one["mask"] is not None or _has_alpha(Path(one["image"])) for one in cameras),
         "points": 0 if layout.points is None else len(layout.points),
         "guessed": layout.guessed,
         "cameras": describe(cameras),
     }
+
+
+def _has_alpha(path: Path) -> bool:
+    """Whether a picture has alpha, which is its mask, by its head alone."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as picture:
+            return "A" in picture.getbands() or "transparency" in picture.info
+    except (OSError, ValueError, SyntaxError):  # a format that Pillow does not know, damaged, or not there
+        return False
 
 
 def inspect_exported_frame(path: Path) -> dict[str, Any]:

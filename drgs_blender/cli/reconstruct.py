@@ -108,7 +108,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--time-budget",
         type=above_zero("not a time"),
         metavar="M",
-        help="minutes of all stages together, about, once kernels are compiled",
+        help="minutes of learning, about, once cameras and masks are found and kernels compiled",
     )
     parser.add_argument(
         "--test-every",
@@ -228,6 +228,9 @@ def run(args: argparse.Namespace) -> int:
     if "decoupling" in report:
         shown = report["decoupling"]["psnr"]
         print(f"  materials in the light that was found, pixels learned from: PSNR {shown:.2f} dB")
+    shape = asset.mesh.vertices if len(asset.mesh.vertices) else asset.surfels.centre
+    size = " x ".join(f"{side:.2g}" for side in shape.max(axis=0) - shape.min(axis=0))
+    print(f"  size: {size} m; look: drgs relight {args.out} --orbit 12 --out '{args.out.stem}/####.png'")
     return 0
 
 

@@ -297,7 +297,7 @@ def table(report: dict[str, Any]) -> list[str]:
     novel = report["novel"]
     if novel:
         lines.append(
-            f"views left out ({novel['views']}, {novel['coverage']:.0%} foreground): "
+            f"views left out, in the light that was found ({novel['views']}, {novel['coverage']:.0%} foreground): "
             f"PSNR {_number(novel['psnr'], 2)} dB, foreground {_number(novel['psnr_foreground'], 2)} dB, "
             f"SSIM {_number(novel['ssim'])}, FLIP {_number(novel['flip'])}, LPIPS {_number(novel['lpips'])}"
         )
