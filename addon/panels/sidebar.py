@@ -42,6 +42,7 @@ class DRGS_PT_object(_SidebarPanel, bpy.types.Panel):
         column.prop(context.object.drgs, "captured_colours", toggle=True, icon="POINTCLOUD_DATA")
         column = self.layout.column(align=True)
         column.operator("drgs.save_asset", icon="FILE_TICK")
+        column.operator("drgs.save_shape", icon="MESH_DATA")
         column.operator("drgs.bake_light", icon="RENDER_RESULT")
 
 

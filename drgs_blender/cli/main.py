@@ -49,6 +49,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("capture", "capture", "find the cameras of photographs or of a video"),
     Command("markers", "markers", "print a sheet of markers to photograph objects on"),
     Command("clean", "clean", "remove floaters and what lies outside a box from an asset"),
+    Command("reshape", "reshape", "give an asset the shape of an edited mesh"),
     Command("convert", "convert", "write an asset, splats, a mesh or a light in a format of other programs"),
     Command("bake", "bake", "bake the light on the objects of a frame to their vertices or to images"),
     Command(

@@ -1,0 +1,138 @@
+"""Save the edited shape: an asset whose shape at rest is that of the object's mesh, with surfels on new faces."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from bpy.props import BoolProperty, StringProperty
+
+from ..addon import assets, blend_paths, mesh_arrays, surfel_points
+from ..addon.export.face_match import match_faces
+from ..addon.viewport_material import update_viewport_material
+from ..drgs_blender.core.asset import MATERIAL_CHANNELS, Mesh
+from ..drgs_blender.core.errors import AssetError
+from . import selection
+from .engine_command import CommandOperator
+
+Array = np.ndarray
+SUFFIX = ".drgs"
+
+
+class DRGS_OT_save_shape(CommandOperator, selection.ObjectMode, bpy.types.Operator):
+    """Write the active DR-GS object as a new .drgs asset with the shape of its mesh, as sculpted, cut and mended; new
+    faces, such as filled holes, get surfels. The object uses the new file from then on"""
+
+    bl_idname = "drgs.save_shape"
+    bl_label = "Save Edited Shape"
+    bl_options = {"REGISTER"}  # noqa: RUF012 - read by Blender
+
+    filepath: StringProperty(
+        name="File",
+        description="The .drgs file to write",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE", *blend_paths.RELATIVE},
+    )
+    filter_glob: StringProperty(default="*.drgs", options={"HIDDEN"})
+    check_existing: BoolProperty(default=True, options={"HIDDEN"})
+
+    _object, _target = "", Path()
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if not self.filepath:
+            name = bpy.path.clean_name(selection.selected(context)[-1].name)
+            self.filepath = os.path.join(os.path.dirname(bpy.data.filepath), f"{name} shape{SUFFIX}")
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        self._target = Path(bpy.path.ensure_ext(bpy.path.abspath(self.chosen("Asset")), SUFFIX))
+        (obj,) = selection.editable(selection.selected(context)[-1:], data=True)
+        assets.check_unused(self._target)
+        self._object = obj.name
+        source = assets.file_of(obj)
+        with self.folder("drgs-shape-") as folder:
+            edit = folder / "edit.npz"
+            arrays: dict[str, Any] = edit_of(obj, assets.load(source).mesh)
+            np.savez(edit, **arrays)
+            given = ["reshape", str(source), "--edit", str(edit), "--out", str(self._target)]
+            status, failure = f"Saving {self._target.name}", "could not be saved"
+            return self.start(context, given, f'Object "{obj.name}"', status, failure, [self._target])
+
+    def done(self, context: bpy.types.Context) -> set[str]:
+        obj = bpy.data.objects.get(self._object)
+        if obj is None:
+            return {"FINISHED"}
+        rest = assets.load(self._target).mesh
+        if len(rest.vertices) != len(obj.data.vertices):
+            self.warn(
+                f'"{obj.name}" was edited meanwhile: it keeps its file; {self._target.name} has the shape of before'
+            )
+            return {"FINISHED"}
+        rows = mesh_arrays.source_rows(obj.data, len(assets.load(assets.file_of(obj)).mesh.vertices))
+        new = np.zeros(len(rest.vertices), bool) if rows is None else rows < 0
+        obj.drgs.asset = assets.anchor(self._target)
+        obj.drgs.surfel_points = None
+        mesh_arrays.write_source_vertices(obj.data)
+        give_channels(obj.data, rest, new)
+        update_viewport_material(obj.data)
+        obj.update_tag()
+        bpy.ops.ed.undo_push(message=self.bl_label)
+        self.report({"INFO"}, f"Saved {self._target}")
+        return {"FINISHED"}
+
+
+def edit_of(obj: bpy.types.Object, rest: Mesh) -> dict[str, Array]:
+    """Arrays of `drgs reshape` of the mesh of an object, without modifiers; `rest` is that of its asset.
+
+    Raises
+    ------
+    AssetError
+        Its vertices are not known; names the object.
+    """
+    mesh = obj.data
+    rows = mesh_arrays.source_rows(mesh, len(rest.vertices))
+    if rows is None:
+        raise AssetError(
+            f'Object "{obj.name}"', f"its mesh has {len(mesh.vertices)} vertices, the asset {len(rest.vertices)}",
+            "Undo the edit, or import the asset again",
+        )  # fmt: skip
+    matched = match_faces(mesh, rows, rest.faces)
+    corner_vertices = mesh_arrays.read_corner_vertices(mesh)
+    corners, polygon = mesh_arrays.read_loop_triangles(mesh)
+    start, _ = mesh_arrays.read_polygons(mesh)
+    of_asset = np.zeros(len(mesh.polygons), bool)
+    of_asset[np.searchsorted(start, matched.corners.min(axis=1), side="right") - 1] = True
+    new = corner_vertices[corners[~of_asset[polygon]]]
+    found = {
+        "vertices": np.array(mesh_arrays.read_vertices(mesh)),
+        "source": rows,
+        "faces": np.concatenate([corner_vertices[matched.corners], new]).astype(np.int32),
+        "face": np.concatenate([matched.face, np.full(len(new), -1)]).astype(np.int32),
+    }
+    asset = assets.load(assets.file_of(obj))
+    removed = surfel_points.removed_of(obj, asset)
+    return found if removed is None else {**found, "removed": removed}
+
+
+def give_channels(mesh: bpy.types.Mesh, rest: Mesh, new: Array) -> None:
+    """Give the `new` vertices, (n,) bool, of a mesh the materials of its asset; those of others stay as painted."""
+    for channel in MATERIAL_CHANNELS:
+        own = getattr(rest, channel)
+        if own is None or channel not in mesh.attributes:
+            continue
+        try:
+            values = mesh_arrays.read_channel(mesh, channel)
+        except TypeError:  # of another kind, which the render does not heed either
+            continue
+        assert values is not None
+        values[new] = own[new]
+        if mesh.attributes[channel].data_type in mesh_arrays.COLOURS and values.ndim == 1:
+            continue  # painted as grey: what is new stays black until it is painted
+        mesh_arrays.write_channel(mesh, channel, values)
+
+
+CLASSES = (DRGS_OT_save_shape,)
