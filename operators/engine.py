@@ -5,8 +5,10 @@ from __future__ import annotations
 import time
 
 import bpy
+from bpy.props import IntProperty
 
-from ..addon import engine_link, messages
+from ..addon import engine_link, messages, running
+from ..drgs_blender.core.errors import UsageError
 from .base import DrgsOperator
 
 
@@ -54,4 +56,20 @@ class DRGS_OT_clear_messages(DrgsOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (DRGS_OT_engine_test, DRGS_OT_engine_stop, DRGS_OT_clear_messages)
+class DRGS_OT_cancel_command(DrgsOperator, bpy.types.Operator):
+    """End this work; what it has not finished is removed"""
+
+    bl_idname = "drgs.cancel_command"
+    bl_label = "Cancel"
+    bl_options = {"INTERNAL"}  # noqa: RUF012 - read by Blender
+
+    index: IntProperty(name="Number", description="Which of those that run", min=0, options={"SKIP_SAVE"})
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        if self.index >= len(running.commands):
+            raise UsageError("Cancel", "there is no such work any more", "It has ended")
+        running.commands[self.index].cancelled = True
+        return {"FINISHED"}
+
+
+CLASSES = (DRGS_OT_engine_test, DRGS_OT_engine_stop, DRGS_OT_clear_messages, DRGS_OT_cancel_command)

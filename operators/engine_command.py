@@ -13,7 +13,7 @@ from pathlib import Path
 
 import bpy
 
-from ..addon import assets, engine_link, messages, output_check
+from ..addon import assets, engine_link, messages, output_check, running
 from ..drgs_blender.core.errors import AssetError, EngineError, UsageError
 from ..drgs_blender.ipc.child_process import clean_environment
 from .base import DrgsOperator
@@ -38,6 +38,9 @@ class CommandOperator(DrgsOperator):
     _output = ""
     #: What the program has warned of so far, in the order of its lines.
     _warned: tuple[str, ...] = ()
+    #: Whether the panel Workflow shows it while it runs.
+    shows_progress = True
+    _running: running.Running | None = None
 
     def done(self, context: bpy.types.Context) -> set[str]:
         """Called after the program has succeeded; returns what execute returns."""
@@ -111,13 +114,14 @@ class CommandOperator(DrgsOperator):
         except BaseException:
             self.clear()
             raise
+        self._running = running.begin(status) if self.shows_progress else None
         self._timer = context.window_manager.event_timer_add(_INTERVAL, window=context.window)
         context.window_manager.modal_handler_add(self)
         context.workspace.status_text_set(f"{status}: Esc cancels")
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if self.stopped(event):
+        if self.stopped(event) or (self._running is not None and self._running.cancelled):
             self.cancel(context)
             return {"CANCELLED"}
         if event.type != "TIMER":
@@ -126,6 +130,9 @@ class CommandOperator(DrgsOperator):
             output = self._read_output()
             self._tell_warnings(output)
             self.follow(context, output)
+            if self._running is not None:
+                self._running.follow(output)
+                redraw_sidebars(context)
             return {"PASS_THROUGH"}
         self._release(context)
         return self.guard(self._finish, context)
@@ -228,10 +235,20 @@ class CommandOperator(DrgsOperator):
             self.clear()
 
     def _release(self, context: bpy.types.Context) -> None:
+        running.end(self._running)
+        redraw_sidebars(context)
         if self._timer is not None:
             context.window_manager.event_timer_remove(self._timer)
             context.workspace.status_text_set(None)
             self._timer = None
+
+
+def redraw_sidebars(context: bpy.types.Context) -> None:
+    """Draw the sidebars again."""
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.tag_redraw()
 
 
 def print_line(text: str) -> None:

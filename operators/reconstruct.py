@@ -11,7 +11,7 @@ from bpy.props import StringProperty
 from ..addon import assets, engine_link, reconstruction
 from ..drgs_blender.core.errors import AssetError, UsageError
 from .base import DrgsOperator
-from .engine_command import CommandOperator
+from .engine_command import CommandOperator, redraw_sidebars
 from .engine_setup import without_capture
 from .import_asset import import_assets
 from .reconstruct_fields import NO_CAPTURE, ReconstructFields, is_video, options_of, settings_file
@@ -23,6 +23,8 @@ class DRGS_OT_reconstruct(ReconstructFields, CommandOperator, bpy.types.Operator
     bl_idname = "drgs.reconstruct"
     bl_label = "Reconstruct from Photographs"
     bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
+
+    shows_progress = False  # the step Import does
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -77,7 +79,7 @@ class DRGS_OT_reconstruct(ReconstructFields, CommandOperator, bpy.types.Operator
 
     def follow(self, context: bpy.types.Context, output: str) -> None:
         context.workspace.status_text_set(f"{self.state(output)}. Cancel is in the sidebar")
-        _redraw(context)
+        redraw_sidebars(context)
 
     def done(self, context: bpy.types.Context) -> set[str]:
         job = _job()
@@ -97,7 +99,7 @@ class DRGS_OT_reconstruct(ReconstructFields, CommandOperator, bpy.types.Operator
     def clear(self) -> None:
         CommandOperator.clear(self)
         reconstruction.job = None
-        _redraw(bpy.context)
+        redraw_sidebars(bpy.context)
 
 
 def _has_no_cameras(capture: Path, axes: str) -> bool:
@@ -190,14 +192,6 @@ def load_picture(file: Path) -> bpy.types.Image:
 def _job() -> reconstruction.Reconstruction:
     assert reconstruction.job is not None, "none is under way"
     return reconstruction.job
-
-
-def _redraw(context: bpy.types.Context) -> None:
-    """Draw the sidebars again."""
-    for window in context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
 
 
 CLASSES = (

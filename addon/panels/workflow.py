@@ -6,10 +6,21 @@ from pathlib import Path
 
 import bpy
 
-from .. import reconstruction, workflow, world_setup
+from .. import reconstruction, running, workflow, world_setup
 from ..viewport import views
 from .engine_setup import draw_engine
 from .text_layout import bar_text, wrapped
+
+
+def _running(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """What commands do beside the window, and how to end them."""
+    for index, command in enumerate(running.commands):
+        box = layout.box()
+        if command.part is None:
+            wrapped(box, context, command.shown(), "SORTTIME")
+        else:
+            box.progress(text=bar_text(box, context, command.shown(), command.part), factor=command.part)
+        box.operator("drgs.cancel_command", icon="CANCEL").index = index
 
 
 def _import(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
@@ -110,6 +121,7 @@ class DRGS_PT_workflow(bpy.types.Panel):
     bl_category = "DR-GS"
 
     def draw(self, context: bpy.types.Context) -> None:
+        _running(self.layout, context)
         found = workflow.steps(context)
         following = workflow.next_step(found)
         for step in found:

@@ -247,3 +247,30 @@ def test_labels_fit_beside_their_field_and_say_more_when_pointed_at(module, name
         p.identifier for p in own if p.type not in ("POINTER", "COLLECTION") and len(p.description) <= len(p.name)
     }
     assert not silent
+
+
+def test_a_command_that_runs_is_shown_with_its_progress_and_ends_by_a_click(ball):
+    running = part("addon.running")
+    command = running.begin("Making cat.drgs")
+    try:
+        assert command.shown() == "Making cat.drgs, 0:00" and command.part is None
+        drawn: list[str] = []
+        panel = SimpleNamespace(layout=Layout(drawn))
+        bpy.types.DRGS_PT_workflow.draw(panel, bpy.context)
+        before = drawn.count("progress")
+        command.follow(
+            'x\nDRGS_PROGRESS part=0.250 phase="Preparing the engine"\nDRGS_PROGRESS part=0.5 phase="Preparing"\n'
+        )
+        assert (command.part, command.phase) == (0.5, "Preparing")
+        drawn.clear()
+        bpy.types.DRGS_PT_workflow.draw(panel, bpy.context)
+        assert drawn.count("progress") == before + 1
+        assert bpy.ops.drgs.cancel_command(index=0) == {"FINISHED"} and command.cancelled
+        command.follow('DRGS_PROGRESS part=1.000 phase="Ready"\n')
+        assert command.part is None
+    finally:
+        running.end(command)
+    running.end(command)  # whoever ends it first
+    assert running.commands == []
+    with pytest.raises(RuntimeError, match="there is no such work any more"):
+        bpy.ops.drgs.cancel_command(index=0)
