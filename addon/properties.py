@@ -43,7 +43,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         min=1,
         soft_max=1024,
         max=65536,
-        default=32,
+        default=64,
     )
     use_strategy_samples: BoolProperty(
         name="Samples per Strategy", description="Choose the number of samples of each strategy", default=False
@@ -161,7 +161,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         name="Denoise",
         description="Filter that takes the noise out of the picture",
         items=DENOISE_ITEMS,
-        default="none",
+        default="svgf",
     )
     use_denoising_data: BoolProperty(
         name="Store Denoising Data",

@@ -178,6 +178,7 @@ def main(path: str) -> None:
                     samples,
                     subpixels,
                 )
+                scene.drgs.denoise = "none"
                 scene.render.filepath = f"{stem}-{step}-{camera_sees}.exr"
                 bpy.ops.render.render(write_still=True)
 

@@ -46,7 +46,7 @@ def build(asset: str) -> bpy.types.Scene:
     camera.location.z = 3
     scene.collection.objects.link(camera)
     scene.camera = camera
-    scene.drgs.samples = 3
+    scene.drgs.samples, scene.drgs.denoise = 3, "none"
     return scene
 
 

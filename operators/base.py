@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ..addon import messages
+from ..addon import messages, preferences
 from ..drgs_blender.core.errors import DrgsError, UsageError, WriteError
 
 #: Class of an operator -> the errors it has told that may still hold.
@@ -36,6 +36,8 @@ class DrgsOperator:
         try:
             result = work(context)
             if "FINISHED" in result:
+                if not preferences.read("knows_sidebar", True):
+                    preferences.write("knows_sidebar", True)
                 for text in list(_errors.get(type(self).__name__, ())):
                     if messages.named_in(text, bpy.data.objects) in ("", *chosen):
                         messages.withdraw("ERROR", text)

@@ -28,7 +28,7 @@ class DRGS_OT_save_shape(CommandOperator, selection.ObjectMode, bpy.types.Operat
 
     bl_idname = "drgs.save_shape"
     bl_label = "Save Edited Shape"
-    bl_options = {"REGISTER"}  # noqa: RUF012 - read by Blender
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
     filepath: StringProperty(
         name="File",
@@ -80,7 +80,6 @@ class DRGS_OT_save_shape(CommandOperator, selection.ObjectMode, bpy.types.Operat
         give_channels(obj.data, rest, new)
         update_viewport_material(obj.data)
         obj.update_tag()
-        bpy.ops.ed.undo_push(message=self.bl_label)
         self.report({"INFO"}, f"Saved {self._target}")
         return {"FINISHED"}
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import bpy
 from mathutils import Matrix, Vector
 
@@ -108,4 +110,24 @@ def frame(context: bpy.types.Context, camera: bpy.types.Object, objects: list[bp
     camera.location = middle + (camera.location - middle) * 1.1
 
 
-CLASSES = (DRGS_OT_pose, DRGS_OT_show_rendered, DRGS_OT_add_camera)
+class DRGS_OT_show_sidebar(DrgsOperator, bpy.types.Operator):
+    """Open the sidebar of this viewport (N) on the tab DR-GS"""
+
+    bl_idname = "drgs.show_sidebar"
+    bl_label = "DR-GS is in the sidebar (N)"
+    bl_options = {"INTERNAL"}  # noqa: RUF012 - read by Blender
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Press it in a 3D viewport")
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        context.space_data.show_region_ui = True
+        region = next(region for region in context.area.regions if region.type == "UI")
+        with contextlib.suppress(TypeError):  # a sidebar that was never open has no tabs yet
+            region.active_panel_category = "DR-GS"
+        return {"FINISHED"}
+
+
+CLASSES = (DRGS_OT_show_sidebar, DRGS_OT_pose, DRGS_OT_show_rendered, DRGS_OT_add_camera)

@@ -1,4 +1,4 @@
-"""The header of 3D viewports: the newest warning or error, and what is awaited, where the sidebar is closed."""
+"""The header of 3D viewports: the newest warning or error, what is awaited, and, until it is known, where DR-GS is."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import textwrap
 
 import bpy
 
-from .. import messages
+from .. import messages, preferences
 from ..viewport import views
 from .sidebar import ICONS
 
@@ -17,6 +17,8 @@ LETTERS = 40
 def draw(header: bpy.types.Header, context: bpy.types.Context) -> None:
     """Show the message until they are cleared, and what is awaited where Blender writes nothing over the picture."""
     scene = context.scene
+    if not preferences.read("knows_sidebar", True):
+        header.layout.operator("drgs.show_sidebar", icon="INFO")
     if scene.drgs.overlay == "LIT" and not views.is_rendered(context.space_data, scene):
         phase, part = views.preparation()
         if phase:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import IntProperty, StringProperty
+from bpy.props import BoolProperty, IntProperty, StringProperty
 
 from .. import preferences
 from .engine_setup import draw_engine
@@ -24,6 +24,12 @@ class DrgsPreferences(bpy.types.AddonPreferences):
     )
     threads: IntProperty(
         name="Threads", description="CPU threads that the engine uses; 0 is all of them", min=0, soft_max=64, default=0
+    )
+
+    knows_sidebar: BoolProperty(
+        name="Knows the Sidebar",
+        description="The headers of 3D viewports need not say any more where DR-GS is",
+        default=False,
     )
 
     def draw(self, context: bpy.types.Context) -> None:

@@ -64,7 +64,7 @@ def scene(tmp_path):
         1,
         1,
     )
-    settings.subpixel_samples = 1
+    settings.subpixel_samples, settings.denoise = 1, "none"
     image = scene.render.image_settings
     image.file_format, image.color_depth = "OPEN_EXR", "32"
     scene.render.filepath = str(tmp_path / "out.exr")

@@ -352,7 +352,9 @@ def test_settings_offer_what_the_engine_knows():
     properties = part("addon.properties").DrgsSceneSettings.bl_rna.properties
     for name in ("camera_sees", "rays_see", "denoise", "shading_model"):
         assert {i.identifier for i in properties[name].enum_items} == set(typing.get_args(hints[name])), name
-        assert properties[name].default == getattr(defaults, name)
+        if name != "denoise":
+            assert properties[name].default == getattr(defaults, name)
+    assert properties["denoise"].default == "svgf"  # the first picture of an artist is clean; programs ask for it
 
 
 def stored(group):

@@ -194,4 +194,4 @@ def test_disable_and_enable_again(scene):
     assert not hasattr(bpy.types.Scene, "drgs")
     assert not [h for h in bpy.app.handlers.load_post if h.__module__.startswith(PACKAGE)]
     bpy.ops.preferences.addon_enable(module=PACKAGE)
-    assert scene.drgs.samples == 32
+    assert scene.drgs.samples == 64

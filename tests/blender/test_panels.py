@@ -274,3 +274,20 @@ def test_a_command_that_runs_is_shown_with_its_progress_and_ends_by_a_click(ball
     assert running.commands == []
     with pytest.raises(RuntimeError, match="there is no such work any more"):
         bpy.ops.drgs.cancel_command(index=0)
+
+
+def test_the_header_says_where_the_sidebar_is_until_it_is_known(ball):
+    """Nobody has to hunt for the tab; the first operator that succeeds ends it."""
+    preferences = bpy.context.preferences.addons[PACKAGE].preferences
+    header, drawn = part("addon.panels.header"), []
+    shown = SimpleNamespace(layout=Layout(drawn))
+    context = SimpleNamespace(scene=bpy.context.scene, space_data=None)
+    preferences.knows_sidebar = False
+    part("addon.messages").clear()
+    header.draw(shown, context)
+    assert drawn == ["operator"]
+    assert bpy.ops.drgs.set_material(preset="GOLD") == {"FINISHED"}
+    assert preferences.knows_sidebar
+    drawn.clear()
+    header.draw(shown, context)
+    assert drawn == []

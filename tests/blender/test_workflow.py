@@ -249,7 +249,7 @@ def test_every_operator_that_changes_the_scene_can_be_undone():
     engine |= {"drgs.copy_messages", "drgs.report"}
     engine |= {"drgs.submit", "drgs.submit_cancel", "drgs.copy_submit", "drgs.print_markers"}  # files and the clipboard
     engine |= {"drgs.show_particles", "drgs.hide_particles", "drgs.cancel_physics"}  # nothing that a file keeps
-    engine |= {"drgs.reconstruct_cancel", "drgs.bakes_cancel"}
+    engine |= {"drgs.reconstruct_cancel", "drgs.bakes_cancel", "drgs.cancel_command", "drgs.show_sidebar"}
     classes = [c for m in part("operators").MODULES for c in m.CLASSES if issubclass(c, bpy.types.Operator)]
     assert {c.bl_idname for c in classes if "UNDO" not in getattr(c, "bl_options", ())} == engine
     for cls in classes:
