@@ -176,7 +176,7 @@ def captured_mesh(obj: bpy.types.Object) -> Mesh:
         The file is absent, or the mesh is not the asset's any more.
     """
     own = load(file_of(obj)).mesh
-    rows = mesh_arrays.source_rows(obj.data, len(own.vertices))
+    rows = mesh_arrays.source_rows(obj.data, own)
     if rows is None:
         raise AssetError(
             f'Object "{obj.name}"',

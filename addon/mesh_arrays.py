@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zlib
+
 import bpy
 import numpy as np
 
@@ -21,6 +23,9 @@ COLOURS = ("FLOAT_COLOR", "BYTE_COLOR")
 SOURCE_VERTEX = "drgs_vertex"
 #: Numbers of vertices that a float32 says exactly.
 _NUMBERS = 1 << 24
+#: Faces of meshes of assets -> their keys, of the last ones.
+_keys: dict[int, tuple[Array, int]] = {}
+_KEPT = 8
 #: Types of attributes besides colours that can be masks.
 MASKS = {"BOOLEAN": bool, "FLOAT": np.float32}
 
@@ -42,19 +47,21 @@ def new_mesh(name: str, source: Mesh) -> bpy.types.Mesh:
         mask = np.zeros(len(source.vertices), bool)
         mask[members] = True
         mesh.attributes.new(group, "BOOLEAN", "POINT").data.foreach_set("value", mask)
-    write_source_vertices(mesh)
+    write_source_vertices(mesh, source)
     mesh.attributes.default_color_name = mesh.attributes.active_color_name = "albedo"
     mesh.update(calc_edges=True)
     mesh.shade_smooth()
     return mesh
 
 
-def write_source_vertices(mesh: bpy.types.Mesh, rows: Array | None = None) -> None:
+def write_source_vertices(mesh: bpy.types.Mesh, rest: Mesh, rows: Array | None = None) -> None:
     """Have every vertex know which of its asset's it is, whatever is deleted, duplicated or reordered later.
 
     Parameters
     ----------
     mesh : bpy.types.Mesh
+    rest : Mesh
+        Of the asset.
     rows : (n,) int32 array, optional
         The asset's vertex of each, -1: none; by default the asset's in its order.
     """
@@ -64,11 +71,13 @@ def write_source_vertices(mesh: bpy.types.Mesh, rows: Array | None = None) -> No
         return
     rows = np.arange(len(mesh.vertices), dtype=np.int32) if rows is None else rows
     attribute = mesh.attributes.new(SOURCE_VERTEX, "FLOAT2", "POINT")
-    attribute.data.foreach_set("vector", np.column_stack((rows, _checksum(rows))).astype(np.float32).ravel())
+    attribute.data.foreach_set("vector", np.column_stack((rows, _checksum(rows, rest))).astype(np.float32).ravel())
 
 
-def read_source_vertices(mesh: bpy.types.Mesh) -> Array | None:
-    """(n,) int32 asset's vertex of each vertex, -1 of new ones; None where the mesh does not know.
+def read_source_vertices(mesh: bpy.types.Mesh, rest: Mesh) -> Array | None:
+    """(n,) int32 vertex of the asset's mesh `rest` that each is, -1 of new ones; None where the mesh does not know.
+
+    Vertices of another asset, which was joined to this one, are new ones, too.
 
     Where Blender makes vertices between others (subdivided edges, cuts), it blends their numbers, so that checksums are
     wrong; integers it would copy.
@@ -81,10 +90,10 @@ def read_source_vertices(mesh: bpy.types.Mesh) -> Array | None:
     number, sums = values[::2], values[1::2]
     whole = (number >= 0) & (number < _NUMBERS) & (number == np.floor(number))
     rows = np.where(whole, number, 0).astype(np.int32)
-    return np.where(whole & (_checksum(rows) == sums), rows, -1).astype(np.int32)
+    return np.where(whole & (_checksum(rows, rest) == sums), rows, -1).astype(np.int32)
 
 
-def source_rows(mesh: bpy.types.Mesh, count: int) -> Array | None:
+def source_rows(mesh: bpy.types.Mesh, rest: Mesh) -> Array | None:
     """(n,) int32 asset's vertex of each vertex of a mesh, -1 of new ones; None where that is not known.
 
     A mesh that knows nothing, as those of older files, has the vertices of the asset if it has as many.
@@ -92,18 +101,32 @@ def source_rows(mesh: bpy.types.Mesh, count: int) -> Array | None:
     Parameters
     ----------
     mesh : bpy.types.Mesh
-    count : int
-        Vertices of the asset.
+    rest : Mesh
+        Of the asset.
     """
-    rows = read_source_vertices(mesh)
+    rows, count = read_source_vertices(mesh, rest), len(rest.vertices)
     if rows is not None and (rows < count).all() and (rows >= 0).any():
         return rows
     return np.arange(count, dtype=np.int32) if len(mesh.vertices) == count else None
 
 
-def _checksum(rows: Array) -> Array:
-    """(n,) float32 in [1, 2): bits of the finaliser of MurmurHash3, so that those of a mean are not the mean."""
-    x = rows.astype(np.uint32) + np.uint32(1)
+def _key(rest: Mesh) -> int:
+    """A number of the mesh of an asset, kept for the last ones."""
+    known = _keys.get(id(rest.faces))
+    if known is None or known[0] is not rest.faces:
+        while len(_keys) >= _KEPT:
+            del _keys[next(iter(_keys))]
+        key = zlib.crc32(np.ascontiguousarray(rest.vertices).data, zlib.crc32(np.ascontiguousarray(rest.faces).data))
+        known = _keys[id(rest.faces)] = rest.faces, key
+    return known[1]
+
+
+def _checksum(rows: Array, rest: Mesh) -> Array:
+    """(n,) float32 in [1, 2): bits of the finaliser of MurmurHash3, so that those of a mean are not the mean.
+
+    They are others for the vertices of every asset.
+    """
+    x = rows.astype(np.uint32) + np.uint32(_key(rest))
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
         x = (x ^ (x >> np.uint32(shift))) * np.uint32(factor)
     return ((x >> np.uint32(9)) | np.uint32(0x3F800000)).view(np.float32)

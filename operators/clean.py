@@ -240,7 +240,7 @@ def points_of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.type
     rows = None if known is None else surfel_points.rows_of(known)
     rows = np.arange(len(asset.surfels), dtype=np.int32) if rows is None else rows[rows < len(asset.surfels)]
     vertices = evaluated_vertices(obj, depsgraph)
-    own = mesh_arrays.source_rows(obj.data, len(asset.mesh.vertices))
+    own = mesh_arrays.source_rows(obj.data, asset.mesh)
     if own is not None and len(own) == len(vertices):  # what was deleted stays where it was
         posed = asset.mesh.vertices.copy()
         posed[own[own >= 0]] = vertices[own >= 0]
@@ -273,7 +273,7 @@ def in_box(box: bpy.types.Object, obj: bpy.types.Object, places: Array) -> Array
 
 def faces_of(obj: bpy.types.Object, asset: Asset, removed: Array) -> Array:
     """(p,) bool polygons of the mesh to which one of the surfels `removed` is the nearest of all, at rest."""
-    rows = mesh_arrays.source_rows(obj.data, len(asset.mesh.vertices))
+    rows = mesh_arrays.source_rows(obj.data, asset.mesh)
     found = np.zeros(len(obj.data.polygons), bool)
     if rows is None:
         return found

@@ -75,7 +75,7 @@ class DRGS_OT_save_asset(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
                 obj.drgs.adjustment.reset()
                 obj.drgs.surfel_points = None
                 if rows is not None:
-                    mesh_arrays.write_source_vertices(obj.data, rows)
+                    mesh_arrays.write_source_vertices(obj.data, assets.load(target).mesh, rows)
                 mesh_arrays.restore_channels(obj.data, assets.captured_mesh(obj))
                 update_viewport_material(obj.data)
         self.report({"INFO"}, f"Saved {', '.join(map(str, paths))}")
@@ -109,7 +109,7 @@ def rows_in_part(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.nd
     part = check_topology(evaluated, evaluated.data, rest, messages.Warnings()).part
     if part is None:
         return None
-    rows = mesh_arrays.source_rows(obj.data, len(rest.vertices))
+    rows = mesh_arrays.source_rows(obj.data, rest)
     assert rows is not None, "the evaluated mesh knows them"
     if len(evaluated.data.vertices) == len(rows):
         return np.where(rows >= 0, np.cumsum(rows >= 0) - 1, -1).astype(np.int32)

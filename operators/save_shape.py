@@ -72,11 +72,11 @@ class DRGS_OT_save_shape(CommandOperator, selection.ObjectMode, bpy.types.Operat
                 f'"{obj.name}" was edited meanwhile: it keeps its file; {self._target.name} has the shape of before'
             )
             return {"FINISHED"}
-        rows = mesh_arrays.source_rows(obj.data, len(assets.load(assets.file_of(obj)).mesh.vertices))
+        rows = mesh_arrays.source_rows(obj.data, assets.load(assets.file_of(obj)).mesh)
         new = np.zeros(len(rest.vertices), bool) if rows is None else rows < 0
         obj.drgs.asset = assets.anchor(self._target)
         obj.drgs.surfel_points = None
-        mesh_arrays.write_source_vertices(obj.data)
+        mesh_arrays.write_source_vertices(obj.data, rest)
         give_channels(obj.data, rest, new)
         update_viewport_material(obj.data)
         obj.update_tag()
@@ -93,7 +93,7 @@ def edit_of(obj: bpy.types.Object, rest: Mesh) -> dict[str, Array]:
         Its vertices are not known; names the object.
     """
     mesh = obj.data
-    rows = mesh_arrays.source_rows(mesh, len(rest.vertices))
+    rows = mesh_arrays.source_rows(mesh, rest)
     if rows is None:
         raise AssetError(
             f'Object "{obj.name}"', f"its mesh has {len(mesh.vertices)} vertices, the asset {len(rest.vertices)}",

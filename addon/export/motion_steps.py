@@ -10,7 +10,7 @@ import numpy as np
 from ...drgs_blender.core.arrays import same_bits
 from ...drgs_blender.core.asset.part import Part
 from ...drgs_blender.core.frame import Frame, MotionStep, Pose
-from .. import mesh_arrays
+from .. import assets, mesh_arrays
 from .camera import export_camera, picture_of
 from .instances import Key, uncancelled, visible
 
@@ -56,13 +56,11 @@ def add_moments(
             frame_set(now, part)
 
 
-def _vertices(mesh: bpy.types.Mesh, part: Part | None) -> Array:
-    """Vertices of a mesh, or of the part of an asset that it has now; all of them where it has another then."""
-    vertices = mesh_arrays.read_vertices(mesh)
-    rows = None if part is None else mesh_arrays.read_source_vertices(mesh)
-    if part is None or rows is None or not np.array_equal(rows[rows >= 0], part.vertices):
-        return vertices
-    return vertices[rows >= 0]
+def _vertices(obj: bpy.types.Object, part: Part) -> Array:
+    """Vertices of the part of its asset that an object has now; all of them where it has another then."""
+    vertices = mesh_arrays.read_vertices(obj.data)
+    rows = mesh_arrays.read_source_vertices(obj.data, assets.load(assets.file_of(obj)).mesh)
+    return vertices if rows is None or not np.array_equal(rows[rows >= 0], part.vertices) else vertices[rows >= 0]
 
 
 def _moment(
@@ -88,7 +86,8 @@ def _moment(
         if shape not in vertices and not mesh.is_editmode:
             pointer = mesh.as_pointer()
             if pointer not in read:
-                read[pointer] = _vertices(mesh, frame.objects[shape[1]].part if shape[0] == "object" else None)
+                part = frame.objects[shape[1]].part if shape[0] == "object" else None
+                read[pointer] = mesh_arrays.read_vertices(mesh) if part is None else _vertices(item.object, part)
                 read[pointer].flags.writeable = False
             vertices[shape] = read[pointer]
 

@@ -100,13 +100,14 @@ def check_topology(obj: bpy.types.Object, mesh: bpy.types.Mesh, rest: Mesh, warn
         the modifiers that may have done it.
     """
     count = len(rest.vertices)
-    rows = mesh_arrays.source_rows(mesh, count)
+    rows = mesh_arrays.source_rows(mesh, rest)
     if rows is None:
         raise _wrong_count(obj, len(mesh.vertices), count)
     triangles = mesh_arrays.read_triangles(mesh)
     if len(rows) == count and triangles is not None and np.array_equal(triangles, rest.faces):
         return Fit()
-    known = mesh_arrays.read_source_vertices(mesh) is not None
+    own = mesh_arrays.read_source_vertices(mesh, rest)
+    known = own is not None and bool((own >= 0).any())
     if not known and len(foreign := np.setdiff1d(_keys(mesh_arrays.read_edges(mesh)), _keys(_edges(rest.faces)))):
         raise AssetError(
             f'Object "{obj.name}"',

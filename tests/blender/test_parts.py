@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 import pytest
-from scenes import part, read_exr, select, sphere
+from scenes import asset_of, part, read_exr, select, sphere
 from test_render import light
 
 pytestmark = pytest.mark.blender_api
@@ -195,6 +195,20 @@ def test_a_cut_object_is_saved_and_is_whole_again(ball, export, tmp_path, ball_f
     assert after.part is None and after.asset == str(path) and after.albedo is None
     bpy.ops.import_scene.drgs(filepath=str(path))
     assert export()[1] == []
+
+
+def test_vertices_of_another_asset_are_not_taken_for_its_own(ball, export, tmp_path):
+    """Two captures with the same faces are joined: only the active one's are rendered, and the others are counted."""
+    vertices, faces = sphere()
+    container.write_asset(tmp_path / "wide.drgs", asset_of(vertices * np.float32([2, 1, 1]), faces))
+    bpy.ops.import_scene.drgs(filepath=str(tmp_path / "wide.drgs"))
+    wide = bpy.context.active_object
+    select(wide, ball)
+    bpy.ops.object.join()
+    (state,), warnings = export()[0].objects, export()[1]
+    assert sorted(state.part.face) == list(range(len(faces)))
+    assert warnings == [f'"ball": {len(faces)} faces are not in its asset and are not rendered']
+    np.testing.assert_array_equal(state.vertices, vertices[state.part.vertices])
 
 
 def test_materials_are_set_restored_and_painted_on_what_is_left(ball, export):
