@@ -75,8 +75,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     light.add_argument("--env-strength", type=finite, default=1.0, metavar="S", help="strength of the environment")
     light.add_argument(
         "--captured", action="store_true",
-        help="show the surfels unlit, in the view-dependent colours of their capture; needs no environment (the asset's "
-        "is behind them: --transparent leaves it out)",
+        help="show the surfels unlit, in the view-dependent colours of their capture; needs no environment (that "
+        "of the asset is behind them: --transparent leaves it out)",
     )  # fmt: skip
     pose = parser.add_argument_group("pose").add_mutually_exclusive_group()
     pose.add_argument("--cache", type=Path, metavar="CACHE", help="folder that `drgs simulate` wrote")
