@@ -59,17 +59,20 @@ def attach(obj: bpy.types.Object, path: Path, first: int) -> None:
 
 def check(obj: bpy.types.Object, rest: Mesh, warn: Callable[[str], None], *, final: bool) -> None:
     """Warn of point caches that Blender cannot play on `obj` because they have another number of vertices."""
+    count = len(obj.original.data.vertices)
     for modifier in obj.original.modifiers:
         if modifier.type != "MESH_CACHE" or not (modifier.show_render if final else modifier.show_viewport):
             continue
         path = Path(bpy.path.abspath(modifier.filepath, library=obj.original.library))
         found = header_of(path)
-        if found is None or found[0] == len(rest.vertices):
+        if found is None or found[0] == count:
             continue
         way = "choose a cache of this mesh"
-        if found[0] == rest.source_count:
+        if found[0] == len(rest.vertices):
+            way = "undo the edit of its mesh, or make the cache anew"
+        elif found[0] == rest.source_count:
             way = "those of the mesh that its asset was made from: press Play Point Cache to play it in their order"
         warn(
             f'"{obj.name}" is not moved by modifier "{modifier.name}": {path.name} has {found[0]} vertices, the mesh '
-            f"{len(rest.vertices)}; {way}"
+            f"{count}; {way}"
         )

@@ -155,6 +155,10 @@ class DRGS_OT_finish_surfels(DrgsOperator, bpy.types.Operator):
         pair = edited(context)
         assert pair is not None, "poll has looked"
         points, obj = pair
+        if obj.name not in context.view_layer.objects:
+            raise UsageError(
+                f'Object "{obj.name}"', "is in no collection of this view layer", "Undo what removed it, or show that"
+            )
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         mesh = points.data
@@ -298,7 +302,11 @@ def faces_of(obj: bpy.types.Object, asset: Asset, removed: Array) -> Array:
 
 
 def delete_vertices_or_faces(obj: bpy.types.Object, vertices: Array | None = None, faces: Array | None = None) -> None:
-    """Delete vertices, (n,) bool, or faces, (p,) bool, of the mesh of an object, with vertices that lose all faces."""
+    """Delete vertices, (n,) bool, or faces, (p,) bool, of the mesh of an object, with vertices that lose all faces.
+
+    Objects that share the mesh keep it.
+    """
+    selection.own_mesh(obj)
     mesh = bmesh.new()
     mesh.from_mesh(obj.data)
     if vertices is not None:

@@ -60,7 +60,11 @@ class DRGS_OT_play_point_cache(CommandOperator, selection.ObjectMode, bpy.types.
         rest = assets.load(asset).mesh
         points, first = found
         self._name, self._first = obj.name, first if self.use_file_start else context.scene.frame_start
-        order = self._order(rest, points, subject, path)
+        left = len(obj.data.vertices)
+        if left not in (points, len(rest.vertices)):
+            problem = f"has {left} vertices left of {len(rest.vertices)}; {path.name} has {points}"
+            raise UsageError(subject, problem, "Choose a cache of what is left, or import the asset again")
+        order = self._order(rest, points, subject, path) if left == len(rest.vertices) else "ASSET"
         if order == "ASSET":
             self._target = path
             return self.done(context)

@@ -71,6 +71,7 @@ class DRGS_OT_save_asset(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
         if self.use_saved:
             for obj, target in zip(selection.editable(objects, vertices=False, data=True), paths):
                 rows = rows_in_part(obj, context.evaluated_depsgraph_get())
+                selection.own_mesh(obj)
                 obj.drgs.asset = assets.anchor(target)
                 obj.drgs.adjustment.reset()
                 obj.drgs.surfel_points = None
@@ -91,12 +92,16 @@ def save(obj: bpy.types.Object, path: Path, depsgraph: bpy.types.Depsgraph) -> i
     ------
     AssetError
         The mesh is not the asset's; names the object.
+    UsageError
+        Nothing of it is left; names the object.
     WriteError
         The file cannot be written.
     """
     source = assets.file_of(obj)
     asset = assets.load(source)
     asset, _, painted, adjustment = appearance_of(obj.evaluated_get(depsgraph), asset, messages.Warnings())
+    if not len(asset.surfels) and not len(asset.mesh.faces):
+        raise UsageError(f'Object "{obj.name}"', "has nothing left of its asset", "Undo the edit, or show some of it")
     edited = edited_asset(asset, painted, adjustment)
     write_asset(path, replace(edited, provenance={**asset.provenance, "edited_from": source.name}))
     textures = asset.mesh.textures

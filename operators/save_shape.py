@@ -11,7 +11,7 @@ import numpy as np
 from bpy.props import BoolProperty, StringProperty
 
 from ..addon import assets, blend_paths, mesh_arrays, surfel_points
-from ..addon.export.face_match import match_faces
+from ..addon.export.face_match import MOST, match_faces
 from ..addon.viewport_material import update_viewport_material
 from ..drgs_blender.core.asset import MATERIAL_CHANNELS, Mesh
 from ..drgs_blender.core.errors import AssetError
@@ -67,13 +67,14 @@ class DRGS_OT_save_shape(CommandOperator, selection.ObjectMode, bpy.types.Operat
         if obj is None:
             return {"FINISHED"}
         rest = assets.load(self._target).mesh
-        if len(rest.vertices) != len(obj.data.vertices):
+        if obj.mode == "EDIT" or len(rest.vertices) != len(obj.data.vertices):
             self.warn(
                 f'"{obj.name}" was edited meanwhile: it keeps its file; {self._target.name} has the shape of before'
             )
             return {"FINISHED"}
         rows = mesh_arrays.source_rows(obj.data, assets.load(assets.file_of(obj)).mesh)
         new = np.zeros(len(rest.vertices), bool) if rows is None else rows < 0
+        selection.own_mesh(obj)
         obj.drgs.asset = assets.anchor(self._target)
         obj.drgs.surfel_points = None
         mesh_arrays.write_source_vertices(obj.data, rest)
@@ -102,10 +103,15 @@ def edit_of(obj: bpy.types.Object, rest: Mesh) -> dict[str, Array]:
     matched = match_faces(mesh, rows, rest.faces)
     corner_vertices = mesh_arrays.read_corner_vertices(mesh)
     corners, polygon = mesh_arrays.read_loop_triangles(mesh)
-    start, _ = mesh_arrays.read_polygons(mesh)
+    start, total = mesh_arrays.read_polygons(mesh)
     of_asset = np.zeros(len(mesh.polygons), bool)
     of_asset[np.searchsorted(start, matched.corners.min(axis=1), side="right") - 1] = True
-    new = corner_vertices[corners[~of_asset[polygon]]]
+    of_asset = of_asset[polygon]
+    large = np.flatnonzero((total > MOST)[polygon])  # these may be the asset's in part
+    if len(large):
+        matches = set(map(frozenset, matched.corners.tolist()))
+        of_asset[large] = [frozenset(triangle) in matches for triangle in corners[large].tolist()]
+    new = corner_vertices[corners[~of_asset]]
     found = {
         "vertices": np.array(mesh_arrays.read_vertices(mesh)),
         "source": rows,

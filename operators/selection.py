@@ -52,6 +52,12 @@ def editable(
     return found
 
 
+def own_mesh(obj: bpy.types.Object) -> None:
+    """Give an object a mesh of its own where it shares that with others, or has that of a library."""
+    if obj.data.users - obj.data.use_fake_user > 1 or not obj.data.is_editable:
+        obj.data = obj.data.copy()
+
+
 def bounds(objects: Iterable[bpy.types.Object]) -> tuple[Array, Array]:
     """Lowest and highest corner, (3,) float64 metres in the world, of undeformed meshes."""
     points = np.concatenate([world_vertices(o) for o in objects])

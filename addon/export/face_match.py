@@ -13,7 +13,7 @@ from .. import mesh_arrays
 Array = np.ndarray
 
 #: Corners of a polygon of which any three are tried; of larger ones the triangles that Blender cuts them into.
-_MOST = 8
+MOST = 8
 #: Assets whose sorted faces are kept.
 _KEPT = 4
 _kept: dict[int, tuple[Array, Array, Array]] = {}
@@ -29,7 +29,7 @@ class Matched(NamedTuple):
     corners : (m, 3) int32 array
         Corners of the mesh, in the order of the corners of the asset's face.
     foreign : int
-        Polygons that join vertices as no face of the asset does.
+        Polygons that join vertices as no face of the asset does, as a whole or in part.
     """
 
     face: Array
@@ -71,23 +71,29 @@ def match_faces(mesh: bpy.types.Mesh, rows: Array, faces: Array) -> Matched:
     both = np.zeros(len(faces), bool)
     both[face[~flipped]] = True
     right &= ~(flipped & both[face])  # the inside of a shell that a modifier made
-    corners = np.take_along_axis(corners, order, axis=1)[right]
-    seen = len(np.unique(polygon[right]))
-    return Matched(face[right], np.ascontiguousarray(corners, np.int32), len(mesh.polygons) - seen)
+    corners = np.take_along_axis(corners, order, axis=1)
+    # a polygon stands for all triangles that fill it: one over a hole has three corners of a face by chance
+    start, total = mesh_arrays.read_polygons(mesh)
+    known_before = np.r_[0, np.cumsum(of >= 0)]
+    filling = known_before[start + total] - known_before[start] - 2
+    large = total > MOST
+    right &= (np.bincount(polygon[right], minlength=len(total)) >= filling)[polygon] | large[polygon]
+    whole = np.bincount(polygon[right], minlength=len(total)) >= np.where(large, total - 2, 1)
+    return Matched(face[right], np.ascontiguousarray(corners[right], np.int32), int((~whole).sum()))
 
 
 def _triangles(mesh: bpy.types.Mesh) -> tuple[Array, Array]:
     """(t, 3) corners of all triangles that polygons may stand for, and the (t,) polygon of each."""
     start, total = mesh_arrays.read_polygons(mesh)
     corners, polygons = [], []
-    for size in np.unique(total[total <= _MOST]):
+    for size in np.unique(total[total <= MOST]):
         of_size = np.flatnonzero(total == size)
         for chosen in combinations(range(size), 3):
             corners.append(start[of_size, None] + np.array(chosen, np.int32))
             polygons.append(of_size)
-    if (total > _MOST).any():
+    if (total > MOST).any():
         cut, polygon = mesh_arrays.read_loop_triangles(mesh)
-        large = total[polygon] > _MOST
+        large = total[polygon] > MOST
         corners.append(cut[large])
         polygons.append(polygon[large])
     if not corners:

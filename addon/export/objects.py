@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.core.asset import MATERIAL_CHANNELS, Asset
-from ...drgs_blender.core.asset.part import Part, part_of
+from ...drgs_blender.core.asset.part import Part, has_surfels, part_of
 from ...drgs_blender.core.frame import Adjustment, ObjectState
 from ...drgs_blender.core.materials import ShaderAOV
 from ...drgs_blender.core.passes import Pass
@@ -88,8 +88,8 @@ class DrgsObjects:
             (uid(obj), uid(obj.data), uid(obj.original.drgs.surfel_points)),
             lambda: _shape(obj, self._depsgraph, self._key_of, self._warn),
         )
-        if shape.part is not None and not len(shape.part.face) and shape.part.removed is None:
-            self._warn(f'"{obj.name}": none of the faces of its asset is left; it is left out')
+        if (lack := _lack(obj, shape.part, self._depsgraph.scene.drgs)) is not None:
+            self._warn(f'"{obj.name}": {lack}; it is left out')
             return
         material = obj.material_slots[0].material if obj.material_slots else None
         visibility = self._holdouts.cut_out(item, [material], lambda: None).visibility
@@ -108,6 +108,18 @@ class DrgsObjects:
         )
         _check_shown(obj, material, shape, self._warn)
         self.keys.append(item.key)
+
+
+def _lack(obj: bpy.types.Object, part: Part | None, settings: bpy.types.PropertyGroup) -> str | None:
+    """Why nothing would be seen of what an object has left of its asset; None: something is."""
+    if part is None:
+        return None
+    asset = assets.load(assets.file_of(obj))
+    if asset.binding is not None and not len(part.face):
+        return "none of the faces of its asset is left"
+    if "surfels" in (settings.camera_sees, settings.rays_see) and not has_surfels(asset, part):
+        return "none of the surfels of its asset is left"
+    return None
 
 
 def _check_shown(obj: bpy.types.Object, material: bpy.types.Material | None, shape: ObjectState, warn: Warn) -> None:
@@ -136,7 +148,7 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     asset = assets.load(path)
     # While a mesh is edited, its evaluated data is a wrapper without arrays; a converted copy has them.
     editing, captured = obj.mode == "EDIT", obj.drgs.show_captured
-    mesh = obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph) if editing else obj.data
+    mesh = _converted(obj, depsgraph) if editing else obj.data
     try:
         point_caches.check(obj, asset.mesh, warn, final=depsgraph.mode == "RENDER")
         fit = without_removed(check_topology(obj, mesh, asset.mesh, warn), obj, asset)
@@ -156,6 +168,13 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     finally:
         if editing:
             obj.to_mesh_clear()
+
+
+def _converted(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.types.Mesh:
+    """The mesh of an object in Edit Mode: in viewports as it is edited now, with the modifiers that are shown there."""
+    if depsgraph.mode == "VIEWPORT":
+        return obj.to_mesh()
+    return obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)  # of what Blender has written back before
 
 
 def without_removed(fit: Fit, obj: bpy.types.Object, asset: Asset) -> Fit:

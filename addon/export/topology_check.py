@@ -12,7 +12,7 @@ from ...drgs_blender.core.asset import Mesh
 from ...drgs_blender.core.asset.part import Part
 from ...drgs_blender.core.errors import AssetError
 from .. import mesh_arrays
-from .face_match import match_faces
+from .face_match import Matched, match_faces
 
 Array = np.ndarray
 
@@ -30,6 +30,22 @@ REMODELLING = {
     "REMESH": "making a new mesh", "MIRROR": "mirroring the mesh", "SKIN": "making a new mesh",
     "SCREW": "making a new mesh", "OCEAN": "making a new mesh",
 }  # fmt: skip
+
+
+#: Matches that are kept.
+_KEPT = 16
+
+
+class _Kept(NamedTuple):
+    """What was found of a mesh: the asset's faces, the state of the mesh, and what that has of them."""
+
+    faces: Array
+    state: tuple[Array, Array, Array]
+    matched: Matched
+    part: Part | None
+
+
+_matches: list[_Kept] = []
 
 
 def check_modifiers(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
@@ -96,10 +112,13 @@ def check_topology(obj: bpy.types.Object, mesh: bpy.types.Mesh, rest: Mesh, warn
     Raises
     ------
     AssetError
-        Nothing of the asset is left, or the vertices do not know which they are and are others; names object, asset and
-        the modifiers that may have done it.
+        The vertices do not know which of the asset's they are, and are others or joined by other faces; names object,
+        asset and the modifiers that may have done it.
     """
     count = len(rest.vertices)
+    if count and not len(mesh.vertices):  # all are deleted, masked or not built yet
+        none, corners = np.zeros(0, np.int32), np.zeros((0, 3), np.int32)
+        return Fit(Part(none, corners, none), None, corners)
     rows = mesh_arrays.source_rows(mesh, rest)
     if rows is None:
         raise _wrong_count(obj, len(mesh.vertices), count)
@@ -115,22 +134,47 @@ def check_topology(obj: bpy.types.Object, mesh: bpy.types.Mesh, rest: Mesh, warn
             f"({len(foreign)} edges differ){_named(obj)}",
             "Undo the edit or disable the modifier, import the asset again, or choose the file of this mesh",
         )
-    matched = match_faces(mesh, rows, rest.faces)
-    if len(mesh.polygons) and not len(matched.face) and len(rest.faces):
+    matched, part = _kept_match(mesh, rows, rest)
+    if not known and len(mesh.polygons) and not len(matched.face) and len(rest.faces):
         raise AssetError(
             f'Object "{obj.name}"', f"has no face of {obj.original.drgs.asset.name} any more{_named(obj)}",
             "Undo the edit or disable the modifier, or import the asset again",
         )  # fmt: skip
     if matched.foreign:
         warn(f'"{obj.name}": {matched.foreign} faces are not in its asset and are not rendered')
-    in_order = len(rows) == count and bool((rows == np.arange(count)).all())
+    if part is None:
+        return Fit(corners=matched.corners)
+    there = rows >= 0
+    return Fit(part, None if there.all() else np.flatnonzero(there), matched.corners)
+
+
+def _kept_match(mesh: bpy.types.Mesh, rows: Array, rest: Mesh) -> tuple[Matched, Part | None]:
+    """Faces of a mesh that its asset has, and the part of it that they are; None: all, then in its order.
+
+    The last ones are kept, as most frames of an animation move vertices alone.
+    """
+    joined = mesh_arrays.read_corner_vertices(mesh)
+    start = np.zeros(0, np.int32) if len(joined) == 3 * len(mesh.polygons) else mesh_arrays.read_polygons(mesh)[0]
+    state = rows, joined, start
+    for i, entry in enumerate(_matches):
+        if entry.faces is rest.faces and all(map(np.array_equal, entry.state, state)):
+            del _matches[i]
+            break
+    else:
+        entry = _Kept(rest.faces, state, *_match(mesh, rows, joined, rest))
+    _matches.insert(0, entry)
+    del _matches[_KEPT:]
+    return entry.matched, entry.part
+
+
+def _match(mesh: bpy.types.Mesh, rows: Array, joined: Array, rest: Mesh) -> tuple[Matched, Part | None]:
+    matched = match_faces(mesh, rows, rest.faces)
+    in_order = np.array_equal(rows, np.arange(len(rest.vertices)))
     if in_order and len(matched.face) == len(np.unique(matched.face)) == len(rest.faces):
-        return Fit(corners=matched.corners[np.argsort(matched.face)])
+        return matched._replace(corners=matched.corners[np.argsort(matched.face)]), None
     there = rows >= 0
     number = np.cumsum(there, dtype=np.int32) - 1
-    faces = number[mesh_arrays.read_corner_vertices(mesh)[matched.corners]]
-    part = Part(rows[there], np.ascontiguousarray(faces, np.int32), matched.face)
-    return Fit(part, None if there.all() else np.flatnonzero(there), matched.corners)
+    return matched, Part(rows[there], np.ascontiguousarray(number[joined[matched.corners]], np.int32), matched.face)
 
 
 def _edges(faces: Array) -> Array:

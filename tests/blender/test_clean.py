@@ -206,3 +206,41 @@ def test_points_of_another_asset_are_named(littered, export, ball_file):
     obj.drgs.surfel_points.attributes["drgs_surfel"].data[0].value = 10**6
     with pytest.raises(Exception, match=r'"littered".*its points .* Press Restore Surfels'):
         export()
+
+
+@pytest.mark.parametrize("way", ["finish", "save_asset", "save_shape"])
+def test_objects_that_share_the_mesh_stay_as_they_are(ball, export, tmp_path, way):
+    """Linked duplicates (Alt-D): of one, surfels are deleted with their faces, or it is saved as another asset."""
+    twin = bpy.data.objects.new("twin", ball.data)
+    twin.drgs.asset = ball.drgs.asset
+    bpy.context.scene.collection.objects.link(twin)
+    if way == "finish":
+        import bmesh
+
+        select(ball)
+        bpy.ops.drgs.edit_surfels()
+        mesh = bmesh.from_edit_mesh(bpy.context.edit_object.data)
+        for vertex in mesh.verts:
+            vertex.select = vertex.co.z > 0
+        bmesh.update_edit_mesh(bpy.context.edit_object.data)
+        bpy.ops.mesh.delete(type="VERT")
+        bpy.ops.drgs.finish_surfels()
+        parts = {state.name: state.part for state in export()[0].objects}
+        assert parts["twin"] is None and len(parts["ball"].face) < 168
+        return
+    import bmesh
+
+    mesh = bmesh.new()
+    mesh.from_mesh(ball.data)
+    bmesh.ops.delete(mesh, geom=[v for v in mesh.verts if v.co.z > 0.1], context="VERTS")
+    mesh.to_mesh(ball.data)
+    mesh.free()
+    select(ball, twin)
+    if way == "save_asset":
+        assert bpy.ops.drgs.save_asset(filepath=str(tmp_path / "a.drgs"), use_saved=True) == {"FINISHED"}
+        assert [state.part for state in export()[0].objects] == [None, None]
+    else:
+        select(ball)
+        assert bpy.ops.drgs.save_shape(filepath=str(tmp_path / "a.drgs")) == {"FINISHED"}
+        parts = {state.name: state.part for state in export()[0].objects}
+        assert parts["ball"] is None and len(parts["twin"].face) == 84

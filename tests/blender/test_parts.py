@@ -257,3 +257,102 @@ def test_motion_vectors_are_of_what_is_left(ball, scene, export):
     pose = frame.previous.objects[0] if frame.previous is not None else None
     if pose is not None:
         assert pose.vertices is None and not np.array_equal(pose.matrices[0], frame.objects[0].matrix_world)
+
+
+@pytest.mark.parametrize("way", ["deleted", "masked", "built later"])
+def test_no_vertex_left_leaves_the_object_out(ball, scene, export, way, tmp_path):
+    """Such as the first frames of a Build modifier: a warning, and everything else is rendered."""
+    if way == "deleted":
+        delete(ball, np.ones(86, bool))
+    elif way == "masked":
+        ball.modifiers.new("Mask", "MASK").vertex_group = ball.vertex_groups.new(name="None").name
+    else:
+        ball.modifiers.new("Build", "BUILD").frame_start = 10
+    frame, warnings = export()
+    assert frame.objects == [] and warnings == ['"ball": none of the faces of its asset is left; it is left out']
+    select(ball)
+    with pytest.raises(RuntimeError, match="has nothing left of its asset"):
+        bpy.ops.drgs.save_asset(filepath=str(tmp_path / "nothing.drgs"))
+
+
+def test_new_faces_alone_are_left_out(ball, export):
+    """A hole is filled, and the filling separated."""
+    delete(ball, high(ball, 0.6))
+
+    def fill():
+        bpy.context.tool_settings.mesh_select_mode = False, True, False
+        bpy.ops.mesh.select_non_manifold(extend=False)
+        bpy.ops.mesh.edge_face_add()
+        bpy.ops.mesh.separate(type="SELECTED")
+
+    edit(ball, fill)
+    frame, warnings = export()
+    assert [state.name for state in frame.objects] == ["ball"]
+    assert '"ball.001": none of the faces of its asset is left; it is left out' in warnings
+
+
+def test_pieces_without_surfels_are_left_out(ball, scene, export):
+    """Faces that no surfel hangs on, because all are removed: where surfels are seen, the rest is rendered."""
+    light(scene)
+    select(ball)
+    bpy.ops.drgs.edit_surfels()
+    bpy.ops.mesh.select_all(action="SELECT")
+    bpy.ops.mesh.delete(type="VERT")
+    bpy.ops.drgs.finish_surfels(use_faces=False)
+    assert export()[1] == ['"ball": none of the surfels of its asset is left; it is left out']
+    assert bpy.ops.render.render() == {"FINISHED"}
+
+
+def test_a_cut_object_that_moves_is_matched_once(ball, export, monkeypatch):
+    check = part("addon.export.topology_check")
+    calls, match = [], check.match_faces
+    monkeypatch.setattr(check, "match_faces", lambda *given: calls.append(1) or match(*given))
+    delete(ball, high(ball))
+    first = export()[0].objects[0]
+    ball.data.vertices[0].co.x += 1
+    ball.data.update()
+    second = export()[0].objects[0]
+    assert len(calls) == 1 and second.part is first.part and second.vertices[0, 0] == first.vertices[0, 0] + 1
+    delete(ball, high(ball, -0.5))
+    assert len(export()[0].objects[0].part.face) < len(first.part.face) and len(calls) == 2
+
+
+@pytest.mark.parametrize("count", [86, 49])
+def test_a_cut_object_plays_caches_of_what_is_left(ball, export, tmp_path, count):
+    import struct
+
+    delete(ball, high(ball))
+    path = tmp_path / "cache.pc2"
+    head = struct.pack("<12s2i2fi", b"POINTCACHE2\0", 1, count, 1, 1.0, 1)
+    path.write_bytes(head + np.full((count, 3), 2, "<f4").tobytes())
+    if count == 49:
+        assert bpy.ops.drgs.play_point_cache(filepath=str(path)) == {"FINISHED"}
+        (state,), warnings = export()[0].objects, export()[1]
+        assert warnings == [] and (state.vertices == 2).all()
+        delete(ball, high(ball, -0.5))
+        assert 'is not moved by modifier "Point Cache"' in export()[1][0]
+        return
+    with pytest.raises(RuntimeError, match=r"has 49 vertices left of 86; cache\.pc2 has 86"):
+        bpy.ops.drgs.play_point_cache(filepath=str(path))
+
+
+def test_finish_of_an_object_that_is_gone_is_refused(ball):
+    bpy.ops.drgs.edit_surfels()
+    points = bpy.context.active_object
+    for collection in ball.users_collection:
+        collection.objects.unlink(ball)
+    with pytest.raises(RuntimeError, match="is in no collection of this view layer"):
+        bpy.ops.drgs.finish_surfels()
+    assert points.name in bpy.data.objects
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def test_viewports_show_what_is_deleted_at_once(ball, export):
+    select(ball)
+    bpy.ops.object.mode_set(mode="EDIT")
+    try:
+        choose(ball, high(ball))
+        bpy.ops.mesh.delete(type="VERT")
+        assert len(export()[0].objects[0].part.face) == 84
+    finally:
+        bpy.ops.object.mode_set(mode="OBJECT")

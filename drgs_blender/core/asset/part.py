@@ -73,6 +73,18 @@ def part_of(asset: Asset, part: Part, subject: str = "part") -> Asset:
     return replace(asset, mesh=cut, surfels=surfels, binding=binding)
 
 
+def has_surfels(asset: Asset, part: Part) -> bool:
+    """Whether a part of an asset has any surfel."""
+    kept = np.ones(len(asset.surfels), bool)
+    if part.removed is not None:
+        kept[part.removed] = False
+    if asset.binding is None:
+        return bool(kept.any())
+    there = np.zeros(len(asset.mesh.faces), bool)
+    there[part.face] = True
+    return bool((there[asset.binding.face] & kept).any())
+
+
 def part_of_faces(mesh: Mesh, faces: Array) -> Part:
     """The part of some faces of a mesh, (m,) bool, with the vertices that they use."""
     rows = np.unique(mesh.faces[faces])
