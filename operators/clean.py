@@ -30,6 +30,8 @@ class DRGS_OT_edit_surfels(DrgsOperator, selection.ObjectMode, bpy.types.Operato
 
     def run(self, context: bpy.types.Context) -> set[str]:
         (obj,) = selection.editable(selection.selected(context)[-1:], vertices=False)
+        for earlier in [o for o in bpy.data.objects if o.drgs.points_of == obj]:
+            bpy.data.objects.remove(earlier)  # not finished: what was deleted in it is, its mesh says so
         mesh = points_of(obj, context.evaluated_depsgraph_get())
         surfel_points.keep_removed(mesh, len(assets.load(assets.file_of(obj)).surfels))
         points = bpy.data.objects.new(mesh.name, mesh)

@@ -95,6 +95,21 @@ def test_editing_goes_on_where_it_was_left(littered, export):
     assert [o.type for o in bpy.context.scene.objects if o.name.endswith("surfels")] == []
 
 
+def test_editing_that_was_not_finished_goes_on(littered, export):
+    """Tab and another click on Edit Surfels: one set of points, without what was deleted before."""
+    obj, _, litter = littered
+    bpy.ops.drgs.edit_surfels()
+    bpy.ops.drgs.select_surfels(criterion="FLOATERS")
+    bpy.ops.mesh.delete(type="VERT")
+    bpy.ops.object.mode_set(mode="OBJECT")
+    select(obj)
+    assert bpy.ops.drgs.edit_surfels() == {"FINISHED"}
+    assert len(chosen()) == (~litter).sum()
+    assert [o.drgs.points_of for o in bpy.data.objects if o.drgs.points_of is not None] == [obj]
+    assert bpy.ops.drgs.finish_surfels() == {"FINISHED"}
+    assert len(export()[0].objects[0].part.removed) == litter.sum()
+
+
 def test_faces_go_with_the_surfels_that_cover_them(littered, export):
     """Half of the surfels deleted by hand: their faces go, with Finish, and with them nothing else."""
     import bmesh
