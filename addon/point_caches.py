@@ -69,7 +69,7 @@ def check(obj: bpy.types.Object, rest: Mesh, warn: Callable[[str], None], *, fin
             continue
         way = "choose a cache of this mesh"
         if found[0] == len(rest.vertices):
-            way = "undo the edit of its mesh, or make the cache anew"
+            way = "undo the edit of its mesh, or make the cache again"
         elif found[0] == rest.source_count:
             way = "those of the mesh that its asset was made from: press Play Point Cache to play it in their order"
         warn(

@@ -65,17 +65,22 @@ def removed_of(obj: bpy.types.Object, asset: Asset) -> Array | None:
                 "Press Restore Surfels in sidebar > DR-GS > Clean",
             )  # fmt: skip
         left = found
-    gone = np.ones(count, bool)
-    gone[left] = False
-    return np.flatnonzero(gone).astype(np.int32) if gone.any() else None
+    gone = _lacking(left, count)
+    return gone if len(gone) else None
 
 
 def keep_removed(mesh: bpy.types.Mesh, count: int) -> None:
     """Have a mesh of points remember which of `count` surfels it lacks, for as long as it is edited."""
     rows = rows_of(mesh)
-    gone = np.ones(count, bool)
-    gone[[] if rows is None else rows] = False
-    if gone.any():
-        mesh[SURFEL] = np.flatnonzero(gone).tolist()
+    gone = _lacking(np.zeros(0, np.int32) if rows is None else rows, count)
+    if len(gone):
+        mesh[SURFEL] = gone.tolist()
     elif SURFEL in mesh:
         del mesh[SURFEL]
+
+
+def _lacking(left: Array, count: int) -> Array:
+    """(k,) int32 of `count` surfels, those that are not among the surfels `left`, (n,) int."""
+    gone = np.ones(count, bool)
+    gone[left] = False
+    return np.flatnonzero(gone).astype(np.int32)

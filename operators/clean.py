@@ -13,7 +13,7 @@ from ..addon.viewport.surfels import posed_centres
 from ..drgs_blender.core.asset import Asset
 from ..drgs_blender.core.asset.part import taken
 from ..drgs_blender.core.errors import UsageError
-from ..drgs_blender.core.floaters import distance_from_mesh, find_floaters
+from ..drgs_blender.core.floaters import distance_from_mesh, find_floaters, median_size
 from . import selection
 from .base import DrgsOperator
 
@@ -114,12 +114,11 @@ class DRGS_OT_select_surfels(DrgsOperator, bpy.types.Operator):
     def chosen_of(self, asset: Asset, rows: Array, before: Array) -> Array:
         """(n,) bool of the surfels `rows`, of which `before` says what is selected."""
         surfels = asset.surfels
-        size = surfels.scale.max(axis=1)
-        typical = float(np.median(size)) if len(size) else 0.0
+        typical = median_size(surfels)
         if self.criterion == "OPACITY":
             return (surfels.opacity < self.opacity)[rows]
         if self.criterion == "SIZE":
-            return (size > self.size * typical)[rows]
+            return (surfels.scale.max(axis=1) > self.size * typical)[rows]
         if self.criterion == "COLOUR":
             if not before.any():
                 raise UsageError("Selection", "holds no surfel whose colour is meant", "Select one or several")

@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.core.asset import MATERIAL_CHANNELS, Asset
-from ...drgs_blender.core.asset.part import Part, has_surfels, part_of
+from ...drgs_blender.core.asset.part import Part, has_surfels, part_of, whole_of
 from ...drgs_blender.core.frame import Adjustment, ObjectState
 from ...drgs_blender.core.materials import ShaderAOV
 from ...drgs_blender.core.passes import Pass
@@ -81,8 +81,10 @@ class DrgsObjects:
             return
         check_modifiers(obj, self._depsgraph)
         cache_playback.check(obj, self._warn, final=self._depsgraph.mode == "RENDER")
-        appearance = obj.drgs.show_captured, obj.drgs.adjustment.values(), *cache_playback.fracture_state(obj).items()
-        appearance = *appearance, surfel_points.state_of(obj)
+        appearance = (
+            obj.drgs.show_captured, obj.drgs.adjustment.values(), *cache_playback.fracture_state(obj).items(),
+            surfel_points.state_of(obj),
+        )  # fmt: skip
         shape = self._cache.get(
             ("object", uid(obj), obj.name, obj.data.as_pointer(), obj.mode, str(assets.file_of(obj)), appearance),
             (uid(obj), uid(obj.data), uid(obj.original.drgs.surfel_points)),
@@ -182,8 +184,7 @@ def without_removed(fit: Fit, obj: bpy.types.Object, asset: Asset) -> Fit:
     removed = surfel_points.removed_of(obj, asset)
     if removed is None:
         return fit
-    whole = np.arange(len(asset.mesh.vertices), dtype=np.int32), asset.mesh.faces
-    part = Part(*whole, np.arange(len(asset.mesh.faces), dtype=np.int32)) if fit.part is None else fit.part
+    part = whole_of(asset.mesh) if fit.part is None else fit.part
     return fit._replace(part=replace(part, removed=removed))
 
 

@@ -24,7 +24,7 @@ DEFORMING = {
     *("DATA_TRANSFER", "NORMAL_EDIT", "WEIGHTED_NORMAL", "UV_PROJECT", "UV_WARP", "VERTEX_WEIGHT_EDIT"),
     *("VERTEX_WEIGHT_MIX", "VERTEX_WEIGHT_PROXIMITY", "DYNAMIC_PAINT", "PARTICLE_SYSTEM"),
 }
-#: Modifiers that make all faces anew, and how.
+#: Modifiers that make other faces, and how.
 REMODELLING = {
     "SUBSURF": "subdividing the mesh", "MULTIRES": "subdividing the mesh", "DECIMATE": "merging faces",
     "REMESH": "making a new mesh", "MIRROR": "mirroring the mesh", "SKIN": "making a new mesh",
@@ -49,7 +49,7 @@ _matches: list[_Kept] = []
 
 
 def check_modifiers(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
-    """Refuse an object whose faces a modifier makes anew, before its mesh is asked for.
+    """Refuse an object whose faces a modifier replaces, before its mesh is asked for.
 
     From 5.0 on Blender subdivides only when somebody looks at the result, which may take minutes.
 

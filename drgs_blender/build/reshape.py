@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 _PIECE = 2.5
 #: Known vertices by which the materials of a new one are interpolated.
 _NEAREST = 8
-_REMEDY = "Write it anew"
+_REMEDY = "Write it again"
 
 
 @dataclass(slots=True)

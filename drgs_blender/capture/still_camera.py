@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from ..core.arrays import Array
-from ..reconstruct.capture.turntable import COARSE, FINE, PAIRS, Surroundings, correlation
+from ..reconstruct.capture.turntable import PAIRS, Surroundings, correlation, detail_of
 
 #: Part of a picture's side, from each edge, that counts as surroundings.
 _RIM = 0.16
@@ -50,8 +49,4 @@ def _rim(picture: Array) -> Surroundings:
     known = np.ones(picture.shape)
     rows, columns = (max(2, round(_RIM * side)) for side in picture.shape)
     known[rows:-rows, columns:-columns] = 0
-
-    def blurred(deviation: float) -> Array:
-        return gaussian_filter(picture * known, deviation) / np.maximum(gaussian_filter(known, deviation), 1e-3)
-
-    return Surroundings((blurred(_SCALE * FINE) - blurred(_SCALE * COARSE)) * known, known)
+    return detail_of(picture, known, _SCALE)

@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     check_writable(args.out, [args.asset])
 
     from ..core.asset.container import read_asset, write_asset
-    from ..core.asset.part import Part, part_of, part_of_faces
+    from ..core.asset.part import part_of, part_of_faces, whole_of
 
     asset = read_asset(args.asset)
     count, mesh = len(asset.surfels), asset.mesh
@@ -87,11 +87,7 @@ def run(args: argparse.Namespace) -> int:
     if gone.all() or (len(faces) and not faces.any()):
         raise UsageError(str(args.asset), "would be gone as a whole", "Remove less")
     whole = faces.all()
-    part = (
-        Part(np.arange(len(mesh.vertices), dtype=np.int32), mesh.faces, np.arange(len(faces), dtype=np.int32))
-        if whole
-        else part_of_faces(mesh, faces)
-    )
+    part = whole_of(mesh) if whole else part_of_faces(mesh, faces)
     if gone.any():
         part.removed = np.flatnonzero(gone).astype(np.int32)
     cut = part_of(asset, part, str(args.asset)) if gone.any() or not whole else asset
@@ -113,27 +109,24 @@ def _faint(asset: Asset, least: float) -> np.ndarray:
 
 
 def _wide(asset: Asset, factor: float) -> np.ndarray:
-    size = asset.surfels.scale.max(axis=1)
-    return np.asarray(size > factor * _median(size))
+    from ..core.floaters import median_size
+
+    return np.asarray(asset.surfels.scale.max(axis=1) > factor * median_size(asset.surfels))
 
 
 def _distant(asset: Asset, factor: float) -> np.ndarray:
-    from ..core.floaters import distance_from_mesh
+    from ..core.floaters import distance_from_mesh, median_size
 
     away = distance_from_mesh(asset)
     if away is None:
         logger.warning("the surfels are bound to no mesh: --distance removes none")
         return np.zeros(len(asset.surfels), bool)
-    return np.asarray(away > factor * _median(asset.surfels.scale.max(axis=1)))
+    return np.asarray(away > factor * median_size(asset.surfels))
 
 
 def _outside(asset: Asset, box: list[float]) -> np.ndarray:
     centre = asset.surfels.centre
     return ~np.all((centre >= box[:3]) & (centre <= box[3:]), axis=1)
-
-
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values)) if len(values) else 0.0
 
 
 #: Option -> which surfels of an asset go by its value.

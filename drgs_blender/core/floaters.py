@@ -37,7 +37,7 @@ def find_floaters(surfels: Surfels, away: Array | None = None, strength: float =
     if not len(surfels):
         return np.zeros(0, bool)
     size = surfels.scale.max(axis=1)
-    typical = max(float(np.median(size)), 1e-12)
+    typical = max(median_size(surfels), 1e-12)
     place, cells = _cells(surfels.centre, CELL * typical)
     area = surfels.opacity * surfels.scale.prod(axis=1)
     solid = size < WIDE * typical
@@ -53,6 +53,11 @@ def find_floaters(surfels: Surfels, away: Array | None = None, strength: float =
     if away is not None:
         doubtful |= away > OFF / strength * typical
     return small | (alone & doubtful)
+
+
+def median_size(surfels: Surfels) -> float:
+    """Median of the larger deviation of surfels, metres; 0 of none."""
+    return float(np.median(surfels.scale.max(axis=1))) if len(surfels) else 0.0
 
 
 def distance_from_mesh(asset: Asset) -> Array | None:

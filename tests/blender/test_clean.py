@@ -38,6 +38,17 @@ def chosen():
     return found
 
 
+def delete_upper_points():
+    """Delete the points above the ground of the object in Edit Mode, as by hand."""
+    import bmesh
+
+    mesh = bmesh.from_edit_mesh(bpy.context.edit_object.data)
+    for vertex in mesh.verts:
+        vertex.select = vertex.co.z > 0
+    bmesh.update_edit_mesh(bpy.context.edit_object.data)
+    bpy.ops.mesh.delete(type="VERT")
+
+
 def test_floaters_are_found_deleted_and_gone_from_the_render(littered, export):
     obj, asset, litter = littered
     assert bpy.ops.drgs.edit_surfels() == {"FINISHED"}
@@ -112,15 +123,9 @@ def test_editing_that_was_not_finished_goes_on(littered, export):
 
 def test_faces_go_with_the_surfels_that_cover_them(littered, export):
     """Half of the surfels deleted by hand: their faces go, with Finish, and with them nothing else."""
-    import bmesh
-
     _, asset, _ = littered
     bpy.ops.drgs.edit_surfels()
-    mesh = bmesh.from_edit_mesh(bpy.context.edit_object.data)
-    for vertex in mesh.verts:
-        vertex.select = vertex.co.z > 0
-    bmesh.update_edit_mesh(bpy.context.edit_object.data)
-    bpy.ops.mesh.delete(type="VERT")
+    delete_upper_points()
     bpy.ops.drgs.finish_surfels()
     state = export()[0].objects[0]
     gone = asset.surfels.centre[: len(asset.mesh.faces), 2] > 0  # a surfel in the middle of each face
@@ -230,15 +235,9 @@ def test_objects_that_share_the_mesh_stay_as_they_are(ball, export, tmp_path, wa
     twin.drgs.asset = ball.drgs.asset
     bpy.context.scene.collection.objects.link(twin)
     if way == "finish":
-        import bmesh
-
         select(ball)
         bpy.ops.drgs.edit_surfels()
-        mesh = bmesh.from_edit_mesh(bpy.context.edit_object.data)
-        for vertex in mesh.verts:
-            vertex.select = vertex.co.z > 0
-        bmesh.update_edit_mesh(bpy.context.edit_object.data)
-        bpy.ops.mesh.delete(type="VERT")
+        delete_upper_points()
         bpy.ops.drgs.finish_surfels()
         parts = {state.name: state.part for state in export()[0].objects}
         assert parts["twin"] is None and len(parts["ball"].face) < 168

@@ -85,6 +85,11 @@ def has_surfels(asset: Asset, part: Part) -> bool:
     return bool((there[asset.binding.face] & kept).any())
 
 
+def whole_of(mesh: Mesh) -> Part:
+    """The part that is all of a mesh, in its order."""
+    return Part(np.arange(len(mesh.vertices), dtype=np.int32), mesh.faces, np.arange(len(mesh.faces), dtype=np.int32))
+
+
 def part_of_faces(mesh: Mesh, faces: Array) -> Part:
     """The part of some faces of a mesh, (m,) bool, with the vertices that they use."""
     rows = np.unique(mesh.faces[faces])

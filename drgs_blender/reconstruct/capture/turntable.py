@@ -80,11 +80,26 @@ def _surroundings(view: View) -> Surroundings:
     layers = np.dstack([view.colour.mean(axis=2), view.mask])[: h * step, : w * step]
     grey, mask = np.moveaxis(layers.reshape(h, step, w, step, 2).mean(axis=(1, 3)), 2, 0)
     known = binary_erosion(mask < TRACE, iterations=AROUND, border_value=1).astype(np.float64)
+    return detail_of(grey, known)
 
-    def blurred(deviation: float) -> Array:  # of the surroundings alone
+
+def detail_of(grey: Array, known: Array, scale: float = 1.0) -> Surroundings:
+    """What is between fine and coarse in a picture, where it is known.
+
+    Parameters
+    ----------
+    grey : (h, w) float array
+        Luminance, sRGB-encoded.
+    known : (h, w) float array
+        1 where it counts, 0 elsewhere.
+    scale : float
+        Of the blurs; 1 for pictures of `SIZE` pixels.
+    """
+
+    def blurred(deviation: float) -> Array:  # of what is known alone
         return gaussian_filter(grey * known, deviation) / np.maximum(gaussian_filter(known, deviation), 1e-3)
 
-    return Surroundings((blurred(FINE) - blurred(COARSE)) * known, known)
+    return Surroundings((blurred(scale * FINE) - blurred(scale * COARSE)) * known, known)
 
 
 def correlation(first: Surroundings, second: Surroundings) -> float | None:
