@@ -287,7 +287,7 @@ def faces_of(obj: bpy.types.Object, asset: Asset, removed: Array) -> Array:
     corners = mesh_arrays.read_corner_vertices(obj.data)
     rest = asset.mesh.vertices[rows[corners].clip(0)]
     middle = np.add.reduceat(rest, start, axis=0) / total[:, None]
-    margin = 4 * float(np.median(asset.surfels.scale.max(axis=1)))
+    margin = 4 * median_size(asset.surfels)
     low, high = centre[removed].min(axis=0) - margin, centre[removed].max(axis=0) + margin
     near = np.flatnonzero(((centre >= low - margin) & (centre <= high + margin)).all(axis=1))
     tree = KDTree(len(near))

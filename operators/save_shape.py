@@ -13,7 +13,7 @@ from bpy.props import BoolProperty, StringProperty
 from ..addon import assets, blend_paths, mesh_arrays, surfel_points
 from ..addon.export.face_match import MOST, match_faces
 from ..addon.viewport_material import update_viewport_material
-from ..drgs_blender.core.asset import MATERIAL_CHANNELS, Mesh
+from ..drgs_blender.core.asset import MATERIAL_CHANNELS, Asset, Mesh
 from ..drgs_blender.core.errors import AssetError
 from . import selection
 from .engine_command import CommandOperator
@@ -56,7 +56,7 @@ class DRGS_OT_save_shape(CommandOperator, selection.ObjectMode, bpy.types.Operat
         source = assets.file_of(obj)
         with self.folder("drgs-shape-") as folder:
             edit = folder / "edit.npz"
-            arrays: dict[str, Any] = edit_of(obj, assets.load(source).mesh)
+            arrays: dict[str, Any] = edit_of(obj, assets.load(source))
             np.savez(edit, **arrays)
             given = ["reshape", str(source), "--edit", str(edit), "--out", str(self._target)]
             status, failure = f"Saving {self._target.name}", "could not be saved"
@@ -85,15 +85,15 @@ class DRGS_OT_save_shape(CommandOperator, selection.ObjectMode, bpy.types.Operat
         return {"FINISHED"}
 
 
-def edit_of(obj: bpy.types.Object, rest: Mesh) -> dict[str, Array]:
-    """Arrays of `drgs reshape` of the mesh of an object, without modifiers; `rest` is that of its asset.
+def edit_of(obj: bpy.types.Object, asset: Asset) -> dict[str, Array]:
+    """Arrays of `drgs reshape` of the mesh of an object with that asset, without modifiers.
 
     Raises
     ------
     AssetError
         Its vertices are not known; names the object.
     """
-    mesh = obj.data
+    mesh, rest = obj.data, asset.mesh
     rows = mesh_arrays.source_rows(mesh, rest)
     if rows is None:
         raise AssetError(
@@ -118,7 +118,6 @@ def edit_of(obj: bpy.types.Object, rest: Mesh) -> dict[str, Array]:
         "faces": np.concatenate([corner_vertices[matched.corners], new]).astype(np.int32),
         "face": np.concatenate([matched.face, np.full(len(new), -1)]).astype(np.int32),
     }
-    asset = assets.load(assets.file_of(obj))
     removed = surfel_points.removed_of(obj, asset)
     return found if removed is None else {**found, "removed": removed}
 

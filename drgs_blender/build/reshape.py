@@ -20,10 +20,11 @@ from ..core.asset.model import (
     Surfels,
     neutral_values,
 )
-from ..core.asset.part import Part, part_of
+from ..core.asset.part import Part, part_of, vertices_of
 from ..core.asset.textures import MeshTextures
 from ..core.color import linear_to_srgb
 from ..core.errors import AssetError
+from ..core.floaters import median_size
 from ..deform.attach import attach
 from ..deform.face_frames import Faces
 from ..deform.mesh_driven import MeshDriven
@@ -190,12 +191,9 @@ def _textures(textures: MeshTextures, new: int, moved: bool) -> MeshTextures:
 def _new_surfels(mesh: Mesh, faces: Array, others: Surfels) -> tuple[Surfels, Binding]:
     """Surfels on new faces, with the materials of the mesh; as large as the `others`."""
     rows, local = np.unique(faces, return_inverse=True)
-    channels: dict[str, Any] = {
-        name: None if (values := getattr(mesh, name)) is None else values[rows] for name in MATERIAL_CHANNELS
-    }
-    patch = Mesh(mesh.vertices[rows], local.reshape(-1, 3), **channels)
+    patch = replace(vertices_of(mesh, rows), faces=local.reshape(-1, 3))
     diagonal = float(np.linalg.norm(np.ptp(patch.vertices, axis=0)))
-    typical = float(np.median(others.scale.max(axis=1))) if len(others) else diagonal / 100
+    typical = median_size(others) if len(others) else diagonal / 100
     surfels, binding, _ = attach(patch, density=max(1.0, diagonal / max(_PIECE * typical, 1e-12)))
     return surfels, binding
 
