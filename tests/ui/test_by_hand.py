@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import window
+from subjects import asset_path
 
 #: Difference of a colour channel from which a pixel is another one: more than the noise of a finished picture.
 OTHER = 0.1
@@ -87,7 +88,7 @@ def test_a_moved_lattice_moves_the_picture(seen):
 
 def test_paint_is_seen_where_the_brush_went(seen):
     result = seen.result
-    assert result["chosen"] == "robot" and result["painting"] == "PAINT_VERTEX"
+    assert result["chosen"] == asset_path("robot").stem and result["painting"] == "PAINT_VERTEX"
     painted, of = result["painted"]
     assert 0 < painted < of / 2
     where = changed(seen, "11-paint-mode", "12-painted")
