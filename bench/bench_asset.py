@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_evaluate import mean, of_truth, score, similarity, under_other_lights
+from bench_evaluate import how_made, mean, of_truth, score, similarity, under_other_lights
 from decouple_score import with_materials_of
 from PIL import Image
 from report import DOCUMENT, OUT, ROOT, store_row, table, write_section
@@ -185,7 +185,8 @@ def main() -> None:
         f"{bound}, {len(capture.training)} photographs of {side} pixels by Cycles; PSNR in dB over the frame on white, "
         f"and of the foreground; scaled by one factor a channel, as are the pictures of SSIM and FLIP, on white; means "
         f"over the other lights. With the true materials: "
-        f"on the own shape; no bound, as learned ones may make up for its errors. The true asset: the ceiling.\n\n"
+        f"on the own shape; no bound, as learned ones may make up for its errors. The true asset: the ceiling. "
+        f"{how_made(options.scenes)}\n\n"
         f"![One view of each: as photographed; under another light, Cycles and ours; bent](images/{FIGURE.name})\n\n"
     )
     cells = [(*key.split("|"), *cells) for key, cells in sorted(rows.items())]

@@ -84,6 +84,17 @@ def made(args: argparse.Namespace) -> tuple[Path, Plan, str]:
     return out, plan, f" ({spent / views:.2f} processor seconds a view)" if views else ""
 
 
+def how_made(scenes: Path) -> str:
+    """The command that makes scenes again, and their lights, in words."""
+    plan = Plan(**json.loads((scenes / "plan.json").read_text()))
+    photographed, *others = plan.lights
+    return (
+        f"The scenes: `drgs evaluate --make-scenes {scenes.name} --size {plan.size} --train {plan.train} "
+        f"--test {plan.test} --spp {plan.samples}`, {plan.bounces} bounces; photographed under Blender's "
+        f"{photographed}, the other lights are {', '.join(others)}."
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=Path, help="that are there already; else they are made")
@@ -122,7 +133,7 @@ def main() -> None:
         f"{plan.samples} samples and denoiser of Cycles{cost}, {args.samples} samples of ours without a denoiser. PSNR "
         f"in dB "
         'on white, SSIM and FLIP of the scaled pictures there; "published way" fits a scale an image to 8-bit values, '
-        "white background included.\n\n"
+        f"white background included. {how_made(scenes)}\n\n"
     )
     write_section("evaluate", "Scenes with known truth: the ceiling", about + table(COLUMNS, rows))
 
