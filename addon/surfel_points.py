@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import random
+
 import bpy
 import numpy as np
 
 from ..drgs_blender.core.asset import Asset
-from ..drgs_blender.core.errors import AssetError
+from ..drgs_blender.core.errors import AssetError, UsageError
 
 Array = np.ndarray
 
-#: Attribute with the number of the surfel that each point is.
+#: Attribute with the number of the surfel that each point is. As a property of the mesh: the surfels that were removed
+#: before these points were edited, until Finish.
 SURFEL = "drgs_surfel"
+#: Attribute and property with a number of all points of a mesh, by which others that are joined to them are known.
+SET = "drgs_points"
 
 
 def new_points(name: str, rows: Array, places: Array) -> bpy.types.Mesh:
@@ -20,20 +25,39 @@ def new_points(name: str, rows: Array, places: Array) -> bpy.types.Mesh:
     mesh.vertices.add(len(rows))
     if len(rows):
         mesh.attributes["position"].data.foreach_set("vector", np.ascontiguousarray(places, np.float32).ravel())
-    mesh.attributes.new(SURFEL, "INT", "POINT").data.foreach_set("value", rows.astype(np.int32))
+    mesh[SET] = random.SystemRandom().randrange(1, 1 << 31)
+    for attribute, values in ((SURFEL, rows), (SET, np.full(len(rows), mesh[SET]))):
+        mesh.attributes.new(attribute, "INT", "POINT").data.foreach_set("value", values.astype(np.int32))
     mesh.update()
     return mesh
 
 
-def rows_of(mesh: bpy.types.Mesh) -> Array | None:
-    """(n,) int32 surfels that the points of a mesh are; None where it does not know."""
-    attribute = mesh.attributes.get(SURFEL)
+def rows_of(mesh: bpy.types.Mesh, number: int | None = None) -> Array | None:
+    """(n,) int32 surfels that the points of a mesh are, -1 of others; None where it does not know.
+
+    Parameters
+    ----------
+    mesh : bpy.types.Mesh
+        Not one in Edit Mode: that shows none of its attributes.
+    number : int, optional
+        Of its points; by default what the mesh says. 0: any.
+    """
+    rows = _integers(mesh, SURFEL)
+    number = mesh.get(SET, 0) if number is None else number
+    if rows is None or not number:
+        return rows
+    own = _integers(mesh, SET)
+    return rows if own is None else np.where(own == number, rows, -1).astype(np.int32)
+
+
+def _integers(mesh: bpy.types.Mesh, name: str) -> Array | None:
+    attribute = mesh.attributes.get(name)
     if attribute is None or (attribute.data_type, attribute.domain) != ("INT", "POINT"):
         return None
-    rows = np.empty(len(mesh.vertices), np.int32)
-    if len(rows):
-        attribute.data.foreach_get("value", rows)
-    return rows
+    values = np.empty(len(mesh.vertices), np.int32)
+    if len(values):
+        attribute.data.foreach_get("value", values)
+    return values
 
 
 def state_of(obj: bpy.types.Object) -> tuple[int, int]:
@@ -42,8 +66,36 @@ def state_of(obj: bpy.types.Object) -> tuple[int, int]:
     return (0, -1) if mesh is None else (mesh.session_uid, len(mesh.vertices))
 
 
-def removed_of(obj: bpy.types.Object, asset: Asset) -> Array | None:
-    """(k,) int32 surfels of its asset that an object lacks; None: none. While points are edited, those of before.
+def objects_of(obj: bpy.types.Object) -> list[bpy.types.Object]:
+    """Objects of points that are surfels of a DR-GS object: those that count first, then copies."""
+    mesh = obj.drgs.surfel_points
+    return sorted((o for o in bpy.data.objects if o.drgs.points_of == obj), key=lambda o: o.data != mesh)
+
+
+def is_unfinished(obj: bpy.types.Object) -> bool:
+    """Whether surfels of an object were edited as points without Finish."""
+    mesh = obj.drgs.surfel_points
+    return mesh is not None and SURFEL in mesh and not _is_anothers(obj, mesh)
+
+
+def check_finished(obj: bpy.types.Object) -> None:
+    """UsageError where the surfels of an object are still edited; names it."""
+    if is_unfinished(obj):
+        raise UsageError(
+            f'Object "{obj.name}"', "has surfels that are still edited as points",
+            "Press Finish in sidebar > DR-GS > Clean",
+        )  # fmt: skip
+
+
+def left_of(obj: bpy.types.Object, asset: Asset, depsgraph: bpy.types.Depsgraph | None = None) -> Array | None:
+    """(n,) int32 surfels of its asset, in order, that an object has; None: all.
+
+    Parameters
+    ----------
+    obj : bpy.types.Object
+    asset : Asset
+    depsgraph : bpy.types.Depsgraph, optional
+        While points are edited, those that this shows count; else those that Blender has written back.
 
     Raises
     ------
@@ -54,33 +106,45 @@ def removed_of(obj: bpy.types.Object, asset: Asset) -> Array | None:
     if mesh is None:
         return None
     count = len(asset.surfels)
-    if mesh.is_editmode:  # then its attributes have no data
-        rows = np.array(mesh.get(SURFEL, ()), np.int32)
-        left = np.delete(np.arange(count), rows[(rows >= 0) & (rows < count)])
-    else:
-        found = rows_of(mesh)
-        if found is None or (len(found) and (found.min() < 0 or found.max() >= count)):
-            raise AssetError(
-                f'Object "{obj.name}"', f'its points "{mesh.name}" are not of the {count} surfels of its asset',
-                "Press Restore Surfels in sidebar > DR-GS > Clean",
-            )  # fmt: skip
-        left = found
-    gone = _lacking(left, count)
-    return gone if len(gone) else None
+    if SURFEL in mesh and _is_anothers(obj.original, mesh):  # a copy made meanwhile
+        gone = np.array(mesh[SURFEL], np.int64)
+        return np.delete(np.arange(count, dtype=np.int32), gone[gone < count])
+    rows = _rows_now(mesh, depsgraph)
+    if rows is None or (len(rows) and rows.max() >= count):
+        raise AssetError(
+            f'Object "{obj.name}"', f'its points "{mesh.name}" are not of the {count} surfels of its asset',
+            "Press Restore Surfels in sidebar > DR-GS > Clean",
+        )  # fmt: skip
+    return np.unique(rows[rows >= 0])
 
 
-def keep_removed(mesh: bpy.types.Mesh, count: int) -> None:
-    """Have a mesh of points remember which of `count` surfels it lacks, for as long as it is edited."""
-    rows = rows_of(mesh)
-    gone = _lacking(np.zeros(0, np.int32) if rows is None else rows, count)
-    if len(gone):
-        mesh[SURFEL] = gone.tolist()
-    elif SURFEL in mesh:
-        del mesh[SURFEL]
+def removed_of(obj: bpy.types.Object, asset: Asset, depsgraph: bpy.types.Depsgraph | None = None) -> Array | None:
+    """(k,) int32 surfels of its asset that an object lacks; None: none. As `left_of`, which has the error, too."""
+    left = left_of(obj, asset, depsgraph)
+    gone = None if left is None else lacking(left, len(asset.surfels))
+    return gone if gone is not None and len(gone) else None
 
 
-def _lacking(left: Array, count: int) -> Array:
+def lacking(left: Array, count: int) -> Array:
     """(k,) int32 of `count` surfels, those that are not among the surfels `left`, (n,) int."""
     gone = np.ones(count, bool)
     gone[left] = False
     return np.flatnonzero(gone).astype(np.int32)
+
+
+def _is_anothers(obj: bpy.types.Object, mesh: bpy.types.Mesh) -> bool:
+    """Whether a mesh of points is edited for another object, of which `obj` is a copy."""
+    owners = [o.drgs.points_of for o in bpy.data.objects if o.data == mesh]
+    return any(owners) and obj not in owners
+
+
+def _rows_now(mesh: bpy.types.Mesh, depsgraph: bpy.types.Depsgraph | None) -> Array | None:
+    """What `rows_of` says, also while points are edited: then a converted copy of the object has the attributes."""
+    if not mesh.is_editmode:
+        return rows_of(mesh)
+    points = next(o for o in bpy.data.objects if o.data == mesh and o.mode == "EDIT")
+    shown = points if depsgraph is None else points.evaluated_get(depsgraph)
+    try:
+        return rows_of(shown.to_mesh(), mesh.get(SET, 0))
+    finally:
+        shown.to_mesh_clear()

@@ -6,13 +6,14 @@ import bmesh
 import bpy
 import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty
-from mathutils.kdtree import KDTree
 
 from ..addon import assets, mesh_arrays, surfel_points
+from ..addon.export.face_match import match_faces
 from ..addon.viewport.surfels import posed_centres
 from ..drgs_blender.core.asset import Asset
 from ..drgs_blender.core.asset.part import taken
-from ..drgs_blender.core.errors import UsageError
+from ..drgs_blender.core.bare_faces import bare_faces
+from ..drgs_blender.core.errors import AssetError, UsageError
 from ..drgs_blender.core.floaters import distance_from_mesh, find_floaters, median_size
 from . import selection
 from .base import DrgsOperator
@@ -30,10 +31,11 @@ class DRGS_OT_edit_surfels(DrgsOperator, selection.ObjectMode, bpy.types.Operato
 
     def run(self, context: bpy.types.Context) -> set[str]:
         (obj,) = selection.editable(selection.selected(context)[-1:], vertices=False)
-        for earlier in [o for o in bpy.data.objects if o.drgs.points_of == obj]:
-            bpy.data.objects.remove(earlier)  # not finished: what was deleted in it is, its mesh says so
+        known = obj.drgs.surfel_points
+        for earlier in surfel_points.objects_of(obj):
+            if earlier.data == known:  # not finished: its mesh says what was deleted
+                bpy.data.objects.remove(earlier)
         mesh = points_of(obj, context.evaluated_depsgraph_get())
-        surfel_points.keep_removed(mesh, len(assets.load(assets.file_of(obj)).surfels))
         points = bpy.data.objects.new(mesh.name, mesh)
         points.drgs.points_of = obj
         points.matrix_world = obj.matrix_world
@@ -96,16 +98,24 @@ class DRGS_OT_select_surfels(DrgsOperator, bpy.types.Operator):
         assert pair is not None, "poll has looked"
         points, obj = pair
         asset = assets.load(assets.file_of(obj))
-        mesh = bmesh.from_edit_mesh(points.data)
-        layer = mesh.verts.layers.int.get(surfel_points.SURFEL)
-        rows = np.array([vertex[layer] for vertex in mesh.verts], np.int64)
-        before = np.array([vertex.select for vertex in mesh.verts], bool)
-        found = self.chosen_of(asset, rows, before)
+        points.update_from_editmode()
+        written = points.to_mesh()  # that in Edit Mode shows no attributes
+        rows = surfel_points.rows_of(written, points.data.get(surfel_points.SET, 0))
+        before = np.empty(len(written.vertices), bool)
+        written.vertices.foreach_get("select", before)
+        points.to_mesh_clear()
+        if rows is None or rows.max(initial=-1) >= len(asset.surfels):
+            raise UsageError(f'Object "{points.name}"', f'has no points of surfels of "{obj.name}"', "Undo the edit")
+        own = rows >= 0
+        found = np.zeros(len(rows), bool)
+        found[own] = self.chosen_of(asset, rows[own], before[own])
         count = int(found.sum())
         if self.use_extend:
             found |= before
-        for vertex, chosen in zip(mesh.verts, found.tolist(), strict=True):
-            vertex.select = chosen
+        mesh = bmesh.from_edit_mesh(points.data)
+        mesh.verts.ensure_lookup_table()
+        for number in np.flatnonzero(found != before).tolist():
+            mesh.verts[number].select = not before[number]
         mesh.select_flush_mode()
         bmesh.update_edit_mesh(points.data, loop_triangles=False, destructive=False)
         self.report({"INFO"}, f"{count:,} of {len(rows):,} surfels")
@@ -150,33 +160,56 @@ class DRGS_OT_finish_surfels(DrgsOperator, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         cls.poll_message_set("Press Edit Surfels first")
-        return context.mode in ("EDIT_MESH", "OBJECT") and edited(context) is not None
+        return context.mode in ("EDIT_MESH", "OBJECT") and bool(_unfinished(context))
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        pair = edited(context)
-        assert pair is not None, "poll has looked"
-        points, obj = pair
-        if obj.name not in context.view_layer.objects:
-            raise UsageError(
-                f'Object "{obj.name}"', "is in no collection of this view layer", "Undo what removed it, or show that"
-            )
+        objects = _unfinished(context)
+        for obj in objects:
+            if obj.name not in context.view_layer.objects:
+                raise UsageError(
+                    f'Object "{obj.name}"', "is in no collection of this view layer",
+                    "Undo what removed it, or show that",
+                )  # fmt: skip
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
-        mesh = points.data
+        for obj, points in objects.items():
+            self.finish(obj, obj.drgs.surfel_points if points is None else points.data)
+        selection.select_only(context, objects, list(objects)[-1])
+        return {"FINISHED"}
+
+    def finish(self, obj: bpy.types.Object, mesh: bpy.types.Mesh) -> None:
+        """The surfels of an object are those in a mesh of points."""
+        asset, replaced = assets.load(assets.file_of(obj)), obj.drgs.surfel_points
+        obj.drgs.surfel_points = mesh
+        try:
+            removed = surfel_points.removed_of(obj, asset)
+        except AssetError:
+            obj.drgs.surfel_points = replaced
+            raise
         before = np.array(mesh.get(surfel_points.SURFEL, ()), np.int64)
-        bpy.data.objects.remove(points)
-        selection.select_only(context, [obj], obj)
-        asset = assets.load(assets.file_of(obj))
-        removed = surfel_points.removed_of(obj, asset)
+        before = before[before < len(asset.surfels)]
+        for points in surfel_points.objects_of(obj):
+            if points.data == mesh:
+                bpy.data.objects.remove(points)
+        _give_back(mesh, obj, before, len(asset.surfels))
+        if surfel_points.SURFEL in mesh:
+            del mesh[surfel_points.SURFEL]
+        if replaced not in (None, mesh) and not replaced.users:
+            bpy.data.meshes.remove(replaced)
+        if copies := surfel_points.objects_of(obj):
+            names = ", ".join(f'"{points.name}"' for points in copies)
+            self.warn(f'"{obj.name}": other points of its surfels are left: {names}. Delete them, or Finish takes them')
+        rows = surfel_points.rows_of(mesh)
+        assert rows is not None, "removed_of has read them"
+        if foreign := int(np.count_nonzero(rows < 0)):
+            self.warn(f'"{obj.name}": {foreign:,} of the points are none of its surfels; they are left out')
         if removed is None:
             obj.drgs.surfel_points = None
-            return {"FINISHED"}
-        new = np.setdiff1d(removed, before)
-        if self.use_faces and len(new) and len(obj.data.polygons):
+        elif self.use_faces and len(new := np.setdiff1d(removed, before)) and len(obj.data.polygons):
             delete_vertices_or_faces(obj, faces=faces_of(obj, asset, new))
         obj.update_tag()
-        self.report({"INFO"}, f"{len(removed):,} of {len(asset.surfels):,} surfels are removed")
-        return {"FINISHED"}
+        gone = 0 if removed is None else len(removed)
+        self.report({"INFO"}, f"{gone:,} of {len(asset.surfels):,} surfels are removed")
 
 
 class DRGS_OT_restore_surfels(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
@@ -188,6 +221,9 @@ class DRGS_OT_restore_surfels(DrgsOperator, selection.ObjectMode, bpy.types.Oper
 
     def run(self, context: bpy.types.Context) -> set[str]:
         for obj in selection.editable(selection.selected(context), vertices=False):
+            for points in surfel_points.objects_of(obj):
+                if points.data == obj.drgs.surfel_points:
+                    bpy.data.objects.remove(points)
             obj.drgs.surfel_points = None
             obj.update_tag()
         return {"FINISHED"}
@@ -210,6 +246,8 @@ class DRGS_OT_crop(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
                 "Selection", f"holds {len(boxes)} objects that could be the box",
                 "Select the DR-GS objects and one cube, or one empty",
             )  # fmt: skip
+        for obj in objects:
+            surfel_points.check_finished(obj)
         depsgraph = context.evaluated_depsgraph_get()
         for obj in objects:
             asset = assets.load(assets.file_of(obj))
@@ -239,11 +277,32 @@ def edited(context: bpy.types.Context) -> tuple[bpy.types.Object, bpy.types.Obje
     return None if points is None or not assets.is_drgs(obj) else (points, obj)
 
 
+def _unfinished(context: bpy.types.Context) -> dict[bpy.types.Object, bpy.types.Object | None]:
+    """DR-GS objects -> the points by which their surfels are edited; of those that are edited, active or selected."""
+    edited_now = context.objects_in_mode if context.mode == "EDIT_MESH" else ()
+    chosen = [*(context.selected_objects or ()), *edited_now, context.active_object]
+    found = {o: None for o in chosen if assets.is_drgs(o) and surfel_points.is_unfinished(o)}
+    return found | {o.drgs.points_of: o for o in chosen if o is not None and assets.is_drgs(o.drgs.points_of)}
+
+
+def _give_back(mesh: bpy.types.Mesh, owner: bpy.types.Object, removed: Array, count: int) -> None:
+    """Give copies of an object, made while its surfels were edited, points of their own: without those `removed`."""
+    for obj in [o for o in bpy.data.objects if o.drgs.surfel_points == mesh and o != owner]:
+        left = np.delete(np.arange(count, dtype=np.int32), removed)
+        places = np.array(assets.load(assets.file_of(obj)).surfels.centre[left])
+        none = len(left) == count
+        obj.drgs.surfel_points = None if none else surfel_points.new_points(f"{obj.name} surfels", left, places)
+
+
 def points_of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.types.Mesh:
-    """The mesh of points of an object's surfels, new where it has none or shares it, placed as the object is posed."""
+    """The mesh of points of an object's surfels, made anew, placed as the object is posed, to be edited.
+
+    It keeps which surfels were removed before, until the editing is finished.
+    """
     asset, known = assets.load(assets.file_of(obj)), obj.drgs.surfel_points
-    rows = None if known is None else surfel_points.rows_of(known)
-    rows = np.arange(len(asset.surfels), dtype=np.int32) if rows is None else rows[rows < len(asset.surfels)]
+    count, left = len(asset.surfels), surfel_points.left_of(obj, asset)
+    rows = np.arange(count, dtype=np.int32) if left is None else left
+    unfinished = surfel_points.is_unfinished(obj)
     vertices = evaluated_vertices(obj, depsgraph)
     own = mesh_arrays.source_rows(obj.data, asset.mesh)
     if own is not None and len(own) == len(vertices):  # what was deleted stays where it was
@@ -252,6 +311,8 @@ def points_of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.type
         vertices = posed
     places = posed_centres(asset, vertices)[rows]
     obj.drgs.surfel_points = mesh = surfel_points.new_points(f"{obj.name} surfels", rows, places)
+    before = known[surfel_points.SURFEL] if known is not None and unfinished else surfel_points.lacking(rows, count)
+    mesh[surfel_points.SURFEL] = before.tolist() if isinstance(before, np.ndarray) else list(before)
     if known is not None and not known.users:
         bpy.data.meshes.remove(known)
     return mesh
@@ -277,28 +338,16 @@ def in_box(box: bpy.types.Object, obj: bpy.types.Object, places: Array) -> Array
 
 
 def faces_of(obj: bpy.types.Object, asset: Asset, removed: Array) -> Array:
-    """(p,) bool polygons of the mesh to which one of the surfels `removed` is the nearest of all, at rest."""
-    rows = mesh_arrays.source_rows(obj.data, asset.mesh)
+    """(p,) bool polygons of the mesh that only the surfels `removed` covered, see `bare_faces`."""
     found = np.zeros(len(obj.data.polygons), bool)
-    if rows is None:
+    rows = mesh_arrays.source_rows(obj.data, asset.mesh)
+    if rows is None or not (bare := bare_faces(asset, removed)).any():
         return found
-    centre = asset.surfels.centre
-    start, total = mesh_arrays.read_polygons(obj.data)
-    corners = mesh_arrays.read_corner_vertices(obj.data)
-    rest = asset.mesh.vertices[rows[corners].clip(0)]
-    middle = np.add.reduceat(rest, start, axis=0) / total[:, None]
-    margin = 4 * median_size(asset.surfels)
-    low, high = centre[removed].min(axis=0) - margin, centre[removed].max(axis=0) + margin
-    near = np.flatnonzero(((centre >= low - margin) & (centre <= high + margin)).all(axis=1))
-    tree = KDTree(len(near))
-    for number in near.tolist():
-        tree.insert(centre[number], number)
-    tree.balance()
-    gone = np.zeros(len(centre), bool)
-    gone[removed] = True
-    for polygon in np.flatnonzero(((middle >= low) & (middle <= high)).all(axis=1)).tolist():
-        _, number, _ = tree.find(middle[polygon])
-        found[polygon] = number is not None and gone[number]
+    matched = match_faces(obj.data, rows, asset.mesh.faces)
+    start, _ = mesh_arrays.read_polygons(obj.data)
+    polygon = np.searchsorted(start, matched.corners.min(axis=1), side="right") - 1
+    found[polygon] = True
+    found[polygon[~bare[matched.face]]] = False
     return found
 
 

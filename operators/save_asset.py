@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 from bpy.props import BoolProperty, StringProperty
 
-from ..addon import assets, blend_paths, mesh_arrays, messages
+from ..addon import assets, blend_paths, mesh_arrays, messages, surfel_points
 from ..addon.export.objects import appearance_of
 from ..addon.export.topology_check import check_topology
 from ..addon.viewport_material import update_viewport_material
@@ -57,6 +57,8 @@ class DRGS_OT_save_asset(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
             raise UsageError("Asset", "has no file to go to", "Choose one")
         path = Path(bpy.path.ensure_ext(bpy.path.abspath(self.filepath), SUFFIX))
         objects = selection.editable(selection.selected(context), vertices=False)
+        for obj in objects if self.use_saved else ():
+            surfel_points.check_finished(obj)
         paths = [path] if len(objects) == 1 else [path.with_name(bpy.path.clean_name(o.name) + SUFFIX) for o in objects]
         if len(set(paths)) < len(paths):
             raise UsageError("Objects", "have names that make the same file name", "Rename one")

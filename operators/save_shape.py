@@ -51,6 +51,7 @@ class DRGS_OT_save_shape(CommandOperator, selection.ObjectMode, bpy.types.Operat
     def run(self, context: bpy.types.Context) -> set[str]:
         self._target = Path(bpy.path.ensure_ext(bpy.path.abspath(self.chosen("Asset")), SUFFIX))
         (obj,) = selection.editable(selection.selected(context)[-1:], data=True)
+        surfel_points.check_finished(obj)
         assets.check_unused(self._target)
         self._object = obj.name
         source = assets.file_of(obj)

@@ -153,7 +153,7 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     mesh = _converted(obj, depsgraph) if editing else obj.data
     try:
         point_caches.check(obj, asset.mesh, warn, final=depsgraph.mode == "RENDER")
-        fit = without_removed(check_topology(obj, mesh, asset.mesh, warn), obj, asset)
+        fit = _without_removed(check_topology(obj, mesh, asset.mesh, warn), obj, asset, depsgraph)
         arrays: dict[str, Any] = {
             "vertices": fit.of_part(mesh_arrays.read_vertices(mesh)),
             "corner_normals": _corner_normals(obj, mesh, fit, warn),
@@ -179,24 +179,28 @@ def _converted(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.typ
     return obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)  # of what Blender has written back before
 
 
-def without_removed(fit: Fit, obj: bpy.types.Object, asset: Asset) -> Fit:
+def _without_removed(fit: Fit, obj: bpy.types.Object, asset: Asset, depsgraph: bpy.types.Depsgraph | None) -> Fit:
     """How an object fits its asset, without the surfels that were removed from it."""
-    removed = surfel_points.removed_of(obj, asset)
+    removed = surfel_points.removed_of(obj, asset, depsgraph)
     if removed is None:
         return fit
     part = whole_of(asset.mesh) if fit.part is None else fit.part
     return fit._replace(part=replace(part, removed=removed))
 
 
-def appearance_of(obj: bpy.types.Object, asset: Asset, warn: Warn) -> Appearance:
+def appearance_of(
+    obj: bpy.types.Object, asset: Asset, warn: Warn, depsgraph: bpy.types.Depsgraph | None = None
+) -> Appearance:
     """What an evaluated object in Object Mode has of its asset, and how that differs.
+
+    With `depsgraph`, points that are edited count as they are now.
 
     Raises
     ------
     AssetError
         Its mesh is not the asset's any more; names the object.
     """
-    fit = without_removed(check_topology(obj, obj.data, asset.mesh, warn), obj, asset)
+    fit = _without_removed(check_topology(obj, obj.data, asset.mesh, warn), obj, asset, depsgraph)
     painted = {channel: _edited(obj, obj.data, asset, channel, fit, warn) for channel in MATERIAL_CHANNELS}
     return Appearance(
         asset if fit.part is None else part_of(asset, fit.part, f'Object "{obj.name}"'),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from .. import assets
+from .. import assets, surfel_points
 
 
 class DRGS_PT_clean(bpy.types.Panel):
@@ -31,6 +31,8 @@ class DRGS_PT_clean(bpy.types.Panel):
         row.operator("drgs.edit_surfels", icon="POINTCLOUD_DATA")
         if obj.drgs.surfel_points is not None:
             row.operator("drgs.restore_surfels", text="", icon="LOOP_BACK")
+        if surfel_points.is_unfinished(obj):
+            layout.operator("drgs.finish_surfels", icon="CHECKMARK")
         layout.operator("drgs.crop", icon="MESH_CUBE")
 
 

@@ -50,7 +50,7 @@ def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         look = obj.drgs.show_captured, obj.drgs.adjustment.values(), surfel_points.state_of(obj)
         key = "object", uid(obj), obj.data.as_pointer(), obj.mode, look
         owners = uid(obj), uid(obj.data), uid(obj.original.drgs.surfel_points)
-        batch = cache.get(key, owners, partial(_batch, obj))
+        batch = cache.get(key, owners, partial(_batch, obj, depsgraph))
         if batch is None:
             continue
         matrix: Matrix = instance.matrix_world
@@ -59,22 +59,24 @@ def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
     cache.end()
 
 
-def _batch(obj: bpy.types.Object) -> gpu.types.GPUBatch | None:
+def _batch(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> gpu.types.GPUBatch | None:
     try:
         asset = assets.load(assets.file_of(obj))
     except DrgsError:  # reported when the object is rendered
         return None
-    shown, vertices = shown_asset(obj, asset)
+    shown, vertices = shown_asset(obj, asset, depsgraph)
     sizes = _WIDTH * shown.surfels.scale.max(axis=1, initial=0)
     return draw.disc_batch(posed_centres(shown, vertices), shown.surfels.albedo, sizes.astype(np.float32))
 
 
-def shown_asset(obj: bpy.types.Object, asset: Asset) -> tuple[Asset, Array]:
+def shown_asset(
+    obj: bpy.types.Object, asset: Asset, depsgraph: bpy.types.Depsgraph | None = None
+) -> tuple[Asset, Array]:
     """What the evaluated object has of its asset, as it is painted and adjusted, and its (n, 3) vertices."""
     if obj.mode == "EDIT":  # then its mesh is a wrapper without attributes
         return asset, mesh_arrays.read_vertices(obj.data)
     try:
-        found = appearance_of(obj, asset, lambda text: None)
+        found = appearance_of(obj, asset, lambda text: None, depsgraph)
     except DrgsError:  # reported, as warnings are, when the object is rendered
         return asset, mesh_arrays.read_vertices(obj.data)
     captured = obj.drgs.show_captured
