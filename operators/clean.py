@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import compress
+
 import bmesh
 import bpy
 import numpy as np
@@ -101,8 +103,9 @@ class DRGS_OT_select_surfels(DrgsOperator, bpy.types.Operator):
         points.update_from_editmode()
         written = points.to_mesh()  # that in Edit Mode shows no attributes
         rows = surfel_points.rows_of(written, points.data.get(surfel_points.SET, 0))
-        before = np.empty(len(written.vertices), bool)
-        written.vertices.foreach_get("select", before)
+        before, attribute = np.zeros(len(written.vertices), bool), written.attributes.get(".select_vert")
+        if attribute is not None:  # else nothing is selected
+            attribute.data.foreach_get("value", before)
         points.to_mesh_clear()
         if rows is None or rows.max(initial=-1) >= len(asset.surfels):
             raise UsageError(f'Object "{points.name}"', f'has no points of surfels of "{obj.name}"', "Undo the edit")
@@ -138,6 +141,8 @@ class DRGS_OT_select_surfels(DrgsOperator, bpy.types.Operator):
         if self.criterion == "DISTANCE":
             return np.zeros(len(rows), bool) if away is None else (away > self.distance * typical)[rows]
         left = np.unique(rows)
+        if len(left) == len(surfels):
+            return find_floaters(surfels, away, self.strength)[rows]
         found = np.zeros(len(surfels), bool)
         found[left] = find_floaters(taken(surfels, left), None if away is None else away[left], self.strength)
         return found[rows]
@@ -343,6 +348,9 @@ def faces_of(obj: bpy.types.Object, asset: Asset, removed: Array) -> Array:
     rows = mesh_arrays.source_rows(obj.data, asset.mesh)
     if rows is None or not (bare := bare_faces(asset, removed)).any():
         return found
+    triangles = mesh_arrays.read_triangles(obj.data)
+    if triangles is not None and np.array_equal(rows[triangles], asset.mesh.faces):
+        return bare
     matched = match_faces(obj.data, rows, asset.mesh.faces)
     start, _ = mesh_arrays.read_polygons(obj.data)
     polygon = np.searchsorted(start, matched.corners.min(axis=1), side="right") - 1
@@ -360,11 +368,9 @@ def delete_vertices_or_faces(obj: bpy.types.Object, vertices: Array | None = Non
     mesh = bmesh.new()
     mesh.from_mesh(obj.data)
     if vertices is not None:
-        mesh.verts.ensure_lookup_table()
-        bmesh.ops.delete(mesh, geom=[mesh.verts[i] for i in np.flatnonzero(vertices).tolist()], context="VERTS")
+        bmesh.ops.delete(mesh, geom=list(compress(mesh.verts, vertices.tolist())), context="VERTS")
     if faces is not None:
-        mesh.faces.ensure_lookup_table()
-        bmesh.ops.delete(mesh, geom=[mesh.faces[i] for i in np.flatnonzero(faces).tolist()], context="FACES")
+        bmesh.ops.delete(mesh, geom=list(compress(mesh.faces, faces.tolist())), context="FACES")
     mesh.to_mesh(obj.data)
     mesh.free()
     obj.data.update()

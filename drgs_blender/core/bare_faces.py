@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .asset.model import Array, Asset
-from .floaters import distance_from_mesh, median_size
+from .floaters import distance_from_mesh, lengths, median_size
 
 #: Medians of the larger deviation within which a surfel covers a face, from it, or from the rim of another one.
 REACH = 4.0
@@ -26,13 +26,14 @@ def bare_faces(asset: Asset, removed: Array) -> Array:
     if binding is None or away is None:
         return np.zeros(len(mesh.faces), bool)
     centre, least = asset.surfels.centre.astype(np.float64), REACH * median_size(asset.surfels)
-    corners = mesh.vertices[mesh.faces].astype(np.float64)
-    middle = corners.mean(axis=1)
+    vertices = mesh.vertices.astype(np.float64)
+    middle = sum(vertices[corner] for corner in mesh.faces.T) / 3
     near = np.flatnonzero(away <= least)
     on = binding.face[near]
-    nearest = _nearest(near, on, np.linalg.norm(centre[near] - middle[on], axis=1), len(middle))
+    nearest = _nearest(near, on, lengths(centre[near] - middle[on]), len(middle))
     empty = np.flatnonzero(nearest < 0)
     if len(empty):
+        corners = vertices[mesh.faces]
         reach = least + np.linalg.norm(corners[empty] - middle[empty, None], axis=2).max(axis=1)
         place = _places(mesh.vertices)[mesh.faces]
     while len(empty):

@@ -36,7 +36,7 @@ def find_floaters(surfels: Surfels, away: Array | None = None, strength: float =
     """
     if not len(surfels):
         return np.zeros(0, bool)
-    size = surfels.scale.max(axis=1)
+    size = _larger(surfels)
     typical = max(median_size(surfels), 1e-12)
     place, cells = _cells(surfels.centre, CELL * typical)
     area = surfels.opacity * surfels.scale.prod(axis=1)
@@ -57,7 +57,12 @@ def find_floaters(surfels: Surfels, away: Array | None = None, strength: float =
 
 def median_size(surfels: Surfels) -> float:
     """Median of the larger deviation of surfels, metres; 0 of none."""
-    return float(np.median(surfels.scale.max(axis=1))) if len(surfels) else 0.0
+    return float(np.median(_larger(surfels))) if len(surfels) else 0.0
+
+
+def _larger(surfels: Surfels) -> Array:
+    """(n,) larger deviations; numpy's own maximum of rows of two takes five times as long."""
+    return np.maximum(surfels.scale[:, 0], surfels.scale[:, 1])
 
 
 def distance_from_mesh(asset: Asset) -> Array | None:
@@ -65,9 +70,15 @@ def distance_from_mesh(asset: Asset) -> Array | None:
     binding, mesh = asset.binding, asset.mesh
     if binding is None:
         return None
-    corners = mesh.vertices[mesh.faces[binding.face]].astype(np.float64)
-    foot = np.einsum("nk,nkc->nc", binding.barycentric.clip(0, 1), corners)
-    return np.linalg.norm(asset.surfels.centre - foot, axis=1)
+    vertices, away = mesh.vertices.astype(np.float64), asset.surfels.centre.astype(np.float64)
+    for weight, corner in zip(binding.barycentric.clip(0, 1).T, mesh.faces.T, strict=True):
+        away -= weight[:, None] * vertices[corner[binding.face]]
+    return lengths(away)
+
+
+def lengths(vectors: Array) -> Array:
+    """(n,) of (n, 3) float64 vectors."""
+    return np.sqrt(np.einsum("nc,nc->n", vectors, vectors))
 
 
 def connected_parts(count: int, first: Array, second: Array) -> Array:
@@ -84,10 +95,18 @@ def connected_parts(count: int, first: Array, second: Array) -> Array:
 
 
 def _cells(places: Array, side: float) -> tuple[Array, Array]:
-    """The cell of each of (n, 3) places, by number, and the (k, 3) int64 cells that hold any."""
+    """The cell of each of (n, 3) places, by number, and the (k,) int64 packed cells that hold any, sorted."""
     found = np.floor((places.astype(np.float64) - np.median(places, axis=0)) / side).clip(-(2**19), 2**19 - 2)
-    cells, place = np.unique(_packed(found.astype(np.int64)), return_inverse=True)
-    return place.reshape(-1), cells
+    found = found.astype(np.int64)
+    low = found.min(axis=0)
+    shape = found.max(axis=0) - low + 1
+    if shape.prod() > 8 * len(places) + 4096:
+        cells, place = np.unique(_packed(found), return_inverse=True)
+        return place.reshape(-1), cells
+    at = np.ravel_multi_index(tuple((found - low).T), tuple(shape))  # few of the grid are empty: no sorting
+    holds = np.bincount(at, minlength=shape.prod()) > 0
+    cells = np.stack(np.unravel_index(np.flatnonzero(holds), tuple(shape)), axis=1) + low
+    return (np.cumsum(holds) - 1)[at], _packed(cells)
 
 
 def _packed(cells: Array) -> Array:
