@@ -33,6 +33,7 @@ from . import (
     save_shape,
     splats,
     submit,
+    swap_mesh,
     workflow,
 )
 
@@ -58,6 +59,7 @@ MODULES = (
     clean,
     save_asset,
     save_shape,
+    swap_mesh,
     bake,
     bakes,
     compositing,

@@ -126,6 +126,8 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
                 for number in self._frames:
                     colours = np.load(frame_path(self._attribute(i), number), allow_pickle=False)
                     if len(colours) != len(obj.data.vertices):
+                        colours = of_all(obj, colours)
+                    if colours is None:
                         self.warn(f'Object "{name}" has other vertices than before the bake; its light is lost')
                         break
                     write_colours(obj.data, self._attribute_name(number), colours)
@@ -182,16 +184,12 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
             raise UsageError("Folder", f"{self.directory} lies beside the .blend, which is not saved", "Save it first")
         evaluated = obj.evaluated_get(context.evaluated_depsgraph_get())
         fit = check_topology(evaluated, evaluated.data, assets.load(assets.file_of(obj)).mesh, messages.Warnings())
-        same = fit.part is None and fit.corners is None
         uvs = mesh_arrays.read_uvs(evaluated.data, "")
-        if not same or uvs is None:
-            raise UsageError(
-                f'Object "{obj.name}"',
-                "has no UV map" if same else "has other faces than its asset, which UV maps are of",
-                "Unwrap it in Edit Mode, or bake to an attribute",
-            )
+        if uvs is None:
+            raise UsageError(f'Object "{obj.name}"', "has no UV map", "Unwrap it in Edit Mode, or bake to an attribute")
         path = self.work_folder / f"{index}_uvs.npy"
-        np.save(path, uvs.reshape(-1, 3, 2), allow_pickle=False)
+        of_faces = uvs.reshape(-1, 3, 2) if fit.corners is None else uvs[fit.corners]
+        np.save(path, of_faces, allow_pickle=False)
         return [self._image(obj), str(path)]
 
 
@@ -219,6 +217,19 @@ def check_name(name: str, objects: list[bpy.types.Object]) -> None:
         attribute = obj.data.attributes.get(name)
         if name in obj.vertex_groups or (attribute and attribute.data_type not in mesh_arrays.COLOURS):
             raise UsageError(f'Object "{obj.name}"', f'has "{name}" already, which is no colour', "Choose another name")
+
+
+def of_all(obj: bpy.types.Object, colours: np.ndarray) -> np.ndarray | None:
+    """Colours of the vertices that an object has of its asset, for all of its own: new ones are black.
+
+    None: these are of other vertices.
+    """
+    rows = mesh_arrays.source_rows(obj.data, assets.load(assets.file_of(obj)).mesh)
+    if rows is None or np.count_nonzero(rows >= 0) != len(colours):
+        return None
+    found = np.zeros((len(rows), 3), np.float32)
+    found[rows >= 0] = colours
+    return found
 
 
 def write_colours(mesh: bpy.types.Mesh, name: str, colours: np.ndarray) -> None:

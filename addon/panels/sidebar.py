@@ -43,6 +43,7 @@ class DRGS_PT_object(_SidebarPanel, bpy.types.Panel):
         column = self.layout.column(align=True)
         column.operator("drgs.save_asset", icon="FILE_TICK")
         column.operator("drgs.save_shape", icon="MESH_DATA")
+        column.operator("drgs.swap_mesh", icon="MOD_REMESH")
         column.operator("drgs.bake_light", icon="RENDER_RESULT")
 
 

@@ -105,7 +105,7 @@ def import_asset(
             mesh_file, mesh_name, up=up, max_triangles=max_triangles, tolerance=TOLERANCE
         )
         scale_mesh(surface, scale, mesh_name)
-        _check_overlap(captured, surface, surfel_name, mesh_name)
+        check_overlap(captured, surface, surfel_name, mesh_name)
 
     binding, report["binding"] = bind(surface, captured)
     if surface_known and not surfels_known:
@@ -176,7 +176,7 @@ def _has_materials(file: MeshFile) -> bool:
     return bool(file.materials) or file.vertex_roughness is not None or file.vertex_metallic is not None
 
 
-def _check_overlap(surfels: Surfels, mesh: Mesh, surfel_name: str, mesh_name: str) -> None:
+def check_overlap(surfels: Surfels, mesh: Mesh, surfel_name: str, mesh_name: str) -> None:
     """Raise AssetError when most surfels lie away from the mesh, or the two are of different units."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     margin = 0.1 * np.linalg.norm(high - low)

@@ -97,7 +97,7 @@ def reshape(asset: Asset, edit: Edit, subject: str = "edit") -> tuple[Asset, dic
         raise AssetError(subject, "is of an asset whose surfels are bound to no mesh", "Import it with a mesh")
     moved = not np.array_equal(edit.vertices[known], cut.mesh.vertices)
     if moved:
-        surfels, binding = _followed(cut, edit.vertices[known])
+        surfels, binding = follow(cut, edit.vertices[known])
     order = np.r_[np.flatnonzero(old), np.flatnonzero(~old)]
     mesh = _whole(cut.mesh, edit, known, order, int(old.sum()), moved)
     new = edit.faces[~old]
@@ -128,7 +128,7 @@ def _check(edit: Edit, subject: str) -> None:
         raise AssetError(subject, f"faces refer to vertex {int(edit.faces.max())} of {n}", _REMEDY)
 
 
-def _followed(cut: Asset, vertices: Array) -> tuple[Surfels, Binding]:
+def follow(cut: Asset, vertices: Array) -> tuple[Surfels, Binding]:
     """Surfels and binding of an asset whose mesh has other (n, 3) vertices at rest."""
     assert cut.binding is not None
     posed = surfels_of_pose(cut.surfels, MeshDriven(cut.mesh, cut.surfels, cut.binding).pose(vertices))

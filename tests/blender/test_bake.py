@@ -148,3 +148,36 @@ def test_a_mesh_that_is_edited_during_a_bake_is_told(lit, monkeypatch):
     count, messages = 0, part("addon.messages")
     bpy.ops.drgs.bake_light(samples=3, name="second")
     assert 'Object "ball" has other vertices' in messages.history[-1].text and "second" not in lit.data.attributes
+
+
+def test_a_cut_object_is_baked_by_what_is_left_of_its_uv_map(lit, scene, tmp_path):
+    """Half of it deleted, triangles merged to quads, a hole filled: texels show the place that they are of."""
+    import bmesh
+
+    with_uvs(lit)
+    albedo = np.ones((len(lit.data.vertices), 4), np.float32)
+    albedo[:, :2] = [[0.5 + 0.4 * v.co.x, 0.5 + 0.4 * v.co.y] for v in lit.data.vertices]
+    lit.data.attributes["albedo"].data.foreach_set("color", albedo.ravel())
+    mesh = bmesh.new()
+    mesh.from_mesh(lit.data)
+    bmesh.ops.delete(mesh, geom=[v for v in mesh.verts if v.co.z < -0.1], context="VERTS")
+    bmesh.ops.join_triangles(mesh, faces=mesh.faces[:], angle_face_threshold=3, angle_shape_threshold=3)
+    rim = [edge for edge in mesh.edges if edge.is_boundary]
+    middle = mesh.verts.new((0, 0, -0.5))
+    for edge in rim:
+        mesh.faces.new((*edge.verts, middle))
+    mesh.to_mesh(lit.data)
+    mesh.free()
+    assert max(len(p.vertices) for p in lit.data.polygons) == 4
+    options = {"target": "IMAGE", "directory": str(tmp_path), "size": 32, "samples": 64, "light": "diffuse"}
+    assert bpy.ops.drgs.bake_light(**options) == {"FINISHED"}
+    image = read_exr(tmp_path / "ball_0001.exr", 32, 32)[8:24, 8:24]
+    place = (np.arange(8, 24) + 0.5) / 16 - 1
+    assert (image[..., 3] == 1).all()
+    np.testing.assert_allclose(image[..., 0] / image[..., 2], (0.5 + 0.4 * place)[None] * np.ones((16, 1)), atol=0.03)
+    np.testing.assert_allclose(image[..., 1] / image[..., 2], (0.5 - 0.4 * place)[:, None] * np.ones(16), atol=0.03)
+    new = len(lit.data.vertices) - 1  # of vertices, the one in the middle has no light
+    of_asset = np.arange(1, 3 * new + 1, dtype=np.float32).reshape(-1, 3)
+    found = part("operators.bake").of_all(lit, of_asset)
+    assert (found[new] == 0).all() and (found[:new] == of_asset).all()
+    assert part("operators.bake").of_all(lit, of_asset[1:]) is None
