@@ -50,6 +50,36 @@ def rows_of(mesh: bpy.types.Mesh, number: int | None = None) -> Array | None:
     return rows if own is None else np.where(own == number, rows, -1).astype(np.int32)
 
 
+def read_points(points: bpy.types.Object) -> tuple[Array, Array]:
+    """(n,) int32 surfels that the points of an object are, -1 of others, and (n,) bool: which of them are selected.
+
+    In Edit Mode, what Blender has written back: call `update_from_editmode` before.
+
+    Raises
+    ------
+    UsageError
+        They do not know what they are; names the object.
+    """
+    written = points.to_mesh()  # the mesh in Edit Mode shows no attributes
+    try:
+        rows, selected = rows_of(written, points.data.get(SET, 0)), read_selection(written)
+    finally:
+        points.to_mesh_clear()
+    if rows is None:
+        raise UsageError(f'Object "{points.name}"', "has points that are no surfels", "Undo the edit")
+    return rows, selected
+
+
+def read_selection(mesh: bpy.types.Mesh) -> Array:
+    """(n,) bool: which vertices of a mesh are selected."""
+    selected, attribute = np.zeros(len(mesh.vertices), bool), mesh.attributes.get(".select_vert")
+    if mesh.is_editmode:
+        mesh.vertices.foreach_get("select", selected)
+    elif attribute is not None:  # else none is
+        attribute.data.foreach_get("value", selected)
+    return selected
+
+
 def _integers(mesh: bpy.types.Mesh, name: str) -> Array | None:
     attribute = mesh.attributes.get(name)
     if attribute is None or (attribute.data_type, attribute.domain) != ("INT", "POINT"):

@@ -101,13 +101,8 @@ class DRGS_OT_select_surfels(DrgsOperator, bpy.types.Operator):
         points, obj = pair
         asset = assets.load(assets.file_of(obj))
         points.update_from_editmode()
-        written = points.to_mesh()  # that in Edit Mode shows no attributes
-        rows = surfel_points.rows_of(written, points.data.get(surfel_points.SET, 0))
-        before, attribute = np.zeros(len(written.vertices), bool), written.attributes.get(".select_vert")
-        if attribute is not None:  # else nothing is selected
-            attribute.data.foreach_get("value", before)
-        points.to_mesh_clear()
-        if rows is None or rows.max(initial=-1) >= len(asset.surfels):
+        rows, before = surfel_points.read_points(points)
+        if rows.max(initial=-1) >= len(asset.surfels):
             raise UsageError(f'Object "{points.name}"', f'has no points of surfels of "{obj.name}"', "Undo the edit")
         own = rows >= 0
         found = np.zeros(len(rows), bool)

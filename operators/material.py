@@ -113,32 +113,39 @@ class DRGS_OT_set_material(DrgsOperator, selection.ObjectMode, bpy.types.Operato
         UsageError
             It has no such mask; names the object.
         """
-        weight = np.full(len(obj.data.vertices), self.factor, np.float32)
-        if self.mask:
-            mask = mesh_arrays.read_mask(obj, obj.data, self.mask)
-            if mask is None:
-                raise UsageError(
-                    f'Object "{obj.name}"',
-                    f'has no vertex group or number of points "{self.mask}"',
-                    "Choose another mask",
-                )
-            mask = np.clip(np.nan_to_num(mask), 0, 1)
-            weight *= 1 - mask if self.use_invert else mask
-        return weight
+        mask = mask_of(obj, self.mask)
+        if mask is None:
+            return np.full(len(obj.data.vertices), self.factor, np.float32)
+        return np.float32(self.factor) * (1 - mask if self.use_invert else mask)
 
 
 class DRGS_OT_restore_material(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
-    """Give the selected DR-GS objects back the materials of their assets, without adjustments"""
+    """Give the selected DR-GS objects back the materials of their assets, without adjustments; where a mask says so,
+    what is painted alone"""
 
     bl_idname = "drgs.restore_material"
     bl_label = "Restore Captured Material"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
+    mask: StringProperty(
+        name="Mask",
+        description="Vertex group or point attribute: what is painted goes by its values; empty is everywhere",
+        search=_masks,
+        options={"SKIP_SAVE"},
+    )
+
     def run(self, context: bpy.types.Context) -> set[str]:
-        for obj in selection.editable(selection.selected(context), data=True):
-            mesh_arrays.restore_channels(obj.data, assets.captured_mesh(obj))
+        objects = selection.editable(selection.selected(context), data=True)
+        weights = [mask_of(obj, self.mask) for obj in objects]
+        for obj, weight in zip(objects, weights, strict=True):
+            captured = assets.captured_mesh(obj)
+            if weight is None:
+                mesh_arrays.restore_channels(obj.data, captured)
+                obj.drgs.adjustment.reset()
+            else:
+                for channel in filter(obj.data.attributes.__contains__, MATERIAL_CHANNELS):
+                    set_towards(obj, channel, captured.channel(channel), weight)
             update_viewport_material(obj.data)
-            obj.drgs.adjustment.reset()
         return {"FINISHED"}
 
 
@@ -222,9 +229,31 @@ class DRGS_OT_paint(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
 def set_material(obj: bpy.types.Object, preset: Preset, weight: Array) -> None:
     """Change the material attributes of `obj` towards `preset` by `weight`, (n,) in [0, 1]."""
     for channel, change in preset.changes.items():
-        old = present(obj, channel)
-        share = weight[:, None] if old.ndim == 2 else weight
-        mesh_arrays.write_channel(obj.data, channel, old + share * (change(old) - old))
+        set_towards(obj, channel, change(present(obj, channel)), weight)
+
+
+def set_towards(obj: bpy.types.Object, channel: str, values: Array, weight: Array) -> None:
+    """Change a material channel of `obj` towards `values`, (n, 3) or (n,), by `weight`, (n,) in [0, 1]."""
+    old = present(obj, channel)
+    share = weight[:, None] if old.ndim == 2 else weight
+    mesh_arrays.write_channel(obj.data, channel, np.where(share == 1, values, old + share * (values - old)))
+
+
+def mask_of(obj: bpy.types.Object, name: str) -> Array | None:
+    """(n,) float32 in [0, 1] of the mask of that name; None where none is named.
+
+    Raises
+    ------
+    UsageError
+        `obj` has no such mask; names it.
+    """
+    if not name:
+        return None
+    mask = mesh_arrays.read_mask(obj, obj.data, name)
+    if mask is None:
+        problem = f'has no vertex group or number of points "{name}"'
+        raise UsageError(f'Object "{obj.name}"', problem, "Choose another mask")
+    return np.clip(np.nan_to_num(mask), 0, 1)
 
 
 def present(obj: bpy.types.Object, channel: str) -> Array:

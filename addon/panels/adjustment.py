@@ -41,6 +41,7 @@ class _Adjustments:
         row = layout.row(align=True)
         row.prop(settings, "mask")
         row.prop(settings, "use_invert", text="", icon="ARROW_LEFTRIGHT")
+        layout.operator("drgs.mask_selection", icon="SELECT_SET")
         layout.operator("drgs.reset_adjustments", icon="LOOP_BACK")
 
 

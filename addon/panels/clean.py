@@ -25,6 +25,7 @@ class DRGS_PT_clean(bpy.types.Panel):
             if context.mode == "EDIT_MESH":
                 layout.operator_menu_enum("drgs.select_surfels", "criterion", icon="RESTRICT_SELECT_OFF")
                 layout.operator("mesh.delete", text="Delete", icon="TRASH").type = "VERT"
+                layout.operator("drgs.mask_selection", icon="SELECT_SET")
             layout.operator("drgs.finish_surfels", icon="CHECKMARK")
             return
         row = layout.row(align=True)
