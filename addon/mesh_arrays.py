@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
+from typing import Generic, TypeVar
 
 import bpy
 import numpy as np
@@ -23,11 +25,31 @@ COLOURS = ("FLOAT_COLOR", "BYTE_COLOR")
 SOURCE_VERTEX = "drgs_vertex"
 #: Numbers of vertices that a float32 says exactly.
 _NUMBERS = 1 << 24
-#: Faces of meshes of assets -> their keys, of the last ones.
-_keys: dict[int, tuple[Array, int]] = {}
-_KEPT = 8
 #: Types of attributes besides colours that can be masks.
 MASKS = {"BOOLEAN": bool, "FLOAT": np.float32}
+T = TypeVar("T")
+
+
+class OfArrays(Generic[T]):
+    """What is made of arrays that nobody changes, kept for the last `most` of them by their identity."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._known: dict[int, tuple[Array, T]] = {}
+
+    def get(self, array: Array, make: Callable[[], T]) -> T:
+        """What was made of `array`, else what `make` makes."""
+        known = self._known.pop(id(array), None)
+        if known is None or known[0] is not array:
+            known = array, make()
+        self._known[id(array)] = known
+        while len(self._known) > self._most:
+            del self._known[next(iter(self._known))]
+        return known[1]
+
+
+#: Keys of the meshes of assets, by their faces.
+_keys: OfArrays[int] = OfArrays(8)
 
 
 def new_mesh(name: str, source: Mesh) -> bpy.types.Mesh:
@@ -111,14 +133,9 @@ def source_rows(mesh: bpy.types.Mesh, rest: Mesh) -> Array | None:
 
 
 def _key(rest: Mesh) -> int:
-    """A number of the mesh of an asset, kept for the last ones."""
-    known = _keys.get(id(rest.faces))
-    if known is None or known[0] is not rest.faces:
-        while len(_keys) >= _KEPT:
-            del _keys[next(iter(_keys))]
-        key = zlib.crc32(np.ascontiguousarray(rest.vertices).data, zlib.crc32(np.ascontiguousarray(rest.faces).data))
-        known = _keys[id(rest.faces)] = rest.faces, key
-    return known[1]
+    """A number of the mesh of an asset."""
+    crc, contiguous = zlib.crc32, np.ascontiguousarray
+    return _keys.get(rest.faces, lambda: crc(contiguous(rest.vertices).data, crc(contiguous(rest.faces).data)))
 
 
 def _checksum(rows: Array, rest: Mesh) -> Array:

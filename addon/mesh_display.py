@@ -8,8 +8,13 @@ from . import assets
 
 
 def update_display(scene: bpy.types.Scene) -> None:
-    """Show the meshes of DR-GS objects as boxes while something is drawn in their place, else as they were."""
+    """Show the meshes of DR-GS objects as boxes while something is drawn in their place, else as they were.
+
+    Points of surfels stand in front of the meshes; what is drawn in the place of these would hide them there.
+    """
     for obj in scene.objects:
+        if assets.is_drgs(obj.drgs.points_of):
+            obj.show_in_front = scene.drgs.overlay == "OFF"
         if not assets.is_drgs(obj) or obj.library is not None:
             continue
         settings = obj.drgs

@@ -41,7 +41,7 @@ class DRGS_OT_edit_surfels(DrgsOperator, selection.ObjectMode, bpy.types.Operato
         points = bpy.data.objects.new(mesh.name, mesh)
         points.drgs.points_of = obj
         points.matrix_world = obj.matrix_world
-        points.show_in_front = True
+        points.show_in_front = context.scene.drgs.overlay == "OFF"
         points.hide_render = True
         assets.collection(context).objects.link(points)
         selection.select_only(context, [points], points)

@@ -14,9 +14,8 @@ Array = np.ndarray
 
 #: Corners of a polygon of which any three are tried; of larger ones the triangles that Blender cuts them into.
 MOST = 8
-#: Assets whose sorted faces are kept.
-_KEPT = 4
-_kept: dict[int, tuple[Array, Array, Array]] = {}
+#: Order and sorted keys of the faces of assets.
+_sorted: mesh_arrays.OfArrays[tuple[Array, Array]] = mesh_arrays.OfArrays(4)
 
 
 class Matched(NamedTuple):
@@ -56,7 +55,7 @@ def match_faces(mesh: bpy.types.Mesh, rows: Array, faces: Array) -> Matched:
     corners, polygon = corners[known], polygon[known]
     ids = of[corners]
     keys = _keys(ids)
-    order, sorted_keys = _sorted(faces)
+    order, sorted_keys = _sorted.get(faces, lambda: _in_order(_keys(faces)))
     first = np.searchsorted(sorted_keys, keys)
     count = np.searchsorted(sorted_keys, keys, side="right") - first
     there = count > 0
@@ -107,17 +106,10 @@ def _keys(ids: Array) -> Array:
     return (a * np.uint64(0x9E3779B97F4A7C15) ^ b) * np.uint64(0xBF58476D1CE4E5B9) ^ c * np.uint64(0x94D049BB133111EB)
 
 
-def _sorted(faces: Array) -> tuple[Array, Array]:
-    """Order and sorted keys of the faces of an asset, kept for the last ones."""
-    known = _kept.get(id(faces))
-    if known is None or known[0] is not faces:
-        keys = _keys(faces)
-        order = np.argsort(keys, kind="stable")
-        _kept.pop(id(faces), None)
-        while len(_kept) >= _KEPT:
-            del _kept[next(iter(_kept))]
-        known = _kept[id(faces)] = faces, order, keys[order]
-    return known[1], known[2]
+def _in_order(keys: Array) -> tuple[Array, Array]:
+    """The order of keys, and these in order."""
+    order = np.argsort(keys, kind="stable")
+    return order, keys[order]
 
 
 def _rank(keys: Array) -> Array:

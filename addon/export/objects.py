@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -148,10 +149,8 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     """What all instances of an object share."""
     path = assets.file_of(obj)
     asset = assets.load(path)
-    # While a mesh is edited, its evaluated data is a wrapper without arrays; a converted copy has them.
-    editing, captured = obj.mode == "EDIT", obj.drgs.show_captured
-    mesh = _converted(obj, depsgraph) if editing else obj.data
-    try:
+    captured = obj.drgs.show_captured
+    with _readable(obj, depsgraph) as mesh:
         point_caches.check(obj, asset.mesh, warn, final=depsgraph.mode == "RENDER")
         fit = _without_removed(check_topology(obj, mesh, asset.mesh, warn), obj, asset, depsgraph)
         arrays: dict[str, Any] = {
@@ -167,16 +166,24 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
         return ObjectState(
             name=obj.name, asset=key_of(path), part=fit.part, adjustment=adjustment, **arrays, **appearance
         )
+
+
+@contextlib.contextmanager
+def _readable(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None) -> Iterator[bpy.types.Mesh]:
+    """The mesh of an evaluated object; in Edit Mode, where that is a wrapper without arrays, a converted copy.
+
+    In viewports it is as it is edited now, with the modifiers that are shown there.
+    """
+    if obj.mode != "EDIT":
+        yield obj.data
+        return
+    try:
+        if depsgraph is None or depsgraph.mode == "VIEWPORT":
+            yield obj.to_mesh()
+        else:  # of what Blender has written back before
+            yield obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
     finally:
-        if editing:
-            obj.to_mesh_clear()
-
-
-def _converted(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.types.Mesh:
-    """The mesh of an object in Edit Mode: in viewports as it is edited now, with the modifiers that are shown there."""
-    if depsgraph.mode == "VIEWPORT":
-        return obj.to_mesh()
-    return obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)  # of what Blender has written back before
+        obj.to_mesh_clear()
 
 
 def _without_removed(fit: Fit, obj: bpy.types.Object, asset: Asset, depsgraph: bpy.types.Depsgraph | None) -> Fit:
@@ -191,23 +198,24 @@ def _without_removed(fit: Fit, obj: bpy.types.Object, asset: Asset, depsgraph: b
 def appearance_of(
     obj: bpy.types.Object, asset: Asset, warn: Warn, depsgraph: bpy.types.Depsgraph | None = None
 ) -> Appearance:
-    """What an evaluated object in Object Mode has of its asset, and how that differs.
+    """What an evaluated object has of its asset, and how that differs.
 
-    With `depsgraph`, points that are edited count as they are now.
+    With the `depsgraph` of a viewport, meshes and points in Edit Mode count as they are now.
 
     Raises
     ------
     AssetError
         Its mesh is not the asset's any more; names the object.
     """
-    fit = _without_removed(check_topology(obj, obj.data, asset.mesh, warn), obj, asset, depsgraph)
-    painted = {channel: _edited(obj, obj.data, asset, channel, fit, warn) for channel in MATERIAL_CHANNELS}
-    return Appearance(
-        asset if fit.part is None else part_of(asset, fit.part, f'Object "{obj.name}"'),
-        fit.of_part(mesh_arrays.read_vertices(obj.data)),
-        {name: values for name, values in painted.items() if values is not None},
-        _adjustment(obj, obj.data, fit, warn),
-    )
+    with _readable(obj, depsgraph) as mesh:
+        fit = _without_removed(check_topology(obj, mesh, asset.mesh, warn), obj, asset, depsgraph)
+        painted = {channel: _edited(obj, mesh, asset, channel, fit, warn) for channel in MATERIAL_CHANNELS}
+        return Appearance(
+            asset if fit.part is None else part_of(asset, fit.part, f'Object "{obj.name}"'),
+            fit.of_part(mesh_arrays.read_vertices(mesh)),
+            {name: values for name, values in painted.items() if values is not None},
+            _adjustment(obj, mesh, fit, warn),
+        )
 
 
 def _corner_normals(obj: bpy.types.Object, mesh: bpy.types.Mesh, fit: Fit, warn: Warn) -> np.ndarray | None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from .. import reconstruction, running, workflow, world_setup
+from .. import assets, reconstruction, running, workflow, world_setup
 from ..viewport import views
 from .engine_setup import draw_engine
 from .text_layout import bar_text, wrapped
@@ -90,6 +90,12 @@ def _view(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     column = layout.column(align=True)
     column.label(text="Viewport Display")
     column.row(align=True).prop(context.scene.drgs, "overlay", expand=True)
+    obj = context.object
+    if context.scene.drgs.overlay == "SURFELS" and context.mode == "EDIT_MESH" and obj is not None:
+        if assets.is_drgs(obj):
+            wrapped(column, context, "Splats are shown as edited, behind the vertices of their mesh", "INFO")
+        elif assets.is_drgs(owner := obj.drgs.points_of):
+            wrapped(column, context, f"Points are the splats of {owner.name}, which are shown behind them", "INFO")
 
 
 def _render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

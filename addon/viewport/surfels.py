@@ -1,4 +1,8 @@
-"""Surfels without the engine: discs with their albedo where the deformed mesh has carried them."""
+"""Surfels without the engine: discs with their albedo where the deformed mesh has carried them.
+
+Of an object that is edited, the mesh or its surfels as points, they stand a little farther behind, so that vertices and
+points are seen before them.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ from functools import partial
 import bpy
 import gpu
 import numpy as np
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 from ...drgs_blender.core.asset import Asset
 from ...drgs_blender.core.errors import DrgsError
@@ -50,34 +54,67 @@ def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         look = obj.drgs.show_captured, obj.drgs.adjustment.values(), surfel_points.state_of(obj)
         key = "object", uid(obj), obj.data.as_pointer(), obj.mode, look
         owners = uid(obj), uid(obj.data), uid(obj.original.drgs.surfel_points)
-        batch = cache.get(key, owners, partial(_batch, obj, depsgraph))
-        if batch is None:
+        found = cache.get(key, owners, partial(_batch, obj, depsgraph))
+        if found is None:
             continue
+        batch, size = found
         matrix: Matrix = instance.matrix_world
         scale = 0.5 * region.height * rv3d.window_matrix[1][1] * matrix.median_scale
-        draw.discs(batch, rv3d.perspective_matrix @ matrix, scale, rv3d.is_perspective)
+        transform = rv3d.perspective_matrix @ matrix
+        if is_edited(obj):
+            middle = sum((Vector(corner) for corner in obj.bound_box), Vector()) / 8
+            depth = -(rv3d.view_matrix @ matrix @ middle).z
+            transform = set_back(rv3d.window_matrix, depth, size * matrix.median_scale) @ transform
+        draw.discs(batch, transform, scale, rv3d.is_perspective)
     cache.end()
 
 
-def _batch(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> gpu.types.GPUBatch | None:
+def is_edited(obj: bpy.types.Object) -> bool:
+    """Whether an object, or what its surfels are as points, is in Edit Mode."""
+    points = obj.original.drgs.surfel_points
+    return obj.mode == "EDIT" or (points is not None and points.is_editmode)
+
+
+def set_back(window: Matrix, depth: float, distance: float) -> Matrix:
+    """A map of clip space by which what is at a depth before the viewer is `distance` farther, and looks the same.
+
+    Parameters
+    ----------
+    window : Matrix
+        Projection of a viewport, from camera to clip space.
+    depth, distance : float
+        Metres.
+    """
+
+    def depth_of(away: float) -> float:
+        z = window @ Vector((0, 0, -away, 1))
+        return float(z.z / z.w)
+
+    depth = max(depth, distance, 1e-6)
+    moved = Matrix.Identity(4)
+    moved[2][3] = depth_of(depth + distance) - depth_of(depth)
+    return moved
+
+
+def _batch(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[gpu.types.GPUBatch, float] | None:
+    """Discs, and the median of their diameters."""
     try:
         asset = assets.load(assets.file_of(obj))
     except DrgsError:  # reported when the object is rendered
         return None
     shown, vertices = shown_asset(obj, asset, depsgraph)
     sizes = _WIDTH * shown.surfels.scale.max(axis=1, initial=0)
-    return draw.disc_batch(posed_centres(shown, vertices), shown.surfels.albedo, sizes.astype(np.float32))
+    batch = draw.disc_batch(posed_centres(shown, vertices), shown.surfels.albedo, sizes.astype(np.float32))
+    return batch, float(np.median(sizes)) if len(sizes) else 0.0
 
 
 def shown_asset(
     obj: bpy.types.Object, asset: Asset, depsgraph: bpy.types.Depsgraph | None = None
 ) -> tuple[Asset, Array]:
     """What the evaluated object has of its asset, as it is painted and adjusted, and its (n, 3) vertices."""
-    if obj.mode == "EDIT":  # then its mesh is a wrapper without attributes
-        return asset, mesh_arrays.read_vertices(obj.data)
     try:
         found = appearance_of(obj, asset, lambda text: None, depsgraph)
     except DrgsError:  # reported, as warnings are, when the object is rendered
-        return asset, mesh_arrays.read_vertices(obj.data)
+        return asset, asset.mesh.vertices if obj.mode == "EDIT" else mesh_arrays.read_vertices(obj.data)
     captured = obj.drgs.show_captured
     return found.asset if captured else edited_asset(found.asset, found.painted, found.adjustment), found.vertices

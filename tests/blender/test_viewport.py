@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 import pytest
 from mathutils import Matrix, Vector
-from scenes import mesh_object, new_world, part, read_exr
+from scenes import mesh_object, new_world, part, read_exr, select
 
 pytestmark = pytest.mark.blender_api
 
@@ -631,9 +631,71 @@ def test_discs_have_the_colours_that_are_painted_and_adjusted(ball, ball_file):
     np.testing.assert_allclose(shown()[:, 0], 0.5, atol=1e-6)
     bpy.ops.object.mode_set(mode="EDIT")
     try:
-        assert shown() is asset.surfels.albedo
+        np.testing.assert_allclose(shown()[:, 0], 0.5, atol=1e-6)
     finally:
         bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def test_discs_of_an_object_in_edit_mode_are_what_is_left_of_it(ball, ball_file):
+    """Deleted vertices take theirs along while they are edited, and points of surfels each its own."""
+    import bmesh
+
+    surfels, asset = part("addon.viewport.surfels"), part("addon.assets").load(ball_file)
+
+    def shown():
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        left, vertices = surfels.shown_asset(ball.evaluated_get(depsgraph), asset, depsgraph)
+        return surfels.posed_centres(left, vertices)
+
+    def delete(obj, chosen):
+        mesh = bmesh.from_edit_mesh(obj.data)
+        for vertex in mesh.verts:
+            vertex.select_set(chosen(vertex.co))
+        mesh.select_flush(True)
+        bmesh.update_edit_mesh(obj.data)
+        bpy.ops.mesh.delete(type="VERT")
+
+    select(ball)
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.transform.translate(value=(3, 0, 0))
+    delete(ball, lambda place: place.z > 0.1)
+    assert 0 < len(shown()) < len(asset.surfels) and shown()[:, 2].max() < 0.1
+    assert surfels.is_edited(ball)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert not surfels.is_edited(ball)
+    bpy.ops.drgs.edit_surfels()
+    before = len(shown())
+    delete(bpy.context.edit_object, lambda place: place.z < -0.5)
+    assert len(shown()) < before and shown()[:, 2].min() > -0.5 and surfels.is_edited(ball)
+    bpy.ops.drgs.finish_surfels()
+    assert not surfels.is_edited(ball)
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+def test_what_is_set_back_looks_the_same_and_is_farther(projection):
+    from mathutils import Matrix, Vector
+
+    if projection == "perspective":
+        near, far = 0.1, 1000.0
+        depths = -(far + near) / (far - near), -2 * far * near / (far - near)
+        window = Matrix(((2, 0, 0, 0), (0, 3, 0, 0), (0, 0, *depths), (0, 0, -1, 0)))
+    else:
+        window = Matrix(((0.2, 0, 0, 0), (0, 0.3, 0, 0), (0, 0, -0.002, 0), (0, 0, 0, 1)))
+    place, behind = (window @ Vector((0.5, -0.4, z, 1)) for z in (-7, -7.25))
+    moved = part("addon.viewport.surfels").set_back(window, 7, 0.25) @ place
+    assert moved.xy == place.xy and moved.w == place.w
+    assert moved.z / moved.w == pytest.approx(behind.z / behind.w, abs=1e-6) and moved.z > place.z
+
+
+def test_points_of_surfels_stand_in_front_of_a_mesh_but_not_of_splats(ball):
+    select(ball)
+    bpy.ops.drgs.edit_surfels()
+    points, settings = bpy.context.edit_object, bpy.context.scene.drgs
+    assert points.show_in_front
+    settings.overlay = "SURFELS"
+    assert not points.show_in_front  # they would be drawn over
+    settings.overlay = "OFF"
+    assert points.show_in_front
 
 
 def test_composited_frame_shows_our_objects_alone(crowd):
