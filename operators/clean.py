@@ -153,7 +153,7 @@ class DRGS_OT_finish_surfels(DrgsOperator, bpy.types.Operator):
 
     use_faces: BoolProperty(
         name="Delete Their Faces",
-        description="Also delete the faces to which a deleted surfel is the nearest, so that they throw no shadow",
+        description="Also delete the faces that deleted surfels alone covered, so that they throw no shadow",
         default=True,
     )
 

@@ -23,6 +23,7 @@ logger = logging.getLogger(__name__)
 EXAMPLES = """examples:
   drgs clean statue.drgs --floaters --out clean.drgs
   drgs clean statue.drgs --floaters 2 --opacity 0.05 --out clean.drgs
+  drgs clean statue.drgs --floaters --faces --out clean.drgs
   drgs clean room.drgs --box=-1,-1,0,1,1,2 --out corner.drgs
 """
 
@@ -44,6 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--box", type=_box, metavar="X0,Y0,Z0,X1,Y1,Z1",
         help="keep what lies in this box alone, surfels and faces: lowest and highest corner, object space, metres",
     )  # fmt: skip
+    parser.add_argument(
+        "--faces", action="store_true", help="also the faces that only removed surfels covered: they throw shadows"
+    )
 
 
 def _box(text: str) -> list[float]:
@@ -84,6 +88,12 @@ def run(args: argparse.Namespace) -> int:
         inside = np.all((mesh.vertices >= low) & (mesh.vertices <= high), axis=1)
         faces = np.all(inside[mesh.faces], axis=1)
         print(f"box: {int((~faces).sum())} of {len(faces)} faces")
+    if args.faces and gone.any():
+        from ..core.bare_faces import bare_faces
+
+        bare = bare_faces(asset, np.flatnonzero(gone))
+        print(f"faces: {int((bare & faces).sum())} of {len(faces)}")
+        faces = faces & ~bare
     if gone.all() or (len(faces) and not faces.any()):
         raise UsageError(str(args.asset), "would be gone as a whole", "Remove less")
     whole = faces.all()

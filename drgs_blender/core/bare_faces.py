@@ -12,9 +12,10 @@ REACH = 4.0
 
 
 def bare_faces(asset: Asset, removed: Array) -> Array:
-    """(m,) bool: the faces to whose middle a removed surfel is the nearest.
+    """(m,) bool: the faces on which removed surfels alone hang; of those without any, the ones nearest to such.
 
-    Of a face on which surfels hang, these are asked; else, ring by ring, those on the faces around.
+    The nearest is looked for ring by ring, on the faces around. Surfels in the air cover no face, though they hang
+    on it.
 
     Parameters
     ----------
@@ -53,7 +54,9 @@ def bare_faces(asset: Asset, removed: Array) -> Array:
         empty, reach = empty[~found], reach[~found]
     gone = np.zeros(len(centre) + 1, bool)  # the last one is that of faces without any
     gone[removed] = True
-    return gone[nearest]
+    stays = np.zeros(len(middle), bool)  # else what hangs there would go with it
+    stays[binding.face[~gone[:-1]]] = True
+    return gone[nearest] & ~stays
 
 
 def _nearest(candidates: Array, of: Array, distance: Array, count: int) -> Array:

@@ -50,6 +50,25 @@ def test_floaters_go_and_the_rest_stays(littered, tmp_path, capsys):
     assert f"floaters: {int((~kept).sum())} of {len(kept)} surfels" in capsys.readouterr().out
 
 
+def test_faces_that_only_what_is_removed_covered_go_when_asked(littered, tmp_path, capsys):
+    """Half of the ball is faint: its faces go, but for those on which litter hangs, and no surfel that stays."""
+    path, litter = littered
+    asset = read_asset(path)
+    low = asset.mesh.vertices[:, 2] < 0
+    faint = low[asset.mesh.faces].all(axis=1)[asset.binding.face] & ~litter
+    asset.surfels.opacity = np.where(faint, np.float32(0.01), np.maximum(asset.surfels.opacity, np.float32(0.1)))
+    write_asset(tmp_path / "a.drgs", asset)
+    given = ["clean", str(tmp_path / "a.drgs"), "--opacity", "0.05", "--out"]
+    assert main([*given, str(tmp_path / "b.drgs")]) == 0
+    assert main([*given, str(tmp_path / "c.drgs"), "--faces"]) == 0
+    without, cleaned = read_asset(tmp_path / "b.drgs"), read_asset(tmp_path / "c.drgs")
+    assert len(without.mesh.faces) == len(asset.mesh.faces)
+    np.testing.assert_array_equal(cleaned.surfels.centre, without.surfels.centre)
+    still = np.zeros(len(asset.mesh.faces), bool)
+    still[asset.binding.face[~faint]] = True
+    assert len(cleaned.mesh.faces) == still.sum() < len(still)
+
+
 def test_a_clean_capture_has_none_and_size_is_no_matter():
     mesh = plain_mesh(*sphere_mesh(4))
     for scale in (1e-3, 1.0, 1e3):
