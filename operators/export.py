@@ -1,4 +1,4 @@
-"""File > Export: DR-GS objects as splats or meshes for other programs, posed, painted and lit as in the scene."""
+"""File > Export: DR-GS objects for other programs, posed, painted and lit as in the scene, in one frame or moving."""
 
 from __future__ import annotations
 
@@ -7,14 +7,21 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon import blend_paths
+from ..addon import assets, blend_paths
+from ..addon.alembic import write_alembic
 from ..drgs_blender.core.errors import UsageError
-from ..drgs_blender.core.file_types import READ, WRITTEN
+from ..drgs_blender.core.file_types import LOST_IN_ALEMBIC, READ, WRITTEN
 from ..drgs_blender.core.frame_sequences import frame_path
 from .import_parts import UP_ITEMS
 from .scene_frames import NUMBER, SceneFrames, draw_colour
 
-_HELD = {"splats": "Splats", "mesh": "Mesh with materials", "environment": "The World"}
+_HELD = {
+    "splats": "Splats",
+    "mesh": "Mesh with materials",
+    "sequence": "Moving meshes: all frames in one file",
+    "environment": "The World",
+}
+_ALEMBIC = "Alembic sequence"
 # Blender evaluates annotations apart from this module: no loops in them.
 _FORMATS = tuple((name, f"{name} ({t.extensions[0]})", _HELD[t.kind]) for name, t in WRITTEN.items())
 _SPZ_VERSIONS = (
@@ -29,7 +36,7 @@ _KERNELS = (
 )
 _ENDINGS = tuple(dict.fromkeys(e for t in WRITTEN.values() for e in t.extensions))
 #: Endings of what other programs export, or of what is only read. Others may be parts of a name.
-_FOREIGN = {".abc", ".blend", ".bvh", ".drgs", ".fbx", ".mdd", ".pc2", ".svg", ".vdb", ".wrl", ".x3d"}
+_FOREIGN = {".blend", ".bvh", ".drgs", ".fbx", ".mdd", ".pc2", ".svg", ".vdb", ".wrl", ".x3d"}
 _FOREIGN |= {e for t in READ.values() for e in t.extensions if e not in _ENDINGS}
 _GLOB = ";".join(f"*{e}" for e in _ENDINGS)
 
@@ -71,6 +78,9 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
     )
     spz_version: EnumProperty(
         name="Version", description="Version of the SPZ format", items=_SPZ_VERSIONS, default="auto"
+    )
+    surfels: BoolProperty(
+        name="Surfels", description="Beside the meshes their surfels, as moving splats", default=False
     )
     kernel: EnumProperty(name="Kernel", description="What a splat is in USD", items=_KERNELS, default="ellipsoid")
     use_animation: BoolProperty(
@@ -114,8 +124,11 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
             draw_colour(layout, self)
         for option in _options(self):
             layout.prop(self, option)
-        layout.prop(self, "use_animation")
-        if self.use_animation:
+        if kind.kind == "sequence" and self.surfels and kind.options:
+            draw_colour(layout, self)
+        if kind.kind != "sequence":
+            layout.prop(self, "use_animation")
+        if self.use_animation or kind.kind == "sequence":
             column = layout.column(align=True)
             column.prop(self, "frame_start")
             column.prop(self, "frame_end")
@@ -129,10 +142,15 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
         if self.check(context) and given.suffix.lower() in _ENDINGS:
             self.warn(f"{given.name}: its format is {self.format}; written as {Path(self.filepath).name}")
         target = Path(bpy.path.abspath(self.filepath)).absolute()
-        frames = range(self.frame_start, self.frame_end + 1, self.frame_step) if self.use_animation else None
+        moving = kind.kind == "sequence"
+        frames = None
+        if self.use_animation or moving:
+            frames = range(self.frame_start, self.frame_end + 1, self.frame_step)
         if frames is not None and not frames:
             raise UsageError("Export", f"frames {self.frame_start} to {self.frame_end} are none", "Change the range")
-        if frames is not None and "#" not in target.name:
+        if self.format == _ALEMBIC:
+            return self._write_alembic(context, target, frames or range(0))
+        if frames is not None and "#" not in target.name and not moving:
             target = target.with_name(f"{target.stem}_{NUMBER}{target.suffix}")
         with self.folder("drgs-export-"):
             arguments = self.describe(context, target, kind.kind, frames)
@@ -145,13 +163,27 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
                 arguments.append(name if value is True else f"{name}={value}")
         if not kind.fixed and self.up != "auto":
             arguments.append(f"--up={self.up}")
-        files = [frame_path(str(target), n) for n in ([context.scene.frame_current] if frames is None else frames)]
+        shown = [context.scene.frame_current] if frames is None else frames
+        files = [target] if moving else [frame_path(str(target), n) for n in shown]
         return self.start(context, arguments, target.name, f"Writing {target.name}", "could not be written", files)
+
+    def _write_alembic(self, context: bpy.types.Context, target: Path, frames: range) -> set[str]:
+        """Let Blender's own exporter write the meshes."""
+        names = [obj.name for obj in context.selected_objects if assets.is_drgs(obj)]
+        if self.use_selection and not names:
+            raise UsageError("Export", "no selected object is a DR-GS object", "Select one")
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        write_alembic(context, target, frames, names if self.use_selection else [], self.scale)
+        self.report({"INFO"}, f"{target.name}: {LOST_IN_ALEMBIC}")
+        return {"FINISHED"}
 
 
 def _options(operator: DRGS_OT_export) -> list[str]:
-    """Options of the chosen format; that of SPZ in glTF only where there is some."""
+    """Options of the chosen format; those of surfels in a sequence, and of SPZ in glTF, only where there are some."""
     names = WRITTEN[operator.format].options
+    if "surfels" in names and not operator.surfels:
+        return ["surfels"]
     return [n for n in names if n != "spz_version" or operator.format == "SPZ" or operator.compress]
 
 

@@ -55,7 +55,10 @@ class SceneFrames(CommandOperator):
         template = str(self.work_folder / f"{NUMBER}{SUFFIX}")
         numbers = self._write_all(context, template, kind, frames)
         arguments = ["convert", template, str(target), "--as", kind, f"--frames={','.join(map(str, numbers))}"]
-        if kind == "splats":
+        if kind == "sequence":
+            render = context.scene.render
+            arguments.append(f"--fps={render.fps / render.fps_base:.9g}")
+        if kind in ("splats", "sequence"):
             arguments += ["--colour", self.colour, "--samples", str(self.samples)]
         return arguments
 
@@ -91,7 +94,7 @@ class SceneFrames(CommandOperator):
         elif not any(o.visibility.camera for o in frame.objects):
             what = "selected object" if self.use_selection else "object of the scene"
             raise UsageError("Export", f"no {what} is a DR-GS object that can be seen", "Select or import one")
-        if self.colour != "relit" or kind != "splats":  # nothing lights or shadows anything
+        if self.colour != "relit" or kind not in ("splats", "sequence"):  # nothing lights or shadows anything
             frame.meshes, frame.lights, frame.images = [], [], []
         write_frame_file(frame_path(template, number), frame)
 

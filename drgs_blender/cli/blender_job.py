@@ -46,7 +46,11 @@ def do(job: dict[str, Any], reader: io.FileIO, writer: io.FileIO) -> None:
     link.send(protocol.Hello(protocol.PROTOCOL, version, os.getpid()))
     threading.Thread(target=send_heartbeats, args=(link, protocol), daemon=True).start()
     try:
-        render_frames(Exporter(link, package, job["passes"]), job)
+        exporter = Exporter(link, package, job["passes"])
+        if job.get("alembic"):
+            export_alembic(exporter, package, job)
+        else:
+            render_frames(exporter, job)
         link.send(protocol.Shutdown())
     except errors.DrgsError as error:
         link.send(protocol.Failed(0, type(error).__name__, error.subject, error.problem, error.remedy))
@@ -240,6 +244,28 @@ def differences(scene: Any) -> list[str]:
     return notes
 
 
+def open_scene(exporter: Exporter, job: dict[str, Any]) -> None:
+    """Open the file of `job`."""
+    import bpy
+
+    try:
+        bpy.ops.wm.open_mainfile(filepath=job["scene"], load_ui=False, use_scripts=job["scripts"])
+    except RuntimeError as error:
+        reason = str(error).strip().removeprefix("Error: ")
+        raise exporter.errors.AssetError(job["scene"], f"cannot be opened ({reason})", "Check the file") from error
+
+
+def export_alembic(exporter: Exporter, package: str, job: dict[str, Any]) -> None:
+    """Let Blender write the DR-GS objects of `job` as Alembic."""
+    import bpy
+
+    open_scene(exporter, job)
+    given = job["alembic"]
+    write = importlib.import_module(f"{package}.addon.alembic").write_alembic
+    names = write(bpy.context, Path(given["path"]), job["frames"], given["objects"], given["scale"])
+    exporter.request(exporter.protocol.Render(0, {"objects": names}, {}))
+
+
 def render_frames(exporter: Exporter, job: dict[str, Any]) -> None:
     """Evaluate every frame as a final render does: render visibility, render levels, handlers, each view layer."""
     import bpy
@@ -262,20 +288,23 @@ def render_frames(exporter: Exporter, job: dict[str, Any]) -> None:
         def evaluate(self, frame: int, subframe: float) -> None:
             self.frame_set(frame, subframe=subframe)
 
-    try:
-        bpy.ops.wm.open_mainfile(filepath=job["scene"], load_ui=False, use_scripts=job["scripts"])
-    except RuntimeError as error:
-        reason = str(error).strip().removeprefix("Error: ")
-        raise exporter.errors.AssetError(job["scene"], f"cannot be opened ({reason})", "Check the file") from error
+    open_scene(exporter, job)
     bpy.utils.register_class(BatchEngine)
     try:
         scene = bpy.context.scene
         if job.get("report"):
-            about = {"files": outside_files(), "notes": differences(scene)}
+            about = {
+                "files": outside_files(),
+                "notes": differences(scene),
+                "fps": scene.render.fps / scene.render.fps_base,
+            }
             exporter.request(exporter.protocol.Render(0, about, {}))
         if not any(layer.use for layer in scene.view_layers):  # Blender would crash
             problem, remedy = "has no view layer that is rendered", "Switch on Use for Rendering of one"
             raise exporter.errors.UsageError(f'scene "{scene.name}"', problem, remedy)
+        if job.get("surfaces") and scene.camera is None:  # Blender renders nothing without one
+            scene.camera = bpy.data.objects.new("DR-GS", bpy.data.cameras.new("DR-GS"))
+            scene.collection.objects.link(scene.camera)
         scene.render.engine = ENGINE
         scene.render.use_compositing = scene.render.use_sequencer = False
         scene.render.use_persistent_data = True

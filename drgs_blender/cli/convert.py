@@ -17,6 +17,7 @@ from ..core.file_types import SPZ_VERSIONS, USD_KERNELS, Held
 from ..core.frame_sequences import frame_path
 from ..formats.axes import UP_AXES
 from ..formats.point_cache import SUFFIXES as POINT_CACHES
+from .convert_sequence import OPTIONS, convert_sequence, is_sequence
 from .frame_range import check_template, parse_frames, requested_frames
 from .output import check_writable
 from .pose_file import add_vertex_order, check_vertex_order, in_asset_order, is_point_cache, open_cache, read_poses
@@ -26,8 +27,6 @@ from .sampling import int_range
 
 logger = logging.getLogger(__name__)
 
-#: Options that go to the writers of formats that take them.
-OPTIONS = ("materials", "compress", "spz_version", "kernel")
 EXAMPLES = """examples:
   drgs convert capture.ply capture.spz
   drgs convert helmet.drgs helmet.glb
@@ -40,18 +39,23 @@ EXAMPLES = """examples:
   drgs convert splats.ply splats.spz --spz-version 3
   drgs convert lego.drgs light.exr
   drgs convert helmet.drgs helmet.glb --as splats --materials
+  drgs convert shot.blend walk.usdc --object Robot --frames 1-24 --surfels
+  drgs convert robot.drgs walk.usdz --vertices walk.pc2 --frames
+  drgs convert shot.blend walk.abc --frames 1-24
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs convert``."""
     parser.add_argument(
-        "input", type=Path, metavar="IN", help="asset, splats, mesh, environment, or a frame that Blender exported"
-    )
+        "input", type=Path, metavar="IN",
+        help="asset, splats, mesh, environment, a .blend with DR-GS objects, or a frame that Blender exported",
+    )  # fmt: skip
     parser.add_argument("output", type=Path, metavar="OUT", help="file to write; its extension chooses the format")
     parser.add_argument(
-        "--as", dest="kind", choices=("splats", "mesh", "environment"),
-        help="what to write of an asset; default: what OUT can hold, its mesh rather than its splats",
+        "--as", dest="kind", choices=("splats", "mesh", "environment", "sequence"),
+        help="what to write of an asset; default: what OUT can hold, its mesh rather than its splats; sequence: all "
+        "frames in one USD, as it is where OUT has no #",
     )  # fmt: skip
     parser.add_argument(
         "--up", choices=tuple(UP_AXES), help="up axis of the file written; default: what its format prescribes, else z"
@@ -67,8 +71,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_vertex_order(parser)
     parser.add_argument(
         "--frames", nargs="?", const="",
-        help="frames, one file each: #### in IN, OUT and V becomes the number; 1-24, or nothing for those of IN or V",
+        help="frames, one file each: #### in IN, OUT and V becomes the number; 1-24, or nothing for those of IN or V; "
+        "a USD without #### in its name has all of them",
     )  # fmt: skip
+    blend = parser.add_argument_group("of Blender's files")
+    blend.add_argument(
+        "--object",
+        action="append",
+        metavar="NAME",
+        help="an object of the scene; repeatable; default: all DR-GS objects",
+    )
+    blend.add_argument(
+        "--blender", metavar="PATH", help="blender program, or a Python (or its environment) that has bpy"
+    )
+    blend.add_argument(
+        "--enable-scripts", action="store_true", help="let the file run its own Python scripts and drivers"
+    )
     formats = parser.add_argument_group("what single formats leave open")
     formats.add_argument(
         "--materials", action="store_true",
@@ -86,6 +104,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--kernel", choices=USD_KERNELS,
         help="of USD with splats: ellipsoid (default), which viewers show, or surflet, flat as surfels are",
     )  # fmt: skip
+    formats.add_argument(
+        "--surfels", action="store_true", help="of a sequence: the surfels, too, as splats; else the mesh alone"
+    )
+    formats.add_argument(
+        "--fps", type=positive, metavar="N", help="of a sequence: frames per second; default: the scene's, else 24"
+    )
     splats = parser.add_argument_group("colour of splats")
     splats.add_argument(
         "--colour", choices=("captured", "albedo", "relit"),
@@ -103,16 +127,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Convert one file, or those of all frames."""
     check_vertex_order(args)
-    args.frame = None
+    args.frame = args.scene_fps = None
+    if args.input.suffix.lower() == ".blend":
+        from .convert_blend import evaluated_frames
+
+        with evaluated_frames(args) as described:
+            return 0 if described is None else convert_all(described)
+    return convert_all(args)
+
+
+def convert_all(args: argparse.Namespace) -> int:
+    """Convert what is not Blender's file itself."""
+    from ..ipc.frame_file import SUFFIX
+
+    for option in ("object", "blender", "enable_scripts"):
+        if getattr(args, option) and args.input.suffix.lower() != SUFFIX:
+            raise UsageError(f"--{option.replace('_', '-')}", "is of a .blend", "Leave it out")
     moving = is_point_cache(args.vertices)
     if args.output.suffix.lower() in POINT_CACHES:
         return convert_poses(args)
     frames: list[int] | None
-    if moving and (args.frames == "" or (args.frames is None and "#" in args.output.name)):
+    whole = args.frames is None and ("#" in args.output.name or is_sequence(args, None))
+    if moving and (args.frames == "" or whole):
         frames = [frame for frame, _ in read_poses(args.vertices)]
-        check_template(str(args.output), frames)
     else:
-        frames = requested_frames(args.frames, args.input, args.output)
+        frames = requested_frames(args.frames, args.input)
+    if is_sequence(args, frames):
+        convert_sequence(args, frames)
+        return 0
+    if args.fps:
+        raise UsageError("--fps", "is of a sequence", "Leave it out, or name OUT .usdc and give --frames")
+    if frames is not None:
+        check_template(str(args.output), frames)
     if frames is None:
         convert(args)
         return 0

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from ..core.asset import OPTIONAL_CHANNELS, Asset, Environment, Mesh, Surfels
-from ..core.asset.model import neutral_values
+from ..core.asset.model import BASE_CHANNELS, MATERIAL_CHANNELS, neutral_values
 from ..core.errors import UsageError
 from ..core.file_types import Held
 from ..core.frame import RenderSettings, World
@@ -20,7 +20,8 @@ from .progress import FractionBar
 from .relight import read_environment, rotation_z
 
 if TYPE_CHECKING:
-    from ..engine.session import PosedObject
+    from ..engine.session import PosedObject, Session
+    from ..formats.usd_sequence import MovingObject
 
 Array = np.ndarray
 
@@ -56,6 +57,9 @@ class Source(Protocol):
 
     def environment(self) -> Environment:
         """The light."""
+
+    def moving(self, meshes: bool, surfels: bool) -> list[MovingObject]:
+        """The objects one by one; their surfels where they are asked for, or where there is no mesh."""
 
 
 def open_source(args: argparse.Namespace) -> Source:
@@ -121,14 +125,15 @@ class AssetSource:
 
     def mesh(self) -> Mesh:
         """The mesh, posed."""
-        rest = self._asset.mesh
-        textures = rest.textures
-        if self._posed and textures is not None and textures.normals is not None:
-            from ..deform.face_frames import local_normals, posed_normals
+        return posed_mesh(self._asset.mesh, self._vertices) if self._posed else self._asset.mesh
 
-            local = local_normals(rest.vertices, rest.faces, textures.normals)
-            textures = replace(textures, normals=posed_normals(self._vertices, rest.faces, local))
-        return replace(rest, vertices=self._vertices, textures=textures)
+    def moving(self, meshes: bool, surfels: bool) -> list[MovingObject]:
+        """The asset, named as its file."""
+        from ..formats.usd_sequence import MovingObject
+
+        mesh = self.mesh() if "mesh" in self.kinds and meshes else None
+        splats = self.splats()[0] if "splats" in self.kinds and (surfels or mesh is None) else None
+        return [MovingObject(self._args.input.stem.rstrip("#_.-") or "asset", mesh, np.eye(4), splats=splats)]
 
     def splats(self) -> tuple[Splats, str]:
         """The surfels, posed, in the colour that was chosen."""
@@ -161,16 +166,23 @@ class AssetSource:
 class FrameSource:
     """The DR-GS objects that the camera may see in a frame of Blender's, where they are in the world, and the light."""
 
-    def __init__(self, args: argparse.Namespace) -> None:
+    def __init__(self, args: argparse.Namespace, session: Session | None = None) -> None:
         from ..engine.session import Session
 
         if args.env:
             raise UsageError("--env", "is given for a frame, which has its own light", "Leave it out")
-        self._args, session = args, Session()
+        self._args, session = args, session or Session()
         self._frame = surface_frame(args.input, args.samples, session)
         self.notes: list[str] = []
         self._prepared, self._objects = session.prepare(self._frame)
         self._visible = [i for i, item in enumerate(self._objects) if item.state.visibility.camera]
+        if args.object:
+            there = [self._objects[i].state.name for i in self._visible]
+            if missing := [name for name in args.object if name not in there]:
+                known = ", ".join(dict.fromkeys(there)) or "none"
+                problem = f"is no DR-GS object that is seen in {args.input.name}, which has {known}"
+                raise UsageError(f"--object {missing[0]}", problem, "Choose one of them")
+            self._visible = [i for i in self._visible if self._objects[i].state.name in args.object]
         self._session = session  # keeps the scene
         faces = any(len(self._objects[i].mesh.faces) for i in self._visible)
         kinds: list[Held] = ["mesh"] if faces else []
@@ -226,6 +238,41 @@ class FrameSource:
             lit = [self._lit(i, progress) for i in self._visible]
         return join_splats(lit), _COLOUR_NAMES["scene"]
 
+    def moving(self, meshes: bool, surfels: bool) -> list[MovingObject]:
+        """The objects; instances of one get numbers."""
+        found: list[MovingObject] = []
+        count: dict[str, int] = {}
+        for i in self._visible:
+            name = self._objects[i].state.name
+            count[name] = count.get(name, 0) + 1
+            found.append(self._moving(i, f"{name}.{count[name] - 1:03d}" if count[name] > 1 else name, meshes, surfels))
+        return found
+
+    def _moving(self, index: int, name: str, meshes: bool, surfels: bool) -> MovingObject:
+        from ..formats.usd_sequence import MovingObject
+
+        item = self._objects[index]
+        state, traced, mesh = item.state, item.mesh, None
+        if meshes and len(traced.faces):
+            rest = item.asset.mesh
+            bare = state.adjustment is None and all(getattr(state, channel) is None for channel in MATERIAL_CHANNELS)
+            if rest.textures is not None and not bare:
+                note = f"{name}: is painted or adjusted, so its images are left out for the materials of its vertices"
+                self.notes.append(note)
+            mesh = posed_mesh(rest, rest.vertices if state.vertices is None else state.vertices)
+            values = {channel: getattr(traced, channel) for channel in BASE_CHANNELS} | item.channels
+            mesh = replace(mesh, **values, textures=mesh.textures if bare else None)
+            if traced.torn is not None and traced.torn.any():
+                self.notes.append(f"{name}: has torn faces, which are written stretched over the gap")
+        splats = None
+        if surfels or mesh is None:
+            if self._args.colour == "relit":
+                with FractionBar(self._args, "lighting") as progress:
+                    splats = self._lit(index, progress)
+            else:
+                splats = _unlit(self._surfels(index), self._args.colour or "captured")[0]
+        return MovingObject(name, mesh, state.matrix_world, state.corner_normals, splats)
+
     def _surfels(self, index: int) -> Surfels:
         from ..build.export import faded, surfels_of_pose
 
@@ -250,6 +297,17 @@ class FrameSource:
             self._prepared.scene, self._prepared.environment, points, settings, self._prepared.lights, tree, progress
         )
         return splats_of(surfels, colour if item.emission is None else colour + item.emission)
+
+
+def posed_mesh(rest: Mesh, vertices: Array) -> Mesh:
+    """A mesh at other vertices (n, 3), the normals of its textures with them."""
+    textures = rest.textures
+    if textures is not None and textures.normals is not None:
+        from ..deform.face_frames import local_normals, posed_normals
+
+        local = local_normals(rest.vertices, rest.faces, textures.normals)
+        textures = replace(textures, normals=posed_normals(vertices, rest.faces, local))
+    return replace(rest, vertices=vertices, textures=textures)
 
 
 def _unlit(surfels: Surfels, choice: str) -> tuple[Splats, str]:

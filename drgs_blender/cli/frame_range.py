@@ -63,7 +63,7 @@ def parse_frames(text: str) -> list[int]:
     return list(frames)
 
 
-def requested_frames(text: str | None, source: Path, output: Path) -> list[int] | None:
+def requested_frames(text: str | None, source: Path) -> list[int] | None:
     """The frames of a sequence of files, one file each; None where `source` is a single file.
 
     Parameters
@@ -71,19 +71,17 @@ def requested_frames(text: str | None, source: Path, output: Path) -> list[int] 
     text : str or None
         The value of ``--frames``: a range, "" for those that are there, None where it is not given, which means the
         same for a `source` that is no file but a pattern of files.
-    source, output : Path
+    source : Path
         With a run of ``#`` for the number.
 
     Raises
     ------
     UsageError
-        There are no such files, or several would be written to one.
+        There are no such files.
     """
     if text is None and ("#" not in source.name or os.path.lexists(source)):
         return None
-    frames = parse_frames(text) if text else frames_of(str(source))
-    check_template(str(output), frames)
-    return frames
+    return parse_frames(text) if text else frames_of(str(source))
 
 
 def write_frames(frames: Sequence[int]) -> str:

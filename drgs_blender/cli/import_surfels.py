@@ -11,7 +11,7 @@ from pathlib import Path
 from ..core.errors import UsageError
 from ..core.frame_sequences import frame_path
 from ..formats.axes import UP_AXES
-from .frame_range import requested_frames
+from .frame_range import check_template, requested_frames
 from .output import check_suffix, check_writable, write_and_report
 from .progress import FractionBar, clock, prepare_engine
 from .relight import positive
@@ -69,7 +69,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Import and write one asset, or those of all frames."""
-    frames = requested_frames(args.frames, args.surfels, args.out)
+    frames = requested_frames(args.frames, args.surfels)
+    check_template(str(args.out), frames or [])
     if frames is None:
         return _import(args)
     for frame in frames:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core.errors import UsageError
+from ..core.file_types import USD_SUFFIXES
 from ..core.frame_sequences import frame_path
 from ..core.particle_cache import ParticleCache
 from .interrupt import interruptible
@@ -24,6 +25,7 @@ from .progress import FractionBar, clock, prepare_engine
 from .sampling import int_range
 
 if TYPE_CHECKING:
+    from ..core.asset import Mesh
     from ..simulation.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -74,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--export",
         type=Path,
         metavar="FILE",
-        help="all frames: the mesh as .pc2 or .mdd, mesh and particles as .usd, .usda or .usdc",
+        help="all frames: the mesh as .pc2 or .mdd, mesh and particles as .usdc, .usda, .usd or .usdz",
     )
 
 
@@ -88,13 +90,12 @@ def _vector(text: str) -> list[float]:
 def run(args: argparse.Namespace) -> int:
     """Simulate."""
     from ..formats.point_cache import SUFFIXES
-    from ..formats.usd_points import SUFFIXES as USD_SUFFIXES
-    from ..formats.usd_points import check_usd
+    from ..formats.usd_splats import check_usd
 
     if args.export:
         check_suffix(args.export, (*SUFFIXES, *USD_SUFFIXES))
         if args.export.suffix.lower() in USD_SUFFIXES:
-            check_usd(args.export)
+            check_usd(str(args.export))
         check_writable(args.export)
     if args.vertices:
         if "#" not in Path(args.vertices).name:
@@ -137,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
 
         done = bake(job, cache, overwrite=args.overwrite, cancelled=stopped, progress=progress)
     print(f"{args.out}: frames {settings.first} to {settings.last}, {done} of them computed now")
-    _write_exports(args, cache, asset.mesh.faces, settings)
+    _write_exports(args, cache, asset.mesh, settings)
     return 0
 
 
@@ -172,11 +173,12 @@ def _settings(args: argparse.Namespace) -> Settings:
     return parse_settings(data, str(args.settings or "settings"), folder)
 
 
-def _write_exports(args: argparse.Namespace, cache: ParticleCache, faces: np.ndarray, settings: Settings) -> None:
+def _write_exports(args: argparse.Namespace, cache: ParticleCache, mesh: Mesh, settings: Settings) -> None:
     """Poses as arrays and a file for other programs, from the cache."""
     from ..core.asset.archive import replace_file
     from ..formats.point_cache import write_point_cache
-    from ..formats.usd_points import SUFFIXES, write_usd_points
+    from ..formats.usd_sequence import MovingObject, write_usd_sequence
+    from .convert_source import posed_mesh
 
     first, fps = settings.first, settings.fps
     frames = range(first, settings.last + 1)
@@ -187,8 +189,14 @@ def _write_exports(args: argparse.Namespace, cache: ParticleCache, faces: np.nda
             replace_file(frame_path(args.vertices, frame), [encoded.getvalue()])
     if args.export is None:
         return
-    if args.export.suffix.lower() in SUFFIXES:
-        write_usd_points(args.export, map(cache.read, frames), faces, first, fps, settings.matrix_world)
+    if args.export.suffix.lower() in USD_SUFFIXES:
+        name, matrix = args.asset.stem, np.array(settings.matrix_world)
+        states = ((n, cache.read(n)) for n in frames)
+        write_usd_sequence(
+            args.export,
+            ((n, [MovingObject(name, posed_mesh(mesh, s.vertices), matrix, points=s.points)]) for n, s in states),
+            fps,
+        )
     else:
         moving = (cache.read(frame).vertices for frame in frames)
         write_point_cache(args.export, moving, len(frames), len(cache.rest().vertices), first, fps)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Kind = Literal["surfels", "mesh", "environment", "materials"]
-Held = Literal["splats", "mesh", "environment"]
+Held = Literal["splats", "mesh", "environment", "sequence"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +33,8 @@ class WriteType:
     ----------
     extensions : tuple of str
         Endings that choose it.
-    kind : {"splats", "mesh", "environment"}
-        Kind of the data that is written.
+    kind : {"splats", "mesh", "environment", "sequence"}
+        Kind of the data that is written; a sequence has the meshes, and perhaps the surfels, of all frames.
     up : {"z", "y"}
         The up axis that the format prescribes, or that is written unless asked otherwise.
     fixed : bool
@@ -79,6 +79,8 @@ SPZ_VERSIONS = (2, 3, 4)
 
 #: Kernels of splats in USD; the first one is written unless asked otherwise.
 USD_KERNELS = ("ellipsoid", "surflet")
+#: Names of stages.
+USD_SUFFIXES = (".usdc", ".usda", ".usd", ".usdz")
 
 WRITTEN: dict[str, WriteType] = {
     "3DGS PLY": WriteType((".ply",), "splats", "z", False, ("materials",)),
@@ -88,8 +90,13 @@ WRITTEN: dict[str, WriteType] = {
     "USD splats": WriteType((".usd", ".usda", ".usdc"), "splats", "z", True, ("materials", "kernel")),
     "glTF mesh": WriteType((".glb",), "mesh", "y", True),
     "USD mesh": WriteType((".usdz",), "mesh", "z", True),
+    "USD sequence": WriteType(USD_SUFFIXES, "sequence", "z", True, ("surfels", "materials", "kernel")),
+    "Alembic sequence": WriteType((".abc",), "sequence", "y", True),
     "OpenEXR": WriteType((".exr",), "environment", "z", True),
 }
+
+#: What Alembic lacks, in a sentence for the user.
+LOST_IN_ALEMBIC = "surfels, materials and their attributes are left out: Alembic has shape, motion and UV maps"
 
 #: Videos of which `drgs capture` takes frames.
 VIDEOS = frozenset((".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts"))

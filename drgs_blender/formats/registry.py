@@ -356,7 +356,7 @@ def document() -> str:
         "whose third axis, along the normal, is that of the splat it was read from, else a hundredth of the shorter of",
         "the others. Light baked into it is encoded as sRGB, without a view transform; what is brighter than white is",
         "white. Harmonics of a higher degree than 3, and properties that no other program knows, stay behind. Both",
-        "read and write sequences, a file a frame.",
+        "read and write sequences, a file a frame, or all frames in one USD or Alembic file.",
         "",
         "| Format | Names | From | Up axis | Kept | Lost |",
         "|---|---|---|---|---|---|",

@@ -23,6 +23,7 @@ Array = np.ndarray
 
 _ALIGNMENT = 64
 _LOCAL_HEADER = 30
+_PICTURES = "textures/"
 #: The fixed date of entries, so that a file depends on what it holds alone.
 _DATE = (1980, 1, 1, 0, 0, 0)
 #: Numbers turned into text at once; bounds the memory.
@@ -43,20 +44,25 @@ def write_usd_mesh(path: Path, mesh: Mesh) -> None:
     groups = face_groups(mesh, str(path))
     files = {"asset.usda": _stage(mesh, groups).encode()}
     for group in groups:
-        for file, content in _files(group):
-            files[f"textures/{file}"] = content
+        for file, content in picture_files(group):
+            files[f"{_PICTURES}{file}"] = content
+    write_package(path, files)
+
+
+def write_package(path: Path, files: dict[str, bytes]) -> None:
+    """Write a USDZ of these files by name, the first the stage. Raises WriteError."""
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
         for name, content in files.items():
             entry = zipfile.ZipInfo(name, _DATE)
             # An extra field fills up to the alignment; it has a head of 4 bytes.
-            gap = -(data.tell() + _LOCAL_HEADER + len(name) + 4) % _ALIGNMENT
+            gap = -(data.tell() + _LOCAL_HEADER + len(name.encode()) + 4) % _ALIGNMENT
             entry.extra = b"\x86\x19" + gap.to_bytes(2, "little") + bytes(gap)
             archive.writestr(entry, content)
     replace_file(path, [data.getbuffer()])
 
 
-def _files(group: FaceGroup) -> list[tuple[str, bytes]]:
+def picture_files(group: FaceGroup) -> list[tuple[str, bytes]]:
     """Name and content of the pictures of a group."""
     m = group.material
     if isinstance(m, TexturedMaterial):
@@ -102,7 +108,7 @@ def _stage(mesh: Mesh, groups: list[FaceGroup]) -> str:
         lines.append('uniform token subsetFamily:materialBind:familyType = "partition"')
         for name, group in zip(names, groups, strict=True):
             lines += _subset(name, group.faces)
-    materials = [line for name, group in zip(names, groups, strict=True) for line in _material(name, group.material)]
+    materials = [material_text(n, group.material, "/Asset") for n, group in zip(names, groups, strict=True)]
     return "\n".join([*lines, "}", *materials, "}"]) + "\n"
 
 
@@ -117,8 +123,11 @@ def _subset(material: str, faces: Array) -> list[str]:
     ]
 
 
-def _material(name: str, material: UniformMaterial | TexturedMaterial) -> list[str]:
-    path = f"/Asset/{name}"
+def material_text(
+    name: str, material: UniformMaterial | TexturedMaterial, parent: str, pictures: str = _PICTURES
+) -> str:
+    """The material `name` below the prim at `parent` as text; `pictures` comes before the names of `picture_files`."""
+    path = f"{parent}/{name}"
     surface = [
         'def Shader "Surface"\n{',
         'uniform token info:id = "UsdPreviewSurface"',
@@ -198,7 +207,8 @@ def _material(name: str, material: UniformMaterial | TexturedMaterial) -> list[s
             *shaders,
         ]
     connection = f"token outputs:surface.connect = <{path}/Surface.outputs:surface>"
-    return [f'def Material "{name}"\n{{', connection, *surface, "}", *shaders, "}"]
+    text = "\n".join([f'def Material "{name}"\n{{', connection, *surface, "}", *shaders, "}"])
+    return text.replace(f"@{_PICTURES}", f"@{pictures}")
 
 
 def _texture(
@@ -217,7 +227,7 @@ def _texture(
     return [
         f'def Shader "{name}"\n{{',
         'uniform token info:id = "UsdUVTexture"',
-        f"asset inputs:file = @textures/{file}@",
+        f"asset inputs:file = @{_PICTURES}{file}@",
         f'token inputs:sourceColorSpace = "{space}"',
         f'token inputs:wrapS = "{wrap}"',
         f'token inputs:wrapT = "{wrap}"',

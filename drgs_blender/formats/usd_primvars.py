@@ -20,12 +20,12 @@ ALBEDO, ROUGHNESS, METALLIC = "Cd", "rough", "metallic"
 LINEAR_SPACE = "lin_rec709_scene"
 
 
-def write_primvars(prim: Any, geometry: Any, splats: Splats) -> None:
-    """Give a prim the normals and materials of its splats; it has them one a particle."""
-    from pxr import Sdf, Vt
+def primvar_values(prim: Any, splats: Splats) -> list[tuple[Any, Any]]:
+    """The normals and materials of splats, one a particle, as attributes made on `prim` with what to set them to."""
+    from pxr import Sdf, UsdGeom, Vt
 
     if splats.materials is None:
-        return
+        return []
     types = Sdf.ValueTypeNames
     albedo, roughness, metallic = (np.ascontiguousarray(array) for array in splats.materials.arrays())
     # In memory the imaginary part of a quaternion comes first.
@@ -39,9 +39,10 @@ def write_primvars(prim: Any, geometry: Any, splats: Splats) -> None:
         (ROUGHNESS, types.FloatArray, Vt.FloatArray.FromNumpy(roughness)),
         (METALLIC, types.FloatArray, Vt.FloatArray.FromNumpy(metallic)),
     ]
-    primvars = geometry.PrimvarsAPI(prim)
+    primvars, found = UsdGeom.PrimvarsAPI(prim), []
     for name, kind, value in values:
-        attribute = primvars.CreatePrimvar(name, kind, geometry.Tokens.vertex)
-        attribute.Set(value)
+        attribute = primvars.CreatePrimvar(name, kind, UsdGeom.Tokens.vertex).GetAttr()
         if kind == types.Color3fArray:
-            attribute.GetAttr().SetColorSpace(LINEAR_SPACE)
+            attribute.SetColorSpace(LINEAR_SPACE)
+        found.append((attribute, value))
+    return found

@@ -22,7 +22,7 @@ from .splat_scene import Piece, join_pieces
 from .splats import THICKNESS, SplatMaterials, Splats, writable
 from .subprocess_reader import PATIENCE, SECONDS, read_in_subprocess
 from .usd_crate import check_crate
-from .usd_primvars import write_primvars
+from .usd_primvars import primvar_values
 from .usd_stage import ATTRIBUTES, DEGREE, FIELD, HARMONICS, MATERIALS, NO_SPLATS, SCHEMA, SPACE, SURFLET, UP
 
 Array = np.ndarray
@@ -72,11 +72,41 @@ def write_usd_splats(path: Path, splats: Splats, materials: bool = False, kernel
     Raises DeviceError (usd-core is not installed), AssetError (see `splats.writable`) or WriteError.
     """
     splats = writable(splats, str(path))
-    usd, geometry = _usd(str(path))
+    check_usd(str(path))
+    from pxr import Usd, UsdGeom
+
+    try:
+        stage = Usd.Stage.CreateInMemory()
+        UsdGeom.SetStageUpAxis(stage, "Z")
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        prim = define_field(stage, "/Splats", kernel)
+        stage.SetDefaultPrim(prim)
+        for attribute, value in field_values(prim, splats, materials):
+            attribute.Set(value)
+    except RuntimeError as error:
+        raise WriteError(str(path), f"cannot be written ({error})", "Report it") from error
+    replace_by(path, lambda temporary: stage.GetRootLayer().Export(str(temporary)))
+
+
+def define_field(stage: Any, path: str, kernel: str) -> Any:
+    """A new prim at `path` for splats of a kernel, a name of `USD_KERNELS`."""
+    from pxr import Sdf
+
+    flat = kernel != USD_KERNELS[0]
+    prim = stage.DefinePrim(path, FIELD if flat else SCHEMA)
+    for name in (*ATTRIBUTES, SURFLET) if flat else ():
+        prim.AddAppliedSchema(name)
+    prim.AddAppliedSchema("ColorSpaceAPI")
+    space = prim.CreateAttribute(SPACE, Sdf.ValueTypeNames.Token, custom=False, variability=Sdf.VariabilityUniform)
+    space.Set("srgb_rec709_scene")  # of the names that USD knows; without one, colours are linear to it
+    return prim
+
+
+def field_values(prim: Any, splats: Splats, materials: bool) -> list[tuple[Any, Any]]:
+    """Splats that are `writable` as attributes made on `prim`, which `define_field` made, with what to set them to."""
     from pxr import Gf, Sdf, Vt
 
     types = Sdf.ValueTypeNames
-    k = splats.sh.shape[1]
     reach = 3 * splats.scale.max(axis=1, keepdims=True)
     extent = np.zeros((2, 3))
     if len(splats):
@@ -90,32 +120,15 @@ def write_usd_splats(path: Path, splats: Splats, materials: bool = False, kernel
         (HARMONICS, types.Float3Array, Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(splats.sh).reshape(-1, 3))),
         ("extent", types.Float3Array, Vt.Vec3fArray([Gf.Vec3f(*row.tolist()) for row in extent])),
     ]
-    try:
-        stage = usd.Stage.CreateInMemory()
-        geometry.SetStageUpAxis(stage, "Z")
-        geometry.SetStageMetersPerUnit(stage, 1.0)
-        flat = kernel != USD_KERNELS[0]
-        prim = stage.DefinePrim("/Splats", FIELD if flat else SCHEMA)
-        for name in (*ATTRIBUTES, SURFLET) if flat else ():
-            prim.AddAppliedSchema(name)
-        stage.SetDefaultPrim(prim)
-        for name, kind, value in values:
-            prim.CreateAttribute(name, kind, custom=False).Set(value)
-        degree = prim.CreateAttribute(DEGREE, types.Int, custom=False, variability=Sdf.VariabilityUniform)
-        degree.Set(int(np.sqrt(k)) - 1)
-        prim.AddAppliedSchema("ColorSpaceAPI")
-        space = prim.CreateAttribute(SPACE, types.Token, custom=False, variability=Sdf.VariabilityUniform)
-        space.Set("srgb_rec709_scene")  # of the names that USD knows; without one, colours are linear to it
-        if materials:
-            write_primvars(prim, geometry, splats)
-    except RuntimeError as error:
-        raise WriteError(str(path), f"cannot be written ({error})", "Report it") from error
-    replace_by(path, lambda temporary: stage.GetRootLayer().Export(str(temporary)))
+    degree = prim.CreateAttribute(DEGREE, types.Int, custom=False, variability=Sdf.VariabilityUniform)
+    found = [(degree, int(np.sqrt(splats.sh.shape[1])) - 1)]
+    found += [(prim.CreateAttribute(name, kind, custom=False), value) for name, kind, value in values]
+    return found + (primvar_values(prim, splats) if materials else [])
 
 
-def _usd(subject: str) -> tuple[Any, Any]:
+def check_usd(subject: str) -> None:
+    """Raise DeviceError about `subject` where usd-core is not installed."""
     try:
-        from pxr import Usd, UsdGeom
+        import pxr  # noqa: F401
     except ImportError as error:
         raise DeviceError(subject, *_NOT_INSTALLED) from error
-    return Usd, UsdGeom

@@ -16,6 +16,7 @@ from .sog_writer import write_sog
 from .splat_ply import write_splat_ply
 from .spz_writer import write_spz
 from .usd_mesh import write_usd_mesh
+from .usd_sequence import write_usd_sequence
 from .usd_splats import write_usd_splats
 
 
@@ -28,8 +29,8 @@ class Writer:
     name : str
         Shown to users; the key of its `file_types.WriteType`.
     write : callable
-        (path, what goes in, options) -> None, where what goes in is `splats.Splats`, `asset.Mesh` or
-        `asset.Environment`; raises WriteError.
+        (path, what goes in, options) -> None, where what goes in is `splats.Splats`, `asset.Mesh`,
+        `asset.Environment` or numbered frames of `usd_sequence.MovingObject`; raises WriteError.
     kept, lost : str
         For the documentation.
     lost_channels : tuple of str
@@ -37,7 +38,7 @@ class Writer:
     """
 
     name: str
-    write: Callable[..., None]
+    write: Callable[..., object]
     kept: str
     lost: str
     lost_channels: tuple[str, ...] = ()
@@ -92,6 +93,12 @@ _TEXTURES = (
 
 #: What is lost of splats.
 _MATERIALS = "materials, unless with `--materials` ([names](relightable-splats.md))"
+
+
+def write_alembic(path: Path, *_: object) -> None:
+    """Raise UsageError: Blender alone writes it."""
+    raise UsageError(str(path), "is Alembic, which Blender writes", "Give a .blend as IN, or use File > Export there")
+
 
 WRITERS: tuple[Writer, ...] = (
     Writer(
@@ -148,6 +155,22 @@ WRITERS: tuple[Writer, ...] = (
         ("specular",),
     ),
     Writer(
+        "USD sequence",
+        write_usd_sequence,
+        "all frames in one stage, a time code each: objects with their transforms, meshes with points and normals, "
+        "texture coordinates, materials as those of USD mesh (images beside the stage, or in a .usdz) and as "
+        "attributes (primvars); with `--surfels` the surfels as those of USD splats; simulated particles as points; "
+        "needs usd-core",
+        "what USD mesh loses; faces and surfels that differ between frames; images follow no animated material",
+    ),
+    Writer(
+        "Alembic sequence",
+        write_alembic,
+        "transforms, and the evaluated meshes of all frames, with UV maps, as Blender's own exporter writes them, and "
+        "only where it was built with Alembic: *File > Export*, or a .blend as IN",
+        "surfels, materials and their attributes",
+    ),
+    Writer(
         "OpenEXR",
         write_exr_environment,
         "radiance as 32-bit numbers, lat-long in Blender's mapping",
@@ -175,7 +198,12 @@ def find_writer(path: Path, kinds: Sequence[Held]) -> Writer:
 
 
 #: The kinds of data in messages.
-WORDS: dict[Held, str] = {"splats": "splats", "mesh": "meshes", "environment": "environments"}
+WORDS: dict[Held, str] = {
+    "splats": "splats",
+    "mesh": "meshes",
+    "environment": "environments",
+    "sequence": "sequences",
+}
 
 
 def names_for(kinds: Sequence[Held]) -> str:

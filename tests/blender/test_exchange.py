@@ -163,13 +163,15 @@ def test_the_dialogs_show_what_goes_with_the_format(ball, scene):
         column = lambda self, **_: self  # noqa: E731
 
     operator = part("operators.export").DRGS_OT_export
-    values = {"colour": "relit", "use_animation": True, "compress": True}
+    values = {"colour": "relit", "use_animation": True, "compress": True, "surfels": True}
     for format_, wanted, unwanted in (
         ("SPZ", {"samples", "scale", "use_selection", "frame_end", "spz_version"}, {"up"}),
         ("3DGS PLY", {"up", "colour", "materials"}, {"spz_version"}),
         ("glTF splats", {"materials", "compress", "spz_version"}, {"up"}),
         ("USD splats", {"materials", "kernel"}, {"compress", "spz_version"}),
         ("glTF mesh", {"scale"}, {"colour", "up"}),
+        ("USD sequence", {"frame_end", "surfels", "kernel", "samples"}, {"use_animation", "up"}),
+        ("Alembic sequence", {"frame_end", "scale"}, {"surfels", "kernel", "use_animation", "colour"}),
         ("OpenEXR", {"format"}, {"scale", "use_selection", "colour"}),
     ):
         shown.clear()
@@ -208,7 +210,7 @@ def test_stl_that_blender_writes_becomes_an_object(scene, tmp_path, text):
     assert apart.min(axis=1).max() < 1e-5 and apart.min(axis=0).max() < 1e-5
 
 
-@pytest.mark.parametrize("name", ["a.abc", "a.OBJ", "a.gltf", "a.hdr"])
+@pytest.mark.parametrize("name", ["a.fbx", "a.OBJ", "a.gltf", "a.hdr"])
 def test_the_file_browser_keeps_a_foreign_ending_to_be_refused(scene, tmp_path, name):
     """It was made "a.abc.ply", and written without a word. Endings that are part of a name get that of the format."""
     export, stand_in = part("operators.export").DRGS_OT_export, SimpleNamespace(filepath=name, format="3DGS PLY")

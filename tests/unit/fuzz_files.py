@@ -102,7 +102,7 @@ def kinds() -> dict[str, Callable[[], Kind]]:
             return path.read_bytes()
 
     for writer in WRITERS:
-        if writer.name == "USD mesh":
+        if writer.name == "USD mesh" or writer.kind == "sequence":
             continue  # is not read
         for suffix in writer.extensions:
             name = f"{writer.kind}{suffix}"

@@ -234,4 +234,7 @@ def test_convert_tells_of_materials_that_are_assumed(tmp_path: Path, capsys: pyt
     assert "are used" not in capsys.readouterr().out
     assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.spz"), "--materials"]) == 64
     said = capsys.readouterr().err
-    assert "--materials: is no option of SPZ. Leave it out, or write 3DGS PLY, glTF splats or USD splats" in said
+    assert (
+        "--materials: is no option of SPZ. Leave it out, or write 3DGS PLY, glTF splats, USD splats or USD sequence"
+        in said
+    )

@@ -23,7 +23,6 @@ from drgs_blender.core.asset.model import Asset, Mesh
 from drgs_blender.core.errors import AssetError, Cancelled, UsageError, WriteError
 from drgs_blender.core.particle_cache import ParticleCache
 from drgs_blender.deform.attach import attach
-from drgs_blender.formats.usd_points import write_usd_points
 from drgs_blender.simulation import input_digest
 from drgs_blender.simulation.bake import bake
 from drgs_blender.simulation.job import prepare
@@ -391,20 +390,22 @@ def test_exports_hold_every_vertex(tmp_path, whole, suffix):
 
 
 @pytest.mark.parametrize("suffix", [".usda", ".usdc"])
-def test_mesh_and_particles_are_exported_as_usd(tmp_path, whole, suffix):
+def test_mesh_and_particles_are_exported_as_usd(tmp_path, suffix):
     usd = pytest.importorskip("pxr.Usd", reason="usd-core is an optional package")
     from pxr import UsdGeom
 
-    cache, mesh = ParticleCache(whole), block()
+    asset, path, out = asset_file(tmp_path), tmp_path / f"block{suffix}", tmp_path / "c"
     matrix = np.diag([2.0, 2, 2, 1])
     matrix[:3, 3] = 1, 2, 3
-    path = tmp_path / f"block{suffix}"
-    write_usd_points(path, (cache.read(f) for f in range(1, 7)), mesh.faces, 1, 24.0, matrix)
+    (tmp_path / "s.json").write_text(json.dumps(DROP | {"matrix_world": matrix.tolist(), "last": 4}))
+    command = ["simulate", str(asset), "--settings", str(tmp_path / "s.json"), "--out", str(out), "--fps", "25"]
+    assert main([*command, "--export", str(path)]) == 0
+    cache, name = ParticleCache(out), asset.stem
     stage = usd.Stage.Open(str(path))
-    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (1, 6, 24)
-    shape, points = (UsdGeom.PointBased(stage.GetPrimAtPath(f"/Matter/{name}")) for name in ("Mesh", "Points"))
-    assert np.array_equal(np.array(UsdGeom.Mesh(shape).GetFaceVertexIndicesAttr().Get()), mesh.faces.reshape(-1))
-    for frame in (5, 2):
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (1, 4, 25)
+    shape, points = (UsdGeom.PointBased(stage.GetPrimAtPath(f"/root/{name}/{of}")) for of in (name, "particles"))
+    assert shape.GetPrim().HasAPI("MaterialBindingAPI")
+    for frame in (4, 2):
         assert np.array_equal(np.array(shape.GetPointsAttr().Get(frame)), cache.read(frame).vertices)
         assert np.array_equal(np.array(points.GetPointsAttr().Get(frame)), cache.read(frame).points)
     placed = UsdGeom.XformCache(3).GetLocalToWorldTransform(shape.GetPrim()).Transform((1.0, 1.0, 1.0))
