@@ -162,7 +162,7 @@ class CommandOperator(DrgsOperator):
                 stdin=subprocess.PIPE,
                 stdout=handle,
                 stderr=handle,
-                env=clean_environment(),
+                env=clean_environment() | {"DRGS_PROGRESS": "1"},
                 creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),  # Windows alone has it
             )
         except OSError as error:

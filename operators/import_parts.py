@@ -85,7 +85,8 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
     use_remove_light: BoolProperty(
         name="Estimate Colour without Light",
         description="Estimate the albedo of surfels without materials: their captured colour divided by the light that "
-        "the environment sends there, with shadows",
+        "the environment sends there, with shadows. Without an environment that is estimated, too, and kept in the "
+        "asset: all but its brightness and mean colour; highlights and metals stay",
         default=False,
     )
     use_environment: BoolProperty(name="Set World", description="Light the scene with the environment", default=False)
@@ -161,10 +162,6 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
         if light:
             arguments += ["--env", light]
         if surfels and self.use_remove_light:
-            if not light:
-                raise UsageError(
-                    "Estimate Colour without Light", "needs the light of the capture", "Choose its environment"
-                )
             arguments.append("--remove-light")
         if self.pose != "rest" and not surfels:
             arguments += ["--pose", self.pose]

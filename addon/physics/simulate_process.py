@@ -89,7 +89,7 @@ class SimulateProcess:
                     stdin=subprocess.PIPE,
                     stdout=output,
                     stderr=log,
-                    env=clean_environment(),
+                    env=clean_environment() | {"DRGS_PROGRESS": "1"},
                     creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),  # Windows alone has it
                 )
         except OSError as error:

@@ -2,7 +2,8 @@
 
 What leaves a rough, non-metallic surface is its albedo times the light that arrives, and a little gloss that does not
 depend on it. Both follow from the environment and the mesh by the integrator; the captured colour gives the rest. It is
-no inverse rendering: a colour that is not in the environment (another light, a wrong exposure, a mirror) stays.
+no inverse rendering: a colour that is not in the environment (another light, a wrong exposure, a mirror) stays. Where
+the environment is not known, `light_estimate` finds one.
 """
 
 from __future__ import annotations
@@ -11,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from ..core.asset.model import Array, Asset, Surfels
-from ..core.color import LUMINANCE, srgb_to_linear
+from ..core.asset.model import Array, Asset, Environment
+from ..core.color import LUMINANCE
 from ..core.errors import UsageError
 from ..core.frame import RenderSettings, World
 from ..formats.gaussian_ply import CAPTURED_ALBEDO
-from ..formats.harmonics import basis, whole_bands
 from ..render.lights.environment import EnvironmentLight
 from ..render.scene.trace_scene import TraceObject, TraceScene
 from .importer import CAPTURED
-from .relit import Progress, light_components, points_on_mesh
+from .light_estimate import estimate_light
+from .relit import Progress, captured_along, light_components, points_on_mesh, white_surfels
 from .transfer import surfels_to_vertices
 
 #: What surfels without materials are taken for.
@@ -29,8 +30,16 @@ _ROUGHNESS, _METALLIC = 0.5, 0.0
 _DARK = 0.05
 #: Without an exposure, the albedo (by luminance) that this part of the surfels stays below is this.
 _BRIGHT, _BRIGHTEST = 0.9, 0.8
+#: The same where the light is an estimate: objects are darker than white paint as a rule.
+_USUAL = 0.5
 #: Rounds: the light that other parts of the object reflect depends on their albedo.
 _ROUNDS = 2
+#: What an estimated light leaves open, for the user.
+LIMITS = [
+    "the light is estimated: its brightness is unknown (--exposure), its mean colour taken for white, so that light "
+    "which is coloured as a whole stays in the albedo",
+    "highlights, mirrors and metals stay in the albedo; light of near lamps is taken for that of an environment",
+]
 _SAMPLES = RenderSettings(samples=192, subpixel_samples=1, bounces=1, shading_model="principled")
 
 
@@ -42,10 +51,11 @@ def remove_light(
     Parameters
     ----------
     asset : Asset
-        With a mesh, an environment and ``surfels.sh``; changed in place, its mesh too.
+        With a mesh and ``surfels.sh``; changed in place, its mesh too. Without an environment it gets an estimate, as
+        bright as gives the captured colours.
     exposure : float, optional
-        Linear captured colour that radiance 1 gives; None chooses it so that the brightest tenth is not brighter than
-        paint.
+        Linear captured colour that radiance 1 gives, of an estimated light that of white paint in its mean; None
+        chooses it so that the brightest tenth is not brighter than paint, or under an estimate usual things.
     settings : RenderSettings
         Samples per surfel.
     progress : callable, optional
@@ -57,20 +67,21 @@ def remove_light(
         The asset lacks one of these, has materials already, or the environment gives no light.
     """
     surfels, mesh = asset.surfels, asset.mesh
-    if asset.binding is None or asset.environment is None or surfels.sh is None:
-        lacking = (
-            "a mesh" if asset.binding is None else "an environment" if surfels.sh is not None else "captured colours"
-        )
-        raise UsageError("removing light", f"needs {lacking}", "Import the capture with its mesh and its light")
+    if asset.binding is None or surfels.sh is None:
+        lacking = "a mesh" if asset.binding is None else "captured colours"
+        raise UsageError("removing light", f"needs {lacking}", "Import a capture of splats with their mesh")
     materials = asset.provenance.get("materials", CAPTURED)
     if not materials.startswith(CAPTURED):
         raise UsageError("removing light", f"is for captures without materials; these are {materials}", "Leave it out")
-    light = EnvironmentLight(World(asset.environment.radiance))
     surfels.roughness[:], surfels.metallic[:] = _ROUGHNESS, _METALLIC
     mesh.roughness[:], mesh.metallic[:] = _ROUGHNESS, _METALLIC
+    estimated = asset.environment is None
+    parts = _ROUNDS + estimated
+    environment = asset.environment or estimate_light(asset, _part(progress, 0, parts))
+    light = EnvironmentLight(World(environment.radiance))
     report: dict[str, Any] = {}
     for round_ in range(_ROUNDS):
-        share = None if progress is None else _part(progress, round_)
+        share = _part(progress, round_ + estimated, parts)
         diffuse, glossy, seen = _light(asset, light, settings, share)
         arriving = diffuse @ LUMINANCE
         known = arriving > _DARK * np.median(arriving)
@@ -78,32 +89,25 @@ def remove_light(
             raise UsageError(
                 "removing light", "the environment does not reach the surfels", "Choose that of the capture"
             )
-        used = exposure or _exposure(seen, diffuse, glossy, known)
+        used = exposure or _exposure(seen, diffuse, glossy, known, _USUAL if estimated else _BRIGHTEST)
         albedo = np.clip((seen / used - glossy) / np.maximum(diffuse, 1e-6), 0.0, 1.0)
         surfels.albedo[:] = np.where(known[:, None], albedo, np.median(albedo[known], axis=0))
         report["vertices_without_surfels"] = surfels_to_vertices(mesh, surfels, asset.binding)
         surfels.albedo[~known] = _of_mesh(asset)[~known]
         report |= {"exposure": float(used), "too_dark": int((~known).sum())}
         report["clipped"] = int((known & (albedo >= 1).any(axis=1)).sum())
+    whose = "an estimated environment" if estimated else "the environment"
     report["notes"] = [
-        f"albedo estimated: captured colour over the light of the environment, exposure {report['exposure']:.3g}; "
+        f"albedo estimated: captured colour over the light of {whose}, exposure {report['exposure']:.3g}; "
         f"{report['too_dark']} surfels too dark to estimate, {report['clipped']} as bright as white"
     ]
-    asset.provenance["materials"] = "estimated from captured colours, by removing the light of the environment"
+    if estimated:
+        report["notes"] += LIMITS
+        asset.environment = Environment(environment.radiance * np.float32(report["exposure"]))
+    asset.provenance["materials"] = f"estimated from captured colours, by removing the light of {whose}"
     about = asset.provenance.setdefault("report", {})
     about["surfel_notes"] = [note for note in about.get("surfel_notes", []) if note != CAPTURED_ALBEDO]
     about["remove_light"] = report
-
-
-def captured_along(surfels: Surfels, directions: Array) -> Array:
-    """Linear captured colour (n, 3) that each surfel sends along a unit direction (n, 3).
-
-    Harmonics are of the direction from the camera to the splat, which is the other way.
-    """
-    assert surfels.sh is not None
-    sh = whole_bands(surfels.sh)
-    weights = basis(-directions, {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]])
-    return srgb_to_linear(np.clip(0.5 + np.einsum("nk,nkc->nc", weights, sh), 0.0, 1.0))
 
 
 def _light(
@@ -112,11 +116,7 @@ def _light(
     """Diffuse light of albedo 1, glossy light, and captured colour, (n, 3) each, of every surfel along its normal."""
     mesh, surfels = asset.mesh, asset.surfels
     assert asset.binding is not None
-    white = Surfels(
-        surfels.centre, surfels.scale, surfels.rotation, surfels.opacity, np.ones_like(surfels.albedo),
-        surfels.roughness, surfels.metallic,
-    )  # fmt: skip
-    points = points_on_mesh(white, mesh.vertices, mesh.faces, asset.binding)
+    points = points_on_mesh(white_surfels(surfels), mesh.vertices, mesh.faces, asset.binding)
     scene = TraceScene()
     scene.update([TraceObject("asset", mesh.vertices, mesh.faces, mesh.albedo, mesh.roughness, mesh.metallic)])
     try:
@@ -126,9 +126,9 @@ def _light(
     return components[:, :2].sum(axis=1), components[:, 2:].sum(axis=1), captured_along(surfels, points.normal)
 
 
-def _exposure(seen: Array, diffuse: Array, glossy: Array, known: Array) -> float:
-    """The exposure at which the albedo of the brightest tenth is that of bright paint."""
-    light = (_BRIGHTEST * diffuse[known] + glossy[known]) @ LUMINANCE
+def _exposure(seen: Array, diffuse: Array, glossy: Array, known: Array, brightest: float) -> float:
+    """The exposure at which the brightest tenth has an albedo of `brightest`."""
+    light = (brightest * diffuse[known] + glossy[known]) @ LUMINANCE
     return float(max(np.quantile(seen[known] @ LUMINANCE / np.maximum(light, 1e-9), _BRIGHT), 1e-6))
 
 
@@ -139,5 +139,6 @@ def _of_mesh(asset: Asset) -> Array:
     return np.einsum("nk,nkc->nc", asset.binding.barycentric, corners)
 
 
-def _part(progress: Progress, round_: int) -> Progress:
-    return lambda phase, fraction: progress(phase, (round_ + fraction) / _ROUNDS)
+def _part(progress: Progress | None, done: int, parts: int) -> Progress | None:
+    """Progress of one of so many parts."""
+    return None if progress is None else lambda phase, fraction: progress(phase, (done + fraction) / parts)

@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from ..core.asset.model import Asset, Binding, Surfels
+from ..core.color import srgb_to_linear
 from ..core.errors import UsageError
 from ..core.frame import RenderSettings, World
+from ..formats.harmonics import basis, whole_bands
 from ..geometry.normals import rotation_matrices
 from ..render.integrator.integrate import integrate
 from ..render.lights.environment import EnvironmentLight
@@ -184,3 +186,19 @@ def points_along(
         roughness=roughness,
         metallic=metallic,
     )
+
+
+def white_surfels(surfels: Surfels) -> Surfels:
+    """The surfels with an albedo of 1."""
+    return replace(surfels, albedo=np.ones_like(surfels.albedo))
+
+
+def captured_along(surfels: Surfels, directions: Array, rows: Array | slice = slice(None)) -> Array:
+    """Linear captured colour (n, 3) that each surfel, or those of `rows`, sends along a unit direction (n, 3).
+
+    Harmonics are of the direction from the camera to the splat, which is the other way.
+    """
+    assert surfels.sh is not None
+    sh = whole_bands(surfels.sh[rows])
+    weights = basis(-directions, {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]])
+    return srgb_to_linear(np.clip(0.5 + np.einsum("nk,nkc->nc", weights, sh), 0.0, 1.0))

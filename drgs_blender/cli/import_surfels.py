@@ -6,6 +6,7 @@ Without a mesh a closed one is built around the surfels, so that they can be rig
 from __future__ import annotations
 
 import argparse
+import logging
 from pathlib import Path
 
 from ..core.errors import UsageError
@@ -17,6 +18,8 @@ from .progress import FractionBar, clock, prepare_engine
 from .relight import positive
 from .sampling import int_range
 
+logger = logging.getLogger(__name__)
+
 EXAMPLES = """examples:
   drgs import point_cloud.ply --mesh fuse_post.ply --out capture.drgs
   drgs import point_cloud.ply --mesh fuse_post.ply --env room.exr --up y --out capture.drgs
@@ -24,6 +27,7 @@ EXAMPLES = """examples:
   drgs import splats.compressed.ply --up=-y --resolution 256 --out splats.drgs
   drgs import 'dance/####.spz' --no-mesh --frames 1-24 --out 'dance/####.drgs'
   drgs import statue.ply --env garden.hdr --remove-light --out statue.drgs
+  drgs import statue.ply --remove-light --out statue.drgs
 """
 
 
@@ -44,12 +48,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     light = parser.add_argument_group("light in the colours of surfels without materials")
     light.add_argument(
-        "--remove-light", action="store_true", help="estimate the albedo: the captured colour over the light of --env"
-    )
+        "--remove-light", action="store_true",
+        help="estimate the albedo: the captured colour over the light of --env; without it that is estimated, too, but "
+        "for its brightness and mean colour",
+    )  # fmt: skip
     light.add_argument(
         "--exposure", type=positive, metavar="E",
-        help="linear captured colour that radiance 1 of the environment gives; default: what makes the albedo of the "
-        "brightest tenth 0.8",
+        help="linear captured colour that radiance 1 of the environment gives, without --env that of white in the mean "
+        "light; default: what makes the albedo of the brightest tenth 0.8, without --env 0.5",
     )  # fmt: skip
     parser.add_argument(
         "--up",
@@ -73,6 +79,9 @@ def run(args: argparse.Namespace) -> int:
     check_template(str(args.out), frames or [])
     if frames is None:
         return _import(args)
+    if args.remove_light and args.env is None and len(frames) > 1:
+        remedy = "write that of the first by `drgs convert FIRST.drgs light.exr` and give it with --env light.exr"
+        logger.warning("--remove-light: estimates a light for each frame, so that colours may flicker; %s", remedy)
     for frame in frames:
         paths = {name: path for name in ("surfels", "mesh", "env", "out") if (path := getattr(args, name)) is not None}
         of_frame = {name: frame_path(str(path), frame) for name, path in paths.items()}
@@ -83,8 +92,6 @@ def run(args: argparse.Namespace) -> int:
 def _import(args: argparse.Namespace) -> int:
     check_suffix(args.out, (".drgs",))
     check_writable(args.out, (args.surfels, args.mesh, args.env))
-    if args.remove_light and args.env is None:
-        raise UsageError("--remove-light", "needs the light of the capture", "Give it with --env")
     if args.exposure is not None and not args.remove_light:
         raise UsageError("--exposure", "belongs to --remove-light", "Give both")
 

@@ -21,6 +21,11 @@ PROGRAM_SECONDS, PEOPLE_SECONDS = 0.5, 5.0
 WORK_SECONDS = 20.0
 
 
+def lines_wanted(args: argparse.Namespace) -> bool:
+    """Whether a program reads lines of progress on stdout: it said so by the variable DRGS_PROGRESS."""
+    return os.environ.get("DRGS_PROGRESS") == "1" and not args.quiet and not sys.stdout.isatty()
+
+
 def bar(args: argparse.Namespace, label: str, total: float | None = None, unit: str = "it", **options: Any) -> Any:
     """A tqdm bar: on a terminal, or when ``--progress`` asks for it; never with ``-q``."""
     from tqdm import tqdm
@@ -65,7 +70,7 @@ class FractionBar:
     args : argparse.Namespace
     label : str
     programs : bool
-        While kernels are compiled, lines on stdout for a program that reads them, where that is no terminal.
+        While kernels are compiled, lines on stdout for a program that reads them, see `lines_wanted`.
     every : float
         Seconds between two lines on stderr during the work itself, for people without a terminal; 0: none, only those
         of the time in which kernels are compiled.
@@ -75,7 +80,7 @@ class FractionBar:
         layout = "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
         self._bar = bar(args, label, total=1.0, bar_format=layout)
         self._counted = False
-        self._for_programs = programs and not args.quiet and not sys.stdout.isatty()
+        self._for_programs = programs and lines_wanted(args)
         self._for_people = self._bar.disable and not args.quiet and args.progress is None
         self._every = every
         self._next = 0.0

@@ -28,7 +28,7 @@ from ..formats.axes import UP_AXES
 from .frame_lines import emit
 from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_and_report
-from .progress import WORK_SECONDS, FractionBar
+from .progress import WORK_SECONDS, FractionBar, lines_wanted
 from .sampling import above_zero, int_range
 from .uncalibrated import FIELDS, MASKS_HELP, add_options, capture_settings, said_of_masks, tell_unused
 
@@ -207,7 +207,7 @@ def run(args: argparse.Namespace) -> int:
             emit(f"{text}\n", sys.stderr)
 
     note(f"an earlier run was stopped: going on with {work}, where it is of these photographs and settings")
-    with interruptible() as cancelled, FractionBar(args, "reconstructing") as bar:
+    with interruptible() as cancelled, FractionBar(args, "reconstructing", every=WORK_SECONDS) as bar:
         try:
             asset = reconstruct(capture, settings, _Teller(args, bar), cancelled, work)
         except (Cancelled, KeyboardInterrupt):
@@ -307,7 +307,7 @@ def _find_cameras(args: argparse.Namespace, reading: Reading, masks: str) -> Pat
         made = make_capture(args.capture, folder, settings, _telling(args, bar), cancelled)
     for line in made.lines:
         note(line)
-    if not args.quiet and not sys.stdout.isatty():
+    if lines_wanted(args):
         print(f"DRGS_CAPTURE {folder}", flush=True)  # for programs that read the lines
     return folder
 
@@ -366,10 +366,10 @@ def _remove_if_empty(folder: Path) -> None:
 
 
 class _Lines:
-    """Lines on stdout that programs may read, one in a while; none on a terminal, where they would break the bar."""
+    """Lines on stdout for programs that want them, one in a while."""
 
     def __init__(self, args: argparse.Namespace) -> None:
-        self._wanted, self._next = not args.quiet and not sys.stdout.isatty(), 0.0
+        self._wanted, self._next = lines_wanted(args), 0.0
 
     def __call__(self, phase: str, part: float, surfels: int = 0, psnr: float | None = None) -> None:
         now = time.monotonic()

@@ -33,8 +33,8 @@ SH_LIMIT = 64
 ROUGHNESS, METALLIC = 0.5, 0.0
 #: Noted of a file without materials.
 CAPTURED_ALBEDO = (
-    "albedo is the captured colour, with the light of the capture in it; `drgs import ... --env E.hdr --remove-light` "
-    "estimates it without that light"
+    "albedo is the captured colour, with the light of the capture in it; `drgs import ... --remove-light` estimates "
+    "it without that light, best with --env E.hdr"
 )
 
 

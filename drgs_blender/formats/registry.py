@@ -344,7 +344,7 @@ def document() -> str:
         "three scales become surfels: the shortest axis is dropped and becomes the normal, and the report counts those",
         "that were far from flat. Where a file has no materials, the albedo is the captured colour decoded from sRGB,",
         "the roughness 0.5 and the metallic 0; `drgs import --remove-light` estimates the albedo instead, from the",
-        "light of the capture.",
+        "light of the capture, which it is given or estimates.",
         "",
         "| Format | Usual names | Becomes | Remarks |",
         "|---|---|---|---|",

@@ -185,6 +185,18 @@ def test_surfels_become_an_asset_and_an_object(scene, tmp_path):
     assert (tmp_path / "toy.drgs").read_bytes() == before
 
 
+@pytest.mark.slow
+def test_colour_is_estimated_without_an_environment(scene, tmp_path):
+    """The light that was found is the asset's, and lights the scene; the panel tells what stays open."""
+    splats = few_splats(tmp_path / "toy.ply", 3000)
+    made = {"surfels": str(splats), "up": "y", "use_remove_light": True, "use_environment": True}
+    assert bpy.ops.drgs.import_parts(**made) == {"FINISHED"}
+    asset = part("addon.assets").load(tmp_path / "toy.drgs")
+    assert asset.environment is not None and asset.provenance["materials"].startswith("estimated")
+    assert scene.world is not None and any(n.type == "TEX_ENVIRONMENT" for n in scene.world.node_tree.nodes)
+    assert any("the light is estimated" in m.text for m in part("addon.messages").history)
+
+
 def test_a_mesh_is_not_taken_for_a_damaged_asset(scene, tmp_path):
     (tmp_path / "chair.glb").write_bytes(b"glTF" + bytes(60))
     with pytest.raises(RuntimeError, match=r"chair\.glb: is no \.drgs file but a mesh.*drgs make.*Object > Convert"):

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drgs_blender.build.delight import captured_along, remove_light
-from drgs_blender.build.relit import relit_colours
+from drgs_blender.build.delight import LIMITS, remove_light
+from drgs_blender.build.relit import captured_along, relit_colours
 from drgs_blender.cli.main import main
 from drgs_blender.core.asset import Asset, Environment, Mesh, Surfels
 from drgs_blender.core.asset.container import read_asset
@@ -120,6 +120,61 @@ def test_an_unknown_exposure_changes_the_brightness_alone(capture: tuple[Asset, 
     np.testing.assert_allclose(ratio[1:], np.array([0.25, 0.5])[:2] / [0.5, 0.3], rtol=0.35)
 
 
+@pytest.fixture(scope="module")
+def unlit(capture: tuple[Asset, np.ndarray, np.ndarray]) -> Asset:
+    """The capture without its light, by an estimate of that."""
+    asset = copied(capture[0])
+    asset.environment = None
+    remove_light(asset, None, FEW)
+    return asset
+
+
+def aligned(albedo: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Errors after the one factor that nobody can know."""
+    return np.abs(albedo * (albedo * truth).sum() / (albedo**2).sum() - truth)
+
+
+@pytest.mark.slow
+def test_an_unknown_light_goes_too(capture: tuple[Asset, np.ndarray, np.ndarray], unlit: Asset) -> None:
+    _, truth, read = capture
+    error, before = aligned(unlit.surfels.albedo, truth), aligned(read, truth)
+    assert error.mean() < 0.6 * before.mean()
+    bright = truth[:, 0] > 0.5
+    for paint in (bright, ~bright):  # the shadow of the wall is in neither paint
+        spread, lit = (
+            values[paint].std(axis=0) / values[paint].mean(axis=0) for values in (unlit.surfels.albedo, read)
+        )
+        assert spread.mean() < 0.6 * lit.mean()
+    luminance = unlit.surfels.albedo @ [0.2126, 0.7152, 0.0722]
+    assert np.quantile(luminance, 0.9) == pytest.approx(0.5, abs=0.05)
+    notes = unlit.provenance["report"]["remove_light"]["notes"]
+    assert set(LIMITS) < set(notes) and "an estimated environment" in notes[0]
+
+
+@pytest.mark.slow
+def test_the_estimate_is_brightest_where_the_light_was(unlit: Asset) -> None:
+    assert unlit.environment is not None
+    found = unlit.environment.radiance.sum(axis=2)
+    true = sky().sum(axis=2)
+    patch = true > 5
+    assert found[patch].mean() > 3 * found[~patch].mean()
+    warm = unlit.environment.radiance[patch].mean(axis=0)
+    cold = unlit.environment.radiance[:16][~patch[:16]].mean(axis=0)
+    assert warm[0] / warm[2] > cold[0] / cold[2]
+
+
+@pytest.mark.slow
+def test_the_estimate_gives_the_captured_colours_back(
+    capture: tuple[Asset, np.ndarray, np.ndarray], unlit: Asset
+) -> None:
+    """Its light on its albedo, without an exposure."""
+    assert unlit.environment is not None
+    world = World(unlit.environment.radiance)
+    again = relit_colours(unlit, unlit.surfels, unlit.mesh.vertices, world, FORWARD)
+    seen = capture[2]
+    assert np.median(np.abs(again - seen)) < 0.05 * np.median(seen)
+
+
 def test_captured_colour_is_that_seen_from_the_direction() -> None:
     """Harmonics of 3DGS are evaluated along the ray from the camera: the first band of a splat seen from +Z."""
     sh = np.zeros((1, 4, 3), np.float32)
@@ -137,8 +192,11 @@ def test_what_is_lacking_is_said(capture: tuple[Asset, np.ndarray, np.ndarray]) 
     known = Asset(asset.surfels, asset.mesh, asset.binding, asset.environment, {"materials": "of the surfels"})
     with pytest.raises(UsageError, match="these are of the surfels"):
         remove_light(known)
-    with pytest.raises(UsageError, match="needs an environment"):
-        remove_light(Asset(asset.surfels, asset.mesh, asset.binding))
+    black = copied(asset)
+    black.surfels.sh = np.full_like(asset.surfels.sh, -0.5 / SH_C0)
+    black.environment = None
+    with pytest.raises(UsageError, match=r"0 surfels that are neither black nor clipped.*--env"):
+        remove_light(black)
     with pytest.raises(UsageError, match="needs a mesh"):
         remove_light(Asset(asset.surfels, Mesh.empty()))
 
@@ -154,7 +212,7 @@ def test_the_command_removes_the_light(
     (tmp_path / "m.obj").write_text(obj)
     files = ["import", str(tmp_path / "s.ply"), "--mesh", str(tmp_path / "m.obj"), "--up", "z"]
     out = tmp_path / "a.drgs"
-    assert main([*files, "--out", str(out), "--remove-light"]) == 64
+    assert main([*files, "--out", str(out), "--exposure", "1"]) == 64
     light = ["--env", str(tmp_path / "sky.exr"), "--remove-light", "--exposure", "0.4"]
     assert main([*files, *light, "--out", str(out)]) == 0
     found = read_asset(out)

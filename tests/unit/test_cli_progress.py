@@ -71,6 +71,11 @@ def test_programs_read_it_with_its_fraction(capsys, monkeypatch):
     with FractionBar(options(progress=False), "preparing", programs=True) as bar:
         for phase, part in COUNTED:
             bar(phase, part)
+    assert not capsys.readouterr().out, "nobody asked"
+    monkeypatch.setenv("DRGS_PROGRESS", "1")
+    with FractionBar(options(progress=False), "preparing", programs=True) as bar:
+        for phase, part in COUNTED:
+            bar(phase, part)
     out = capsys.readouterr().out.splitlines()
     assert out[0] == f'DRGS_PROGRESS part=0.250 phase="{PREPARING}, 1 of 4"'
     assert out[-1] == 'DRGS_PROGRESS part=1.000 phase="Ready"'

@@ -69,7 +69,8 @@ def test_a_run_that_is_stopped_early_goes_on(photographs, tmp_path, number, code
     words = command(photographs, tmp_path / "a.drgs", "--iterations", "1000000", "-v")
     said = []
     for _ in range(2):
-        with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        asked = os.environ | {"DRGS_PROGRESS": "1"}
+        with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=asked) as process:
             line = process.stdout.readline()
             process.send_signal(number)
             said.append(process.communicate(timeout=60)[1])

@@ -334,6 +334,7 @@ def test_the_command_writes_an_asset_and_its_preview(tmp_path, capsys, monkeypat
     out = tmp_path / "made" / "balls.drgs"
     options = ["--iterations", "30", "--surfels", "800", "--voxels", "32", "--test-every", "5", "--no-materials"]
     monkeypatch.setattr("drgs_blender.compute.warp.runtime.cuda_devices", list)
+    monkeypatch.setenv("DRGS_PROGRESS", "1")
     code = main(["reconstruct", str(tmp_path), "--out", str(out), *options, "--device", "cuda"])
     said, warned = capsys.readouterr()
     assert "device cuda" in warned and "Learned on the CPU" in warned
