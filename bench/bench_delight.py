@@ -149,7 +149,7 @@ def main() -> None:
         "Albedo: root mean square error after the one factor that fits best, since the brightness of the light is "
         "unknown (in brackets without it: the brightest tenth gets .8, under an estimated light .5). Relit: PSNR of "
         f"the object's picture under {args.under}, after the best factor. Captures are taken for rough (.5) and no "
-        "metal, which the cat, mostly metal, and the robot are not: that bounds the first columns, too. Finding the "
+        "metal. The cat is mostly metal: its relit pictures gain nothing, even where the light is known. Finding the "
         f"light and removing it took {np.median(seconds):.0f} s in the median, on a machine that did other work."
     )
     columns = ["object", "light", *(c for way in sums for c in (f"{way}: albedo", "relit"))]

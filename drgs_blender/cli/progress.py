@@ -17,6 +17,8 @@ from .interrupt import interruptible
 
 #: Between two lines while kernels are compiled: for programs, and for people without a terminal.
 PROGRAM_SECONDS, PEOPLE_SECONDS = 0.5, 5.0
+#: Between two lines of a whole reconstruction, for programs.
+REPORT_SECONDS = 2.0
 #: Between two lines of work that takes minutes, for people without a terminal.
 WORK_SECONDS = 20.0
 
@@ -74,9 +76,19 @@ class FractionBar:
     every : float
         Seconds between two lines on stderr during the work itself, for people without a terminal; 0: none, only those
         of the time in which kernels are compiled.
+    span : tuple of (float, float)
+        The part of the whole work that is this one's, see `Steps`.
     """
 
-    def __init__(self, args: argparse.Namespace, label: str, programs: bool = False, every: float = 0.0) -> None:
+    def __init__(
+        self,
+        args: argparse.Namespace,
+        label: str,
+        programs: bool = False,
+        every: float = 0.0,
+        span: tuple[float, float] = (0.0, 1.0),
+    ) -> None:
+        self._span = span
         layout = "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
         self._bar = bar(args, label, total=1.0, bar_format=layout)
         self._counted = False
@@ -88,6 +100,11 @@ class FractionBar:
     def __enter__(self) -> FractionBar:
         return self
 
+    def since(self, start: float) -> FractionBar:
+        """Itself, with a clock that began at `start`, seconds of ``time.time``."""
+        self._bar.start_t = start
+        return self
+
     def __exit__(self, *_: object) -> None:
         self._bar.close()
         if self._for_programs and self._next:
@@ -95,6 +112,8 @@ class FractionBar:
 
     def __call__(self, phase: str, fraction: float) -> None:
         """Show what is being done and the part of it that is done, in [0, 1]."""
+        if not is_counted(phase):
+            fraction = self.of_all(fraction)
         if is_counted(phase) != self._counted:  # it has a bar of its own
             self._counted = is_counted(phase)
             self._bar.reset()
@@ -108,6 +127,11 @@ class FractionBar:
             self._next = time.monotonic() + self._every
             emit(f"drgs: {_counted(phase, fraction)}\n", sys.stderr)
 
+    def of_all(self, fraction: float) -> float:
+        """The part of the whole work that is done with this part of its own."""
+        first, last = self._span
+        return first + (last - first) * max(0.0, min(1.0, fraction))
+
     def _emit(self, phase: str, fraction: float) -> None:
         """Nothing else is heard for minutes where there is no bar."""
         now = time.monotonic()
@@ -119,6 +143,41 @@ class FractionBar:
         elif self._for_people:
             self._next = now + PEOPLE_SECONDS
             emit(f"drgs: {_counted(phase, fraction)}\n", sys.stderr)
+
+
+class ProgramLines:
+    """Lines on stdout for programs that want them, see `lines_wanted`, one in a while."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self._wanted, self._next = lines_wanted(args), 0.0
+
+    def __call__(self, phase: str, part: float, surfels: int = 0, psnr: float | None = None) -> None:
+        """Say what is being done, the part of it that is done, and how many surfels there are, how good."""
+        now = time.monotonic()
+        if self._wanted and now >= self._next:
+            self._next = now + REPORT_SECONDS
+            known = "" if psnr is None else f"psnr={psnr:.2f} "
+            print(f'DRGS_PROGRESS part={part:.3f} surfels={surfels} {known}phase="{phase}"', flush=True)
+
+
+class Steps:
+    """One bar for work of several steps: each goes on where the one before it ended, with the same clock.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+    label : str
+    """
+
+    def __init__(self, args: argparse.Namespace, label: str) -> None:
+        self._args, self._label = args, label
+        self._done, self._since = 0.0, time.time()
+
+    def step(self, part: float = 1.0) -> FractionBar:
+        """The bar of the next step, which is this part of the whole, or all that is left of it."""
+        span = self._done, min(self._done + part, 1.0)
+        self._done = span[1]
+        return FractionBar(self._args, self._label, every=WORK_SECONDS, span=span).since(self._since)
 
 
 def _counted(phase: str, fraction: float) -> str:

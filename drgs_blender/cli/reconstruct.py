@@ -28,7 +28,7 @@ from ..formats.axes import UP_AXES
 from .frame_lines import emit
 from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_and_report
-from .progress import WORK_SECONDS, FractionBar, lines_wanted
+from .progress import FractionBar, ProgramLines, Steps, lines_wanted
 from .sampling import above_zero, int_range
 from .uncalibrated import FIELDS, MASKS_HELP, add_options, capture_settings, said_of_masks, tell_unused
 
@@ -67,8 +67,8 @@ OPTIONS = {
     **{name: f"capture.{name}" for name in FIELDS},
 }
 
-#: Seconds between two lines of progress on stdout.
-_REPORT_EVERY = 2.0
+#: Parts of the whole bar that finding cameras takes, and each model that looks at the photographs.
+_CAMERAS, _BY_MODEL = 0.3, 0.05
 #: Seconds within which an asset is surely written: a younger half of one may be another process's.
 _WRITTEN_WITHIN = 60.0
 
@@ -188,7 +188,8 @@ def run(args: argparse.Namespace) -> int:
     check_mode(masks)
     if reading.normals != NONE:
         load_model(reading.normals)
-    source = args.capture if calibrated else _find_cameras(args, reading, masks)
+    steps = Steps(args, "reconstructing")
+    source = args.capture if calibrated else _find_cameras(args, steps, reading, masks)
     capture = read_capture(
         source, reading.resolution, reading.test_every, reading.axes, reading.up, turntable=reading.turntable
     )
@@ -196,9 +197,9 @@ def run(args: argparse.Namespace) -> int:
         tell_unused(reading, args.capture, calibrated)
         tell_of_views(capture)
     if calibrated or masks == "none" or _masks_after_cameras(reading, masks):  # else `drgs capture` has made them
-        _mask(args, capture, masks)
+        _mask(args, steps, capture, masks)
     if reading.normals != NONE:
-        _give_normals(args, capture, reading.normals)
+        _give_normals(args, steps, capture, reading.normals)
     logger.info("%d views to learn from, %d left out", len(capture.training), len(capture.testing))
     work = args.out.with_name(f"{args.out.stem}.reconstruct")
 
@@ -207,7 +208,7 @@ def run(args: argparse.Namespace) -> int:
             emit(f"{text}\n", sys.stderr)
 
     note(f"an earlier run was stopped: going on with {work}, where it is of these photographs and settings")
-    with interruptible() as cancelled, FractionBar(args, "reconstructing", every=WORK_SECONDS) as bar:
+    with interruptible() as cancelled, steps.step() as bar:
         try:
             asset = reconstruct(capture, settings, _Teller(args, bar), cancelled, work)
         except (Cancelled, KeyboardInterrupt):
@@ -220,14 +221,15 @@ def run(args: argparse.Namespace) -> int:
     write_and_report(args.out, asset)
     clear(work, args.out)
     report = asset.provenance["report"]
-    steps = ", ".join(f"{phase} {done} of {of}" for phase, (done, of) in report["steps"].items())
-    print(f"  steps: {steps}")
+    taken = ", ".join(f"{phase} {done} of {of}" for phase, (done, of) in report["steps"].items())
+    print(f"  steps: {taken}")
     if "psnr" in report:
         # Not what `drgs evaluate` says, which renders the asset under the light that was found.
         print(f"  colours as photographed, views left out: PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.4f}")
     if "decoupling" in report:
-        shown = report["decoupling"]["psnr"]
-        print(f"  materials in the light that was found, pixels learned from: PSNR {shown:.2f} dB")
+        print(
+            f"  materials in the light that was found, pixels learned from: PSNR {report['decoupling']['psnr']:.2f} dB"
+        )
     shape = asset.mesh.vertices if len(asset.mesh.vertices) else asset.surfels.centre
     size = " x ".join(f"{side:.2g}" for side in shape.max(axis=0) - shape.min(axis=0))
     print(f"  size: {size} m; look: drgs relight {args.out} --orbit 12 --out '{args.out.stem}/####.png'")
@@ -289,7 +291,7 @@ def resolved_settings(config: Path | None, options: dict[str, Any], sets: list[s
     return settings, reading
 
 
-def _find_cameras(args: argparse.Namespace, reading: Reading, masks: str) -> Path:
+def _find_cameras(args: argparse.Namespace, steps: Steps, reading: Reading, masks: str) -> Path:
     """A capture with cameras, made of photographs without, beside the output."""
     from ..capture.pipeline import make_capture
 
@@ -303,7 +305,7 @@ def _find_cameras(args: argparse.Namespace, reading: Reading, masks: str) -> Pat
     note(f"{args.capture} has no cameras: they are found first, in {folder}{chosen}")
     tell_unused(reading, args.capture, calibrated=False)
     settings = capture_settings(reading, "given" if _masks_after_cameras(reading, masks) else masks)
-    with interruptible() as cancelled, FractionBar(args, "capturing", every=WORK_SECONDS) as bar:
+    with interruptible() as cancelled, steps.step(_CAMERAS) as bar:
         made = make_capture(args.capture, folder, settings, _telling(args, bar), cancelled)
     for line in made.lines:
         note(line)
@@ -319,29 +321,29 @@ def _masks_after_cameras(reading: Reading, masks: str) -> bool:
 
 def _telling(args: argparse.Namespace, bar: FractionBar) -> Callable[[str, float], None]:
     """Called as (phase, part done): the bar, and lines on stdout that programs may read."""
-    lines = _Lines(args)
+    lines = ProgramLines(args)
 
     def tell(phase: str, part: float) -> None:
         bar(phase, part)
-        lines(phase, part)
+        lines(phase, bar.of_all(part))
 
     return tell
 
 
-def _mask(args: argparse.Namespace, capture: Capture, masks: str) -> None:
+def _mask(args: argparse.Namespace, steps: Steps, capture: Capture, masks: str) -> None:
     """Make masks of a capture that has none, or leave them out, as `capture.masks` says."""
     from ..capture.masks.of_capture import mask_capture
 
-    with interruptible() as cancelled, FractionBar(args, "finding the object", every=WORK_SECONDS) as bar:
+    with interruptible() as cancelled, steps.step(_BY_MODEL) as bar:
         sheet = args.out.with_name(f"{args.out.stem}.masks.png")
         mask_capture(capture, masks, sheet, _telling(args, bar), cancelled)
 
 
-def _give_normals(args: argparse.Namespace, capture: Capture, model: str) -> None:
+def _give_normals(args: argparse.Namespace, steps: Steps, capture: Capture, model: str) -> None:
     """Ask a model for the normals of the photographs."""
     from ..capture.normal_model import give_normals
 
-    with interruptible() as cancelled, FractionBar(args, "normals", every=WORK_SECONDS) as bar:
+    with interruptible() as cancelled, steps.step(_BY_MODEL) as bar:
         give_normals(capture, model, _telling(args, bar), cancelled)
 
 
@@ -365,25 +367,11 @@ def _remove_if_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-class _Lines:
-    """Lines on stdout for programs that want them, one in a while."""
-
-    def __init__(self, args: argparse.Namespace) -> None:
-        self._wanted, self._next = lines_wanted(args), 0.0
-
-    def __call__(self, phase: str, part: float, surfels: int = 0, psnr: float | None = None) -> None:
-        now = time.monotonic()
-        if self._wanted and now >= self._next:
-            self._next = now + _REPORT_EVERY
-            known = "" if psnr is None else f"psnr={psnr:.2f} "
-            print(f'DRGS_PROGRESS part={part:.3f} surfels={surfels} {known}phase="{phase}"', flush=True)
-
-
 class _Teller:
     """Shows progress: a bar, lines on stdout that programs may read, the preview."""
 
     def __init__(self, args: argparse.Namespace, bar: FractionBar) -> None:
-        self._bar, self._lines = bar, _Lines(args)
+        self._bar, self._lines = bar, ProgramLines(args)
         self._preview = args.out.with_name(f"{args.out.stem}.preview.png")
 
     def __call__(self, progress: Progress) -> None:
@@ -391,7 +379,7 @@ class _Teller:
         surfels = f", {progress.surfels} surfels" if progress.surfels else ""
         about = "" if is_preparing(progress.phase) else f"{surfels}{f', {progress.psnr:.1f} dB' if known else ''}"
         self._bar(f"{progress.phase}{about}", progress.part)
-        self._lines(progress.phase, progress.part, progress.surfels, progress.psnr)
+        self._lines(progress.phase, self._bar.of_all(progress.part), progress.surfels, progress.psnr)
         if progress.picture is not None:
             from ..formats.images import write_png
 

@@ -16,7 +16,7 @@ import pytest
 from drgs_blender.cli import picture as pictures
 from drgs_blender.cli import progress
 from drgs_blender.cli.frame_lines import FrameLines
-from drgs_blender.cli.progress import FractionBar
+from drgs_blender.cli.progress import FractionBar, Steps
 from drgs_blender.core.errors import Cancelled, EngineError
 from drgs_blender.core.phases import PREPARING, is_counted, is_preparing
 from drgs_blender.ipc.protocol import Passes
@@ -149,3 +149,16 @@ def test_ctrl_c_ends_the_wait_for_kernels(monkeypatch):
     with pytest.raises(Cancelled):
         progress.prepare_engine(options(), "simulate")
     assert time.monotonic() - start < 10
+
+
+def test_steps_are_one_bar(capsys, monkeypatch):
+    """Where a step ends the next one begins; compiling kernels counts by itself."""
+    monkeypatch.setattr(progress, "WORK_SECONDS", 1e-9)
+    steps = Steps(options(), "reconstructing")
+    for part, phases in ((0.25, ("matching", "registering")), (1.0, ("surfels", "mesh"))):
+        with steps.step(part) as bar:
+            for phase, done in zip(phases, (0.2, 1.0)):
+                bar(phase, done)
+            assert bar.of_all(1.0) == (0.25 if part < 1 else 1.0)
+    said = [line.split(", ")[1] for line in capsys.readouterr().err.splitlines()]
+    assert said == ["5% of all", "25% of all", "40% of all", "100% of all"]
