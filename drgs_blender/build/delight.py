@@ -133,10 +133,10 @@ def _exposure(seen: Array, diffuse: Array, glossy: Array, known: Array, brightes
 
 
 def _of_mesh(asset: Asset) -> Array:
-    """The mesh's albedo at the surfels."""
+    """The mesh's albedo at the surfels; those beside their faces take no more than what is there."""
     assert asset.binding is not None
     corners = asset.mesh.albedo[asset.mesh.faces[asset.binding.face]]
-    return np.einsum("nk,nkc->nc", asset.binding.barycentric, corners)
+    return np.einsum("nk,nkc->nc", asset.binding.barycentric, corners).clip(0.0, 1.0)
 
 
 def _part(progress: Progress | None, done: int, parts: int) -> Progress | None:

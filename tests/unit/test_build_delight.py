@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +119,22 @@ def test_an_unknown_exposure_changes_the_brightness_alone(capture: tuple[Asset, 
     ratio = np.median(asset.surfels.albedo[~bright], axis=0) / np.median(asset.surfels.albedo[bright], axis=0)
     # What is clipped at white is not counted: blue of the dark paint against that of the bright one.
     np.testing.assert_allclose(ratio[1:], np.array([0.25, 0.5])[:2] / [0.5, 0.3], rtol=0.35)
+
+
+def test_dark_surfels_beside_their_faces_get_an_albedo_that_is_one(
+    capture: tuple[Asset, np.ndarray, np.ndarray],
+) -> None:
+    """Captures have surfels over the edges of their mesh; those that are dark take its albedo, continued there."""
+    asset = copied(capture[0])
+    assert asset.binding is not None and asset.surfels.sh is not None
+    n = len(asset.surfels)
+    asset.binding = replace(asset.binding, barycentric=np.tile(np.float32([3.0, -1.0, -1.0]), (n, 1)))
+    sun = np.zeros((32, 64, 3), np.float32)
+    sun[8:10, 31:33] = 500.0  # behind the wall, whose shadow ends on the floor
+    asset.environment = Environment(sun)
+    remove_light(asset, 0.4, FEW)
+    assert 0 < asset.provenance["report"]["remove_light"]["too_dark"] < n
+    assert asset.surfels.albedo.min() >= 0 and asset.surfels.albedo.max() <= 1
 
 
 @pytest.fixture(scope="module")
