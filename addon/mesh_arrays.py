@@ -93,6 +93,8 @@ def write_source_vertices(mesh: bpy.types.Mesh, rest: Mesh, rows: Array | None =
         return
     rows = np.arange(len(mesh.vertices), dtype=np.int32) if rows is None else rows
     attribute = mesh.attributes.new(SOURCE_VERTEX, "FLOAT2", "POINT")
+    if not mesh.uv_layers and hasattr(mesh.uv_layers, "active_render"):
+        mesh.uv_layers.active_render = None  # Blender 5.2 takes the first FLOAT2 for the UV map that renders
     attribute.data.foreach_set("vector", np.column_stack((rows, _checksum(rows, rest))).astype(np.float32).ravel())
 
 

@@ -22,6 +22,8 @@ from . import selection
 from .engine_command import CommandOperator
 
 _NUMBER = "####"
+#: Attributes of meshes themselves, whose names Blender 5.2 gives away, too; others begin with a dot.
+_BUILT_IN = {"position", "material_index", "sharp_face", "sharp_edge"}
 
 
 class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operator):
@@ -209,7 +211,8 @@ def show_image(path: Path, sequence: bool) -> None:
 def check_name(name: str, objects: list[bpy.types.Object]) -> None:
     """UsageError where the colours of vertices cannot be called `name`, or where something else would be lost."""
     trial = bpy.data.meshes.new("trial")
-    usable = name not in ("", *mesh_arrays.ATTRIBUTES) and trial.attributes.new(name, "FLOAT_COLOR", "POINT")
+    usable = name not in ("", *mesh_arrays.ATTRIBUTES, *_BUILT_IN) and not name.startswith(".")
+    usable = usable and trial.attributes.new(name, "FLOAT_COLOR", "POINT") is not None
     bpy.data.meshes.remove(trial)
     if not usable:
         raise UsageError("Name", f'"{name}" is none for baked light', "Choose another")

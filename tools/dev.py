@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import functools
 import json
 import os
 import re
@@ -36,8 +37,10 @@ ROOT = Path(__file__).resolve().parent.parent
 TORCH = "torch==2.13.0"
 BLENDER = "5.0.1"
 BLENDER_FLOOR = "4.2.23"
-#: The LTS between them, tested when asked for.
-BLENDER_LTS = "4.5.15"
+#: Other versions by their series, which is the name of their suite.
+BLENDER_OTHERS = {"4.5": "4.5.15", "5.2": "5.2.3", "5.3": "5.3.0"}
+#: The newest with long-term support: `make check` runs a part of its suite, that of the others when asked for.
+NEWEST_LTS = "5.2"
 #: Seconds that Blender may take to say what its operators and properties are.
 REFERENCE_SECONDS = 300
 #: Programs of npm that read our files in the tests and write others for us.
@@ -60,21 +63,28 @@ APT_PACKAGES = {
 }
 #: The groups of dependencies in pyproject.toml that the site takes, and that tests of `drgs capture` do.
 DOCS, CAPTURE = "docs", "capture"
-#: The suite of the oldest Blender, which `make check` runs, and that of the LTS, which runs when asked for.
-FLOOR, LTS = "floor", "lts"
+#: The suite of the oldest Blender.
+FLOOR = "floor"
 SUITES = {
     suites.LINT: suites.Suite("lint", ()),
     "engine": suites.Suite("engine", ("tests/unit", "tests/engine"), spread=True),
     "farm": suites.Suite("farm", ("tests/farm",)),
     "blender": suites.Suite(f"Blender {BLENDER}", ("tests/blender",)),
     FLOOR: suites.Suite(f"Blender {BLENDER_FLOOR}", ("tests/blender",), leaves="judged or (slow and not blender_api)"),
-    LTS: suites.Suite(f"Blender {BLENDER_LTS}", ("tests/blender",)),
+    **{
+        series: suites.Suite(
+            f"Blender {version}",
+            ("tests/blender",),
+            leaves="judged or slow or programs or not blender_api" if series == NEWEST_LTS else "",
+        )
+        for series, version in BLENDER_OTHERS.items()
+    },
     suites.WINDOW: suites.Suite("a window", ("tests/ui",), times=suites.WINDOW_TIMES),
 }
 #: What `make test` and `make check` run, in this order: the longest first, and last the one that spreads over
 #: processes, which takes what the others leave.
 FAST = (suites.LINT, "blender", "farm", "engine")
-ALL = (suites.LINT, "blender", FLOOR, "farm", "engine")
+ALL = (suites.LINT, "blender", FLOOR, NEWEST_LTS, "farm", "engine")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -111,6 +121,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         nargs="?",
         const=BLENDER,
         metavar="VERSION",
+        type=blender_version,
         help=f"only Blender's environment, of this version, e.g. {BLENDER_FLOOR}; default {BLENDER}",
     )
     command("system", run_system, "print the system packages that Blender needs and that are missing (Linux)")
@@ -146,6 +157,13 @@ def blender_folder(version: str) -> Path:
     return ROOT / (".venv-blender" if version == BLENDER else f".venv-blender-{series}")
 
 
+def blender_version(text: str) -> str:
+    """The whole version of a Blender, as the package index names it; that of a series that has a suite."""
+    if not re.fullmatch(r"\d+\.\d+\.\d+", version := BLENDER_OTHERS.get(text, text)):
+        raise argparse.ArgumentTypeError(f"{text} is no whole version, such as {BLENDER}")
+    return version
+
+
 def python_of(folder: Path) -> Path:
     """The interpreter of an environment."""
     return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
@@ -171,7 +189,7 @@ def about_engine() -> tuple[Path, dict[str, object], list[list[str]]]:
 
 def ensure_blender(version: str = BLENDER) -> Path:
     """Make the environment with Blender `version` as a module when needed and return its interpreter."""
-    return ensure(*about_blender(version), "import bpy", python311())
+    return ensure(*about_blender(version), "import bpy", python_for(version))
 
 
 def about_blender(version: str) -> tuple[Path, dict[str, object], list[list[str]]]:
@@ -205,7 +223,9 @@ def ensure(
         if python is None or python.resolve() == Path(sys.executable).resolve():
             venv.create(folder, with_pip=True)
         else:
-            subprocess.run([python, "-m", "venv", folder], check=True)
+            command = [str(python), "-m", "venv", str(folder)]
+            if subprocess.run(command).returncode:
+                raise Failure(f"{' '.join(command)} failed; its message is above")
     for step in steps:
         command = [str(interpreter), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *step]
         if subprocess.run(command, cwd=ROOT).returncode:
@@ -266,18 +286,44 @@ def fetch(folder: Path, stamp: str, packages: Sequence[str], command: list[str],
     path.write_text(text, encoding="utf-8")
 
 
-def python311() -> Path:
-    """A Python 3.11, the only version for which Blender 4.2 to 5.0 exist as a module."""
-    if sys.version_info[:2] == (3, 11):
+def python_for(version: str) -> Path:
+    """The Python for which Blender `version` exists as a module.
+
+    Raises
+    ------
+    Failure
+        There is none here.
+    """
+    minor = python_minor(version)
+    if (found := find_python(minor)) is None:
+        raise Failure(
+            f"Blender {version} as a module needs Python 3.{minor}, which was not found. Install it, so that "
+            f"{'py -' if os.name == 'nt' else 'python'}3.{minor} starts it, and run this script again"
+        )
+    return found
+
+
+def python_minor(version: str) -> int:
+    """11 for Blender 4.2 to 5.0, 13 for later ones: the minor version of their Python."""
+    major, minor = map(int, version.split(".")[:2])
+    return 11 if (major, minor) <= (5, 0) else 13
+
+
+def find_python(minor: int) -> Path | None:
+    """A Python 3.`minor`: this one, one on the PATH or where package managers put it."""
+    if sys.version_info[:2] == (3, minor):
         return Path(sys.executable)
-    candidates = [["py", "-3.11"]] if os.name == "nt" else [["python3.11"], ["/opt/homebrew/bin/python3.11"]]
+    name = f"python3.{minor}"
+    candidates = [["py", f"-3.{minor}"]] if os.name == "nt" else [[name], [f"/opt/homebrew/bin/{name}"]]
+    pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv")  # on the PATH are those alone that it was told
+    candidates += [[str(path)] for path in sorted(pyenv.glob(f"versions/3.{minor}.*/bin/{name}"))]
     for candidate in candidates:
         if shutil.which(candidate[0]):
             ask = [*candidate, "-c", "import sys; print(sys.executable)"]
             found = subprocess.run(ask, capture_output=True, text=True)
             if found.returncode == 0:
                 return Path(found.stdout.strip())
-    raise Failure("Blender as a module needs Python 3.11, which was not found. Install it and run this script again")
+    return None
 
 
 def import_trouble(folder: Path, message: str) -> str:
@@ -359,7 +405,10 @@ def run_suites(args: argparse.Namespace, part: str, names: list[str]) -> int:
         names += [suites.WINDOW] * any(file.startswith("tests/ui") for file in files)
     elif part != "fast" and not named:
         names += own_window()
-    plan = suites.Plan(part, named or names, [FLOOR, LTS, suites.WINDOW], bool(named), files, options)
+    if not named and NEWEST_LTS in names and find_python(minor := python_minor(NEWEST_LTS)) is None:
+        print(f"== {SUITES[NEWEST_LTS].title}: skipped, there is no Python 3.{minor}", flush=True)
+        names.remove(NEWEST_LTS)
+    plan = suites.Plan(part, named or names, [FLOOR, *BLENDER_OTHERS, suites.WINDOW], bool(named), files, options)
     engine = ensure_engine()  # every suite starts engines
     if {"engine", "farm"} & set(plan.suites):
         ensure_blender()  # they run `drgs render` through it
@@ -369,8 +418,9 @@ def run_suites(args: argparse.Namespace, part: str, names: list[str]) -> int:
     pythons = {name: ensure_engine for name in SUITES} | {
         "blender": ensure_blender,
         FLOOR: lambda: ensure_blender(BLENDER_FLOOR),
-        LTS: lambda: ensure_blender(BLENDER_LTS),
     }
+    for series, version in BLENDER_OTHERS.items():
+        pythons[series] = functools.partial(ensure_blender, version)
     return suites.run(plan, SUITES, pythons, ROOT, os.environ | {"DRGS_ENGINE": str(engine)})
 
 

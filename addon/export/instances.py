@@ -11,13 +11,16 @@ import numpy as np
 
 from ...drgs_blender.core.errors import Cancelled, first_of
 from ...drgs_blender.core.frame import Visibility
-from .. import assets
+from .. import assets, splat_attributes
 
 T = TypeVar("T")
 Warn = Callable[[str], None]
 
 #: What has a surface that a picture without it would lack, by the type of the object.
 UNRENDERED = {"CURVES": "hair", "POINTCLOUD": "point cloud", "VOLUME": "volume"}
+_SPLATS = "splat"
+#: What to do about a kind of them.
+_REMEDIES = {_SPLATS: "; Object > Convert > DR-GS makes objects of them that are"}
 
 
 #: Identifies an instance, at any time: its object, what makes it, its number there.
@@ -113,8 +116,10 @@ class Unrendered:
         self._names: dict[str, set[str]] = {}
 
     def add(self, obj: bpy.types.Object) -> None:
-        """Remember an object of a type in `UNRENDERED`, or the hair on another."""
+        """Remember an object of a type in `UNRENDERED`, splats as points or as vertices, or the hair on another."""
         kind = None if assets.shows_anchor(obj) else UNRENDERED.get(obj.type)
+        if obj.type == "POINTCLOUD" or (obj.type == "MESH" and not obj.data.polygons):
+            kind = _SPLATS if splat_attributes.is_splats(obj.data) else kind
         if kind is not None:
             self._names.setdefault(kind, set()).add(obj.name)
         elif any(p.settings.type == "HAIR" and p.settings.render_type == "PATH" for p in obj.particle_systems):
@@ -124,4 +129,6 @@ class Unrendered:
         """One warning per kind."""
         for kind, found in self._names.items():
             objects = "object is" if len(found) == 1 else "objects are"
-            warn(f"{len(found)} {kind} {objects} not rendered by DR-GS: {first_of(sorted(found))}")
+            warn(
+                f"{len(found)} {kind} {objects} not rendered by DR-GS: {first_of(sorted(found))}{_REMEDIES.get(kind, '')}"
+            )

@@ -22,6 +22,8 @@ _TILED, _DEEP, _PARTS = 0x200, 0x800, 0x1000
 _JPEG_MARKER, _JPEG_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]"), 0xD9
 #: Numbers before the size of a chunk: of scan lines their first, of a tile its place and level.
 _PLACES = {b"scanlineimage": 1, b"tiledimage": 4}
+#: Scan lines of a chunk by the number of the compression, from none to HTJ2K.
+_LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256, 256, 32)
 #: Bytes of an EXR's names at most, with their zeros; bytes that are searched at once, at first and at most.
 _NAMES, _FIRST_BLOCK, _LARGEST_BLOCK = 512, 1 << 12, 1 << 20
 
@@ -88,7 +90,8 @@ def _is_whole_exr(file: _Reader) -> bool:
     (flags,) = file.numbers("<I", 4)
     if flags & _DEEP:
         return True
-    parts, position = [], 8
+    parts: list[dict[bytes, bytes]] = []
+    position = 8
     while True:
         header, position = _header(file, position)
         if header or not flags & _PARTS:
@@ -103,6 +106,8 @@ def _is_whole_exr(file: _Reader) -> bool:
         first = position + 8 * count if b"chunkCount" in header else file.size
         while position < first:
             (offset,) = file.numbers("<Q", position)
+            if offset == 0 and not flags & (_PARTS | _TILED):
+                return _has_all_lines(file, header, position)
             (size,) = file.numbers("<I", offset + front)
             if offset == 0 or offset + front + 4 + size > file.size:
                 return False
@@ -110,6 +115,20 @@ def _is_whole_exr(file: _Reader) -> bool:
             if b"chunkCount" not in header:
                 first = min(first, offset)
     return True
+
+
+def _has_all_lines(file: _Reader, header: dict[bytes, bytes], position: int) -> bool:
+    """Whether all chunks of scan lines follow the table at `position`, which is empty; readers make up for that.
+
+    Blender 5.2 leaves it so where it packs an image; in a file it is what is written last.
+    """
+    _, top, _, bottom = struct.unpack("<4i", header[b"dataWindow"])
+    count = -(-(bottom - top + 1) // _LINES[header[b"compression"][0]])
+    position += 8 * count
+    for _ in range(count):
+        (size,) = file.numbers("<I", position + 4)
+        position += 8 + size
+    return position <= file.size
 
 
 def _header(file: _Reader, position: int) -> tuple[dict[bytes, bytes], int]:

@@ -116,7 +116,8 @@ def test_nothing_is_baked_over_a_material_or_of_what_is_not_rendered(lit):
     for name in ("", "albedo"):
         with pytest.raises(RuntimeError, match="Choose another"):
             bpy.ops.drgs.bake_light(name=name)
-    for name in ("position", "sharp_face", "n" * 68):  # Blender's own, and what it has no room for
+    too_long = ("n" * 68,) if bpy.app.version < (5, 2) else ()  # for Blender's attributes
+    for name in ("position", "sharp_face", ".hidden", *too_long):
         with pytest.raises(RuntimeError, match=f'"{name}" is none for baked light'):
             bpy.ops.drgs.bake_light(name=name)
     with_uvs(lit)

@@ -10,7 +10,7 @@ import pytest
 from scenes import mesh_object, part, read_exr, sphere
 from test_baked_world import folder, jobs  # noqa: F401 - fixtures
 
-pytestmark = pytest.mark.blender_api
+pytestmark = [pytest.mark.blender_api, pytest.mark.programs]
 SQUARE = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
 
 

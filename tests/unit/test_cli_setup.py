@@ -124,6 +124,7 @@ def plans(dev, monkeypatch):
     monkeypatch.setattr(dev, "no_window", lambda: "there is none")
     monkeypatch.setattr(dev, "ensure_engine", lambda: Path("python"))
     monkeypatch.setattr(dev, "ensure_blender", lambda version="": Path("python"))
+    monkeypatch.setattr(dev, "find_python", lambda minor: Path("python"))
     monkeypatch.setattr(dev, "ensure_node", lambda: None)
     monkeypatch.setattr(dev, "ensure_capture", lambda engine: None)
     monkeypatch.setattr(dev.suites, "run", lambda plan, *_: made.append(plan) or 0)
@@ -153,18 +154,60 @@ def test_every_folder_of_tests_is_run(dev, plans, tmp_path):
 
 
 def test_what_test_leaves_is_all_that_the_rest_of_check_runs(dev, plans, tmp_path):
-    """Nothing twice, nothing never: the parts of each suite, and Blender's floor as a whole."""
+    """Nothing twice, nothing never: the parts of each suite, and those of other Blenders as a whole."""
     fast, rest, whole = (commands(dev, plans(*words), tmp_path) for words in (["test"], ["check", "--rest"], ["check"]))
     assert fast.keys() | rest.keys() == whole.keys() and fast.keys() & rest.keys() == fast.keys() - {"lint"}
     for title in fast.keys() - {"lint"}:
         assert "--part=fast" in fast[title] and "--part=slow" in rest[title]
-    assert {title for title in rest if "--part=all" in rest[title]} == {f"Blender {dev.BLENDER_FLOOR}"} | {
-        f"Blender {dev.BLENDER_FLOOR}, alone"
-    } & set(rest)
+    others = {dev.SUITES[name].title for name in (dev.FLOOR, dev.NEWEST_LTS)}
+    assert {title.removesuffix(", alone") for title in rest if "--part=all" in rest[title]} == others
     assert all("--part=all" in command for title, command in whole.items() if title != "lint")
     for title in ("engine", "farm", f"Blender {dev.BLENDER}"):
         assert "--lane=shared" in whole[title]
     assert "--lane=alone" in whole["engine, alone"]
+
+
+def test_check_leaves_out_a_blender_whose_python_is_missing(dev, plans, monkeypatch, capsys):
+    assert dev.NEWEST_LTS in plans("check").suites
+    monkeypatch.setattr(dev, "find_python", lambda minor: None)
+    assert dev.NEWEST_LTS not in plans("check", "--rest").suites
+    said = capsys.readouterr().out
+    assert f"{dev.SUITES[dev.NEWEST_LTS].title}: skipped" in said and "no Python 3.13" in said
+
+
+def test_a_python_that_is_missing_is_named_when_its_blender_is_asked_for(dev, monkeypatch, capsys):
+    monkeypatch.setattr(dev, "find_python", lambda minor: None)
+    monkeypatch.setattr(dev, "ensure_engine", lambda: Path("python"))
+    for words in (["check", dev.NEWEST_LTS], ["env", "--blender", dev.NEWEST_LTS]):
+        assert dev.main(words) == 1
+        assert "needs Python 3.13" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("version", "minor"), [("4.2.23", 11), ("5.0.1", 11), ("5.1.0", 13), ("5.3.0", 13)])
+def test_each_blender_has_the_environment_and_the_python_of_its_series(dev, version, minor, monkeypatch, capsys):
+    monkeypatch.setattr(dev, "find_python", lambda minor: Path(f"python3.{minor}"))
+    assert dev.python_for(version) == Path(f"python3.{minor}")
+    series = version.rpartition(".")[0]
+    folder = ".venv-blender" if version == dev.BLENDER else f".venv-blender-{series}"
+    assert dev.blender_folder(version).name == folder
+    if series in dev.BLENDER_OTHERS:
+        assert dev.blender_version(series).startswith(f"{series}.")
+    with pytest.raises(SystemExit):
+        dev.parse(["env", "--blender", f"{version}.1"])
+    assert "no whole version" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.name == "nt", reason="uses a shell script as an interpreter")
+def test_a_python_is_found_where_pyenv_keeps_it(dev, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYENV_ROOT", str(tmp_path))
+    monkeypatch.setenv("PATH", "")
+    assert dev.find_python(99) is None
+    for name, code in (("3.99.0", 1), ("3.99.1", 0)):
+        python = tmp_path / "versions" / name / "bin" / "python3.99"
+        python.parent.mkdir(parents=True)
+        python.write_text(f"#!/bin/sh\necho {python}\nexit {code}\n")
+        python.chmod(0o755)
+    assert dev.find_python(99) == python
 
 
 def test_words_choose_suites_files_and_tests(dev, plans, tmp_path):
