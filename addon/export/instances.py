@@ -129,6 +129,5 @@ class Unrendered:
         """One warning per kind."""
         for kind, found in self._names.items():
             objects = "object is" if len(found) == 1 else "objects are"
-            warn(
-                f"{len(found)} {kind} {objects} not rendered by DR-GS: {first_of(sorted(found))}{_REMEDIES.get(kind, '')}"
-            )
+            names = first_of(sorted(found))
+            warn(f"{len(found)} {kind} {objects} not rendered by DR-GS: {names}{_REMEDIES.get(kind, '')}")
