@@ -112,7 +112,8 @@ def properties(rna: Any) -> list[Any]:
 
     Hidden ones without a description are between Blender's file browser and an operator.
     """
-    added = [p for p in rna.properties if p.is_runtime or p.identifier not in OWN]
+    is_group = rna.base is not None and rna.base.identifier == "PropertyGroup"  # Blender 5.3 adds a name to each
+    added = [p for p in rna.properties if p.identifier not in OWN or (p.is_runtime and not is_group)]
     return [p for p in added if p.description.strip() or not p.is_hidden]
 
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
-from mathutils import Matrix
+from mathutils import Matrix, Quaternion
 from scenes import part, read_exr, write_exr
 
 pytestmark = [pytest.mark.blender_api, pytest.mark.programs]
@@ -22,14 +22,25 @@ def imported(operator, path: Path) -> list:
 
 
 def world_points(objects) -> np.ndarray:
-    points = [np.array(o.matrix_world @ v.co) for o in objects if o.type == "MESH" for v in o.data.vertices]
+    """Of meshes, and of the point clouds that Blender makes of splats from 5.3 on."""
+    points = []
+    for obj in objects:
+        if obj.type in ("MESH", "POINTCLOUD"):
+            positions = obj.data.attributes["position"].data
+            points += [np.array(obj.matrix_world @ element.vector) for element in positions]
     return np.array(points)
 
 
-def attribute(obj, name: str) -> np.ndarray:
-    values = np.empty(len(obj.data.vertices), np.float32)
-    obj.data.attributes[name].data.foreach_get("value", values)
-    return values
+def column(obj, name: str) -> np.ndarray:
+    """One of splats, by its name in a PLY."""
+    return part("addon.splat_attributes").read_splats(obj.data)[name]
+
+
+def covariances(columns: dict[str, np.ndarray]) -> np.ndarray:
+    """(n, 3, 3) of splats as a PLY describes them."""
+    turns = np.array([Quaternion(q).to_matrix() for q in zip(*(columns[f"rot_{i}"].tolist() for i in range(4)))])
+    axes = turns * np.exp(np.stack([columns[f"scale_{i}"] for i in range(3)], axis=1))[:, None]
+    return axes @ axes.transpose(0, 2, 1)
 
 
 def centres(path: Path) -> np.ndarray:
@@ -50,7 +61,7 @@ def test_splats_stand_in_the_file_as_in_the_scene(ball, ball_file, scene, tmp_pa
     matrix = np.array(ball.matrix_world)
     wanted = 10 * (centres(ball_file) @ matrix[:3, :3].T + matrix[:3, 3])
     np.testing.assert_allclose(world_points([cloud]), wanted, atol=1e-4)
-    red = 0.5 + 0.28209479 * attribute(cloud, "f_dc_0")
+    red = 0.5 + 0.28209479 * column(cloud, "f_dc_0")
     np.testing.assert_allclose(red, 1.055 * 0.9 ** (1 / 2.4) - 0.055, atol=2e-3)
     assert set(temporary.glob("drgs-export-*")) <= before
 
@@ -82,7 +93,17 @@ def test_splats_in_gltf_are_coloured_points_to_who_knows_no_splats(ball, ball_fi
     np.testing.assert_allclose(world_points(found), wanted.centre + np.float32((1, -2, 3)), atol=1e-5)
     if bpy.app.version < (5, 0):
         return  # the importer of 4.2 leaves out the colours of vertices without faces
-    (points,) = [o.data for o in found if o.type == "MESH"]
+    (obj,) = [o for o in found if o.type in ("MESH", "POINTCLOUD")]
+    if obj.type == "POINTCLOUD":  # from 5.3 on they are Blender's own splats
+        ply = tmp_path / "ball.ply"
+        assert bpy.ops.drgs.export(filepath=str(ply), format="3DGS PLY", colour="albedo") == {"FINISHED"}
+        attributes = part("addon.splat_attributes")
+        shown, written = attributes.read_splats(obj.data), attributes.read_ply(ply)
+        np.testing.assert_allclose(covariances(shown), covariances(written), atol=1e-6)
+        for name in ("f_dc_0", "f_dc_1", "f_dc_2", "opacity"):
+            np.testing.assert_allclose(shown[name], written[name], atol=1e-3)
+        return
+    points = obj.data
     colour = points.color_attributes["Color"]  # from 5.2 on the importer keeps what is of splats, too
     values = np.empty(4 * len(points.vertices), np.float32)
     colour.data.foreach_get("color", values)
@@ -135,7 +156,7 @@ def test_the_light_of_the_scene_is_in_the_colours(ball, scene, tmp_path):
     out = tmp_path / "lit.ply"
     assert bpy.ops.drgs.export(filepath=str(out), format="3DGS PLY", colour="relit", samples=32) == {"FINISHED"}
     (cloud,) = imported(bpy.ops.wm.ply_import, out)
-    green = 0.5 + 0.28209479 * attribute(cloud, "f_dc_1")
+    green = 0.5 + 0.28209479 * column(cloud, "f_dc_1")
     height = world_points([cloud])[:, 2]
     assert green[height > 0.5].min() > 0.3 and np.abs(green[height < -0.3]).max() < 0.01
 

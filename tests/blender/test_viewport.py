@@ -192,7 +192,9 @@ def test_a_new_colour_reads_no_geometry(crowd, monkeypatch):
     move(crowd)
     bpy.context.view_layer.update()
     mesh = exported().frame.meshes[0]
-    assert reads == []
+    # From 5.3 on Blender says that the geometry of an object with the material changed, too
+    assert set(reads) <= ({"Plane"} if bpy.app.version >= (5, 3) else set())
+    reads.clear()
     bend(crowd)
     bpy.context.view_layer.update()
     exported()
