@@ -86,8 +86,12 @@ def straight(image: bpy.types.Image) -> Image | None:
     if pixels is None:
         return None
     alpha = pixels[..., 3:]
-    if image.is_float and _has_alpha(image):
+    taken = _is_taken(image)
+    if image.is_float and _has_alpha(image) and not (taken and image.alpha_mode == "STRAIGHT"):
         np.divide(pixels[..., :3], alpha, out=pixels[..., :3], where=alpha > 0)
+    elif taken and image.alpha_mode == "PREMUL" and pixels.shape[2] == 4 and _has_alpha(image):
+        for part in _strips(pixels):
+            part[..., :3] = np.minimum(part[..., :3].astype(np.uint32) * 255 // np.maximum(part[..., 3:], 1), 255)
     return _picture(image, pixels)
 
 
@@ -95,16 +99,25 @@ def associated(image: bpy.types.Image) -> Image | None:
     pixels = _rgba(image)
     if pixels is None:
         return None
-    if pixels.shape[2] == 4 and _has_alpha(image) and (not image.is_float or _is_encoded(image)):
+    taken = _is_taken(image)
+    multiply = image.alpha_mode == "STRAIGHT" if taken else not image.is_float or _is_encoded(image)
+    if pixels.shape[2] == 4 and _has_alpha(image) and multiply:
         for part in _strips(pixels):
             colours, alpha = part[..., :3], part[..., 3:]
             # Of the encoded values, and bytes rounded down, as Cycles does.
-            if image.is_float:
+            if image.is_float and taken:
+                colours *= alpha
+            elif image.is_float:
                 straight = np.divide(colours, alpha, out=np.zeros_like(colours), where=alpha > 0)
                 colours[:] = srgb_to_linear(linear_to_srgb(straight) * alpha)
             elif (alpha != 255).any():
                 colours[:] = colours.astype(np.uint16) * alpha // 255
     return _picture(image, pixels)
+
+
+def _is_taken(image: bpy.types.Image) -> bool:
+    """Whether Cycles takes the pixels from Blender and believes the alpha mode, as it does from 5.2 on."""
+    return bpy.app.version >= (5, 2) and (image.source == "GENERATED" or len(image.packed_files) > 0)
 
 
 def _is_encoded(image: bpy.types.Image) -> bool:
