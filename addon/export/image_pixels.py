@@ -73,6 +73,8 @@ def linear(image: bpy.types.Image) -> Array | None:
     pixels = _read(image)
     if pixels is None:
         return None
+    if pixels.shape[2] == 4 and _is_taken(image) and image.alpha_mode == "STRAIGHT" and _has_alpha(image):
+        pixels = pixels[..., :3] * pixels[..., 3:]
     pixels = pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
     if _is_srgb(image):
         pixels = srgb_to_linear(pixels)
