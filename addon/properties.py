@@ -12,6 +12,7 @@ from ..drgs_blender.core.frame import RenderSettings
 from ..drgs_blender.core.passes import PASSES, Pass
 from . import blend_paths, mesh_display
 from .adjustment_settings import DrgsAdjustmentSettings, tag_changed
+from .level_of_detail import LevelOfDetail
 from .physics_settings import DrgsPhysicsSettings
 from .property_limits import Limited
 from .submit import DrgsSubmitSettings
@@ -33,7 +34,7 @@ def _switch_overlay(settings: DrgsSceneSettings, context: bpy.types.Context) -> 
     mesh_display.update_display(settings.id_data)
 
 
-class DrgsSceneSettings(bpy.types.PropertyGroup):
+class DrgsSceneSettings(LevelOfDetail, bpy.types.PropertyGroup):
     """How DR-GS solves a frame; see drgs_blender.core.frame.RenderSettings."""
 
     samples: IntProperty(

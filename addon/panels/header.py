@@ -7,7 +7,7 @@ import textwrap
 import bpy
 
 from .. import messages, preferences
-from ..viewport import views
+from ..viewport import surfels, views
 from .sidebar import ICONS
 
 #: Letters that a header has room for; a click shows the rest.
@@ -23,10 +23,24 @@ def draw(header: bpy.types.Header, context: bpy.types.Context) -> None:
         phase, part = views.preparation()
         if phase:
             header.layout.label(text=f"{phase}  {part:.0%}", icon="TIME")
+    fewer = _reduction(context)
+    if fewer:
+        header.layout.label(text=fewer, icon="POINTCLOUD_DATA")
     newest = next((m for m in reversed(list(messages.history)) if m.level != "INFO"), None)
     if newest is not None:
         text = textwrap.shorten(newest.text, LETTERS, placeholder="...")
         header.layout.popover("DRGS_PT_messages", text=text, icon=ICONS[newest.level])
+
+
+def _reduction(context: bpy.types.Context) -> str:
+    """What is shown in place of all surfels, in words, where Blender writes nothing over the picture."""
+    shown = context.scene.drgs.overlay
+    if shown == "OFF" or views.is_rendered(context.space_data, context.scene):
+        return ""
+    if shown == "SURFELS":
+        return surfels.reduction
+    window = next((r for r in context.area.regions if r.type == "WINDOW"), None)
+    return "" if window is None else views.reduction(views.name_of(window))
 
 
 def register() -> None:

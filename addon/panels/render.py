@@ -64,6 +64,15 @@ class DRGS_PT_sampling(_RenderPanel, bpy.types.Panel):
         column = layout.column(heading="Viewport")
         column.prop(settings, "use_viewport_denoise")
         column.prop(context.scene.render, "preview_pixel_size")
+        draw_detail(column, settings)
+
+
+def draw_detail(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
+    """How many surfels moving viewports show."""
+    layout.prop(settings, "level_of_detail")
+    row = layout.row()
+    row.active = settings.level_of_detail == "AUTOMATIC"
+    row.prop(settings, "viewport_surfels")
 
 
 class DRGS_PT_light(_RenderPanel, bpy.types.Panel):

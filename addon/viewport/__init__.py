@@ -18,13 +18,13 @@ def _changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = Non
 @bpy.app.handlers.persistent
 def _forget(*_: object) -> None:
     views.forget()
-    surfels.cache.clear()
+    surfels.forget()
 
 
 @bpy.app.handlers.persistent
 def _undone(*_: object) -> None:
     scenes.forget()
-    surfels.cache.clear()
+    surfels.forget()
 
 
 #: Name of the handler list -> what is called. After undo, nothing is where it was in memory.

@@ -6,6 +6,7 @@ points are seen before them.
 
 from __future__ import annotations
 
+import contextlib
 from functools import partial
 
 import bpy
@@ -15,46 +16,72 @@ from mathutils import Matrix, Vector
 
 from ...drgs_blender.core.asset import Asset
 from ...drgs_blender.core.errors import DrgsError
+from ...drgs_blender.core.level_of_detail import Detail
 from ...drgs_blender.core.material_adjustments import edited_asset
 from .. import assets, mesh_arrays, surfel_points
 from ..export.export_cache import ExportCache, uid
 from ..export.objects import appearance_of
+from ..level_of_detail import most_surfels
 from . import draw
 
 Array = np.ndarray
 
 #: Diameter of a disc in standard deviations of its surfel: neighbours just overlap.
 _WIDTH = 2.5
+#: Assets of which the order of surfels is kept.
+_KEPT_ORDERS = 8
 cache = ExportCache()
+#: Orders of surfels, by the place of the array of their centres, which they keep.
+_orders: dict[int, tuple[Array, Detail]] = {}
+#: What is shown in place of all surfels, in words; "" where all are.
+reduction = ""
 
 
-def posed_centres(asset: Asset, vertices: Array) -> Array:
-    """(n, 3) float32: where the surfels are when the mesh has these (v, 3) vertices; bound ones follow their face."""
+def forget() -> None:
+    """Drop everything."""
+    cache.clear()
+    _orders.clear()
+
+
+def posed_centres(asset: Asset, vertices: Array, rows: Array | slice = slice(None)) -> Array:
+    """(n, 3) float32: where the surfels are when the mesh has these (v, 3) vertices; bound ones follow their face.
+
+    `rows` chooses surfels.
+    """
     binding = asset.binding
     if binding is None or len(vertices) != len(asset.mesh.vertices):
-        return asset.surfels.centre
-    corners = vertices[asset.mesh.faces[binding.face]]
-    found = np.einsum("nk,nkc->nc", binding.barycentric, corners)
-    if binding.offset.any():
+        return asset.surfels.centre[rows]
+    faces, offset = asset.mesh.faces[binding.face[rows]], binding.offset[rows]
+    corners = vertices[faces]
+    found = np.einsum("nk,nkc->nc", binding.barycentric[rows], corners)
+    if offset.any():
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-        rest = asset.mesh.vertices[asset.mesh.faces[binding.face]]
+        rest = asset.mesh.vertices[faces]
         edge = np.linalg.norm(rest - np.roll(rest, 1, axis=1), axis=2).mean(axis=1)
-        found += (binding.offset * edge)[:, None] * normal
+        found += (offset * edge)[:, None] * normal
     return np.ascontiguousarray(found, np.float32)
 
 
 def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
-    """Draw the surfels of all visible DR-GS objects."""
+    """Draw the surfels of all visible DR-GS objects, no more than the scene's limit."""
+    global reduction
     region, rv3d = context.region, context.region_data
+    most, whole = most_surfels(depsgraph.scene), _count(depsgraph)
+    share = min(1.0, most / whole) if most and whole else 1.0
+    told = f"{round(whole * share):,} of {whole:,} surfels" if share < 1.0 else ""
+    if told != reduction:
+        reduction = told
+        for other in context.area.regions:
+            other.tag_redraw()  # the header says it
     for instance in depsgraph.object_instances:
         obj = instance.object
         if not instance.show_self or not assets.is_drgs(obj):
             continue
-        look = obj.drgs.show_captured, obj.drgs.adjustment.values(), surfel_points.state_of(obj)
+        look = obj.drgs.show_captured, obj.drgs.adjustment.values(), surfel_points.state_of(obj), share
         key = "object", uid(obj), obj.data.as_pointer(), obj.mode, look
         owners = uid(obj), uid(obj.data), uid(obj.original.drgs.surfel_points)
-        found = cache.get(key, owners, partial(_batch, obj, depsgraph))
+        found = cache.get(key, owners, partial(_batch, obj, depsgraph, share))
         if found is None:
             continue
         batch, size = found
@@ -96,16 +123,45 @@ def set_back(window: Matrix, depth: float, distance: float) -> Matrix:
     return moved
 
 
-def _batch(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[gpu.types.GPUBatch, float] | None:
+def _count(depsgraph: bpy.types.Depsgraph) -> int:
+    """Surfels of all visible objects, those of instances once more."""
+    total = 0
+    for instance in depsgraph.object_instances:
+        if instance.show_self and assets.is_drgs(instance.object):
+            with contextlib.suppress(DrgsError):  # reported when the object is rendered
+                total += len(assets.load(assets.file_of(instance.object)).surfels)
+    return total
+
+
+def _batch(
+    obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, share: float
+) -> tuple[gpu.types.GPUBatch, float] | None:
     """Discs, and the median of their diameters."""
     try:
         asset = assets.load(assets.file_of(obj))
     except DrgsError:  # reported when the object is rendered
         return None
     shown, vertices = shown_asset(obj, asset, depsgraph)
-    sizes = _WIDTH * shown.surfels.scale.max(axis=1, initial=0)
-    batch = draw.disc_batch(posed_centres(shown, vertices), shown.surfels.albedo, sizes.astype(np.float32))
+    rows, growth = first_rows(shown, share)
+    scale = shown.surfels.scale[rows]
+    sizes = _WIDTH * np.maximum(scale.max(axis=1, initial=0), np.sqrt(scale.prod(axis=1) * growth))
+    places = posed_centres(shown, vertices, rows)
+    batch = draw.disc_batch(places, shown.surfels.albedo[rows], sizes.astype(np.float32))
     return batch, float(np.median(sizes)) if len(sizes) else 0.0
+
+
+def first_rows(asset: Asset, share: float) -> tuple[Array | slice, Array | float]:
+    """The surfels that stand for a share of all, and by how much their area grows."""
+    count = max(1, round(share * len(asset.surfels)))
+    if share >= 1.0 or count >= len(asset.surfels):
+        return slice(None), 1.0
+    place = asset.surfels.centre
+    if id(place) not in _orders:
+        while len(_orders) >= _KEPT_ORDERS:
+            del _orders[next(iter(_orders))]
+        _orders[id(place)] = place, Detail.of(asset.surfels)
+    detail = _orders[id(place)][1]
+    return detail.order[:count], detail.growth(count)
 
 
 def shown_asset(

@@ -21,6 +21,7 @@ from ...drgs_blender.core.phases import STARTING, is_counted, is_preparing
 from .. import bakes, engine_link, messages, preferences
 from ..export.camera import check_lens
 from ..export.view import view_camera
+from ..level_of_detail import most_surfels
 from . import blurred, draw, scenes
 from .worker import Picture, Request, Worker
 
@@ -103,7 +104,8 @@ def update(
         viewport.blur = blurred.Blur()
     else:
         viewport.blur = blurred.of(context, depsgraph, through, viewport.blur, _local(space))
-    requested = exported, _values(camera), (options, depthless, viewport.blur.key)
+    most = most_surfels(depsgraph.scene)
+    requested = exported, _values(camera), (options, depthless, viewport.blur.key, most)
     if viewport.requested and viewport.requested[0] is exported and viewport.requested[1:] == requested[1:]:
         return ""
     try:
@@ -114,7 +116,7 @@ def update(
     frame = replace(exported.frame, camera=camera, **options)
     if composited:
         frame = _alone(frame, depthless)
-    worker.submit(name, Request(frame, client, exported.assets, viewport.blur.parts(frame)))
+    worker.submit(name, Request(frame, client, exported.assets, viewport.blur.parts(frame), most))
     _start()
     return ""
 
@@ -185,7 +187,20 @@ def _status(viewport: ViewportState, name: str) -> str:
     if viewport.picture is None or is_preparing(phase):
         return phase or STARTING
     samples = viewport.picture.request.frame.settings.sample_count
-    return f"Sample {round(viewport.picture.fraction * samples)}/{samples}"
+    text = f"Sample {round(viewport.picture.fraction * samples)}/{samples}"
+    fewer = reduction(name)
+    return f"{text}  |  {fewer}" if fewer else text
+
+
+def reduction(name: str) -> str:
+    """What the picture of a viewport shows in place of all surfels, in words; "" where it shows them."""
+    picture = worker.picture(name)
+    if picture is None:
+        return ""
+    shown, whole = picture.surfels
+    if shown >= whole:
+        return ""
+    return f"{shown:,} of {whole:,} surfels" if shown else f"Mesh for {whole:,} surfels"
 
 
 def preparation() -> tuple[str, float]:

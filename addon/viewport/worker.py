@@ -16,6 +16,7 @@ from functools import partial
 
 from ...drgs_blender.core.errors import Cancelled, DrgsError
 from ...drgs_blender.core.frame import Frame
+from ...drgs_blender.core.level_of_detail import MOST_SURFELS
 from ...drgs_blender.core.phases import is_counted
 from ...drgs_blender.ipc.blur import Mean
 from ...drgs_blender.ipc.client import EngineClient, Passes
@@ -24,6 +25,8 @@ log = logging.getLogger("drgs")
 
 #: Side of the pixels beyond which a picture is refined before it is blurred.
 _SHARP_UNTIL = 4
+#: Seconds after a move until all surfels are drawn, where a picture has fewer.
+REST_SECONDS = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,12 +37,14 @@ class Request:
     ----------
     assets : path of every asset in the frame, with the file's time and size, by which changes are found
     parts : frames of whose pictures the mean is the blurred one; the frame's own picture is sharp and comes first
+    most : surfels of a picture until the view rests; 0: all
     """
 
     frame: Frame
     client: EngineClient
     assets: tuple[tuple[str, tuple[int, int]], ...] = ()
     parts: Sequence[Frame] = ()
+    most: int = MOST_SURFELS
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,18 +56,26 @@ class Picture:
     fraction: float
     seconds: float  # from the request to the picture
 
+    @property
+    def surfels(self) -> tuple[int, int]:
+        """How many surfels it shows, and how many there are."""
+        shown, whole = (int(self.passes.statistics.get(f"view.{name}", 0.0)) for name in ("surfels", "all"))
+        return shown, whole
+
 
 @dataclass(slots=True)
 class _View:
     name: str
     request: Request
     submitted: float
+    moved: float  # when the latest request came
     begun: bool = False
     fraction: float = 0.0
     picture: Picture | None = None
     error: str = ""
     phase: str = ""
     part: float = 0.0
+    many: bool = False  # whether there are more surfels than pictures have before the view rests
     pixel: float = 0.0  # side of the pixels of the last picture, 0 before there is one
     mean: Mean | None = None  # of the parts of a blurred one
 
@@ -84,9 +97,10 @@ class Worker:
         with self._changed:
             view = self._views.get(name)
             if view is None:
-                view = self._views[name] = _View(name, request, time.perf_counter())
+                view = self._views[name] = _View(name, request, time.perf_counter(), 0.0)
             elif view.begun:
                 view.submitted = time.perf_counter()
+            view.moved = time.perf_counter()
             view.request, view.begun, view.fraction, view.error = request, False, 0.0, ""
             view.pixel, view.mean = 0.0, None
             if self._thread is None:
@@ -160,7 +174,7 @@ class Worker:
         while True:
             with self._changed:
                 while (view := self._next()) is None and not self._ending:
-                    self._changed.wait()
+                    self._changed.wait(None if self._held or not self._unrested() else REST_SECONDS / 4)
                 if self._ending or view is None:
                     return
                 request, first, submitted = view.request, not view.begun, view.submitted
@@ -184,6 +198,7 @@ class Worker:
             fraction = passes.statistics.get("view.fraction", 1.0)
             with self._changed:
                 view.picture, view.phase, view.part = Picture(request, passes, fraction, now - submitted), "", 0.0
+                view.many = view.picture.surfels[0] <= request.most < view.picture.surfels[1]
                 if view.request is request:
                     view.fraction = fraction
             self.news += 1
@@ -192,7 +207,7 @@ class Worker:
         """The first picture of a request, or one with finer pixels, more samples or more of its parts."""
         note = partial(self._note_phase, view)
         if first or not request.parts or view.pixel > _SHARP_UNTIL:
-            passes = request.client.view(view.name, request.frame, not first, note, stop)
+            passes = request.client.view(view.name, request.frame, not first, note, stop, request.most)
             with self._changed:
                 if view.request is request:
                     view.pixel = passes.statistics.get("view.pixel", 1.0)
@@ -215,8 +230,17 @@ class Worker:
         waiting = [view for view in self._views.values() if not view.begun]
         if waiting:
             return min(waiting, key=lambda view: view.submitted)
-        growing = [view for view in self._views.values() if _unfinished(view)]
+        resting = self._unrested()
+        growing = [view for view in self._views.values() if _unfinished(view) and view not in resting]
         return min(growing, key=lambda view: view.fraction, default=None)
+
+    def _unrested(self) -> list[_View]:
+        """Views that have just moved, and show fewer surfels than there are; called with the lock held.
+
+        All of them would not be drawn before the next move, and to end half way takes a while, too.
+        """
+        latest = time.perf_counter() - REST_SECONDS
+        return [v for v in self._views.values() if v.begun and v.many and v.fraction == 0.0 and v.moved > latest]
 
     def _stop_begin(self, view: _View) -> Callable[[], bool]:
         return lambda: self._ending or self._held > 0 or self._views.get(view.name) is not view

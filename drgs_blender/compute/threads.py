@@ -10,9 +10,10 @@ processor.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from typing import Any
@@ -39,6 +40,23 @@ def use_threads(count: int) -> None:
     """Run this thread's kernels on `count` threads, or on as many as there are; 0 is all of them."""
     limit = numba.config.NUMBA_NUM_THREADS
     _setting.count = limit if count <= 0 else min(count, limit)
+
+
+@contextlib.contextmanager
+def interruptible(check: Callable[[], None]) -> Iterator[None]:
+    """Ask `check` between the pieces of kernels that this thread runs meanwhile; what it raises ends them half way."""
+    before, _setting.check = getattr(_setting, "check", None), check
+    try:
+        yield
+    finally:
+        _setting.check = before
+
+
+def checkpoint() -> None:
+    """Ask what `interruptible` says, for work that is no kernel."""
+    check: Callable[[], None] | None = getattr(_setting, "check", None)
+    if check is not None:
+        check()
 
 
 @cache
@@ -72,23 +90,27 @@ def over_range(kernel: Callable[..., Any], count: int, *arguments: Any, fewest: 
     if count <= 0:
         return []
     threads = get_num_threads()
-    if threads == 1 or count <= fewest:
+    if count <= fewest or (threads == 1 and getattr(_setting, "check", None) is None):
         return [kernel(0, count, *arguments)]
     size = max(-(-count // (threads * _PIECES)), min(fewest, -(-count // threads)))
     starts = range(0, count, size)
     results: list[Any] = [None] * len(starts)
     pieces = iter(starts)  # its next value is taken by one thread at a time
 
-    def work() -> None:
+    def work(check: Callable[[], None] | None = None) -> None:
         for first in pieces:
+            if check is not None:
+                check()
             results[first // size] = kernel(first, min(first + size, count), *arguments)
 
     others: list[Future[None]] = []
     try:
         for _ in range(min(threads, len(starts)) - 1):
             others.append(_pool(threads).submit(work))
-        work()
+        work(checkpoint)
     finally:
+        for _ in pieces:  # where it ends half way, the others are to end, too
+            pass
         begun = [other for other in others if not other.cancel()]  # threads may be at work for another call
         wait(begun)
     for other in begun:
@@ -116,4 +138,6 @@ def over_strided(kernel: Callable[..., Any], most: int, *arguments: Any, calls: 
     over_range(kernel, stride, stride, *arguments)
 
 
-__all__ = ["ELEMENTS", "ROWS", "get_num_threads", "over_range", "over_strided", "use_threads"]
+__all__ = [
+    "ELEMENTS", "ROWS", "checkpoint", "get_num_threads", "interruptible", "over_range", "over_strided", "use_threads",
+]  # fmt: skip

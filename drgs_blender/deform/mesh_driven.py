@@ -9,6 +9,7 @@ takes the one that stretches it less: neither a single face that is carried badl
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -16,8 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..compute.jit import njit, plain
-from ..compute.threads import ELEMENTS, over_range
+from ..compute.threads import ELEMENTS, checkpoint, over_range
 from ..core.asset.model import BASE_CHANNELS, Binding, Mesh, PosedSurfels, Surfels, neutral_values
+from ..core.asset.part import taken, taken_binding
 from ..core.errors import AssetError
 from ..geometry.normals import VertexNormals, rotation_matrices, unit
 from .face_frames import Faces
@@ -26,6 +28,9 @@ from .wide_support import spans
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
+
+#: Surfels whose rest is found at once.
+_ROWS = 1 << 18
 
 
 class Posing(NamedTuple):
@@ -99,7 +104,6 @@ class MeshDriven:
         offset = (binding.offset * faces.mean_edge[face]).astype(np.float32)
         rest_edge = np.where(faces.degenerate, faces.mean_edge, 0).astype(np.float32)  # 0: a proper face
 
-        tangents = rotation_matrices(surfels.rotation.astype(np.float64))[..., :2] * surfels.scale[:, None, :]
         basis = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], faces.normal], -1)
         if self.degenerate_faces:
             log.warning("mesh: %d faces have no area at rest", self.degenerate_faces)
@@ -107,10 +111,30 @@ class MeshDriven:
             for f in np.flatnonzero(faces.degenerate):
                 frame = tangent_frame(*basis[f, :, 0].tolist(), *basis[f, :, 1].tolist(), *smooth[f].tolist())
                 basis[f] = np.reshape(frame, (3, 3)).T
-        coordinates = np.ascontiguousarray(np.linalg.inv(basis)[face] @ tangents, dtype=np.float32)
-        span = spans(mesh.vertices, mesh.faces, normals, faces, face, binding.barycentric, surfels.scale.max(axis=1))
+        inverse, n = np.linalg.inv(basis), len(surfels)
+        coordinates, in_span = np.empty((2, n, 3, 2), np.float32)
+        span = np.empty((n, 3), np.int32)
+        for first in range(0, n, _ROWS):  # bounds memory
+            checkpoint()
+            rows = slice(first, first + _ROWS)
+            scale = surfels.scale[rows]
+            tangents = rotation_matrices(surfels.rotation[rows].astype(np.float64))[..., :2] * scale[:, None, :]
+            coordinates[rows] = inverse[face[rows]] @ tangents
+            given = face[rows], binding.barycentric[rows], scale.max(axis=1)
+            span[rows] = spans(mesh.vertices, mesh.faces, normals, faces, *given)
+            in_span[rows] = _in_spans(mesh.vertices, span[rows], tangents)
         rest = (binding.face, binding.barycentric, offset, rest_edge, binding.normal, coordinates)
-        self.rest = Rest(*map(plain, (*rest, span, _in_spans(mesh.vertices, span, tangents))))
+        self.rest = Rest(*map(plain, (*rest, span, in_span)))
+
+    def first(self, count: int) -> MeshDriven:
+        """The same of the first `count` surfels alone."""
+        few, rest = copy.copy(self), self.rest
+        rows = slice(count)
+        few.surfels = taken(self.surfels, rows)
+        few.binding = taken_binding(self.binding, rows)
+        of_surfels = {name: getattr(rest, name)[rows] for name in Rest._fields if name != "rest_edge"}
+        few.rest = rest._replace(**of_surfels)
+        return few
 
     def pose(
         self,

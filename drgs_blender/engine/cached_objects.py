@@ -10,6 +10,7 @@ import numpy as np
 from ..core.arrays import Array
 from ..core.asset.model import PosedSurfels
 from ..core.frame import MeshState, ObjectState
+from ..core.level_of_detail import Detail
 from ..core.materials import Image
 from ..render.scene.ray_masks import CAMERA, group_mask
 from ..render.scene.trace_scene import ObjectMesh, TraceObject
@@ -28,6 +29,7 @@ class CachedObject:
     One that is shown in captured colours is `captured` for the camera, and for rays `glowing`. One with materials of
     its own, or with `channels` that rays meet, has a `mesh` with `images` and the optional channels `shown`; `met` is
     what stands for the object in the scene. Of a thin one light meets `sheet`. Its surfels may have `emission` (n, 3).
+    It has `levels` of fewer surfels by their number; of these each has the `detail` by which they grow.
     """
 
     state: ObjectState
@@ -46,6 +48,8 @@ class CachedObject:
     emission: Array | None = None
     channels: dict[str, Array] = field(default_factory=dict)
     shown: frozenset[str] = frozenset()
+    levels: dict[int, CachedObject] = field(default_factory=dict)
+    detail: Detail | None = None
 
     @property
     def sheeted(self) -> bool:

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from ..compute.threads import checkpoint
 from ..core.asset.model import Asset, Surfels
+from ..core.asset.part import with_surfels
 from ..core.errors import AssetError
 from ..core.frame import ObjectState
+from ..core.level_of_detail import Detail
 from ..deform.mesh_driven import MeshDriven
 from .asset_textures import TexturedAsset
 from .captured_objects import Glow, glow_of
+
+#: Surfels of the first level of detail that is made of an asset; others are its beginnings.
+_AT_FIRST = 1 << 17
 
 
 @dataclass(slots=True)
@@ -26,6 +32,8 @@ class LoadedAsset:
         Its textures.
     faults : list of str
         What of the file could not be used.
+    levels : dict of int to LoadedAsset
+        Its most needed surfels by their number, see `first`.
     """
 
     asset: Asset
@@ -34,6 +42,32 @@ class LoadedAsset:
     glow: Glow | None = None
     textured: TexturedAsset | None = None
     faults: list[str] = field(default_factory=list)
+    levels: dict[int, LoadedAsset] = field(default_factory=dict)
+    _detail: Detail | None = None
+
+    @property
+    def detail(self) -> Detail:
+        """The order in which its surfels are needed, found once."""
+        if self._detail is None:
+            self._detail = Detail.of(self.asset.surfels, checkpoint)
+        return self._detail
+
+    def first(self, count: int) -> LoadedAsset:
+        """The asset of its `count` most needed surfels, in that order and of their own size."""
+        if count not in self.levels:
+            largest = max(self.levels, default=0)
+            if count > largest:
+                self.levels.clear()
+                largest = min(max(count, _AT_FIRST), len(self.asset.surfels))
+                self.levels[largest] = LoadedAsset(with_surfels(self.asset, self.detail.order[:largest]), self.stamp)
+            if count < largest:
+                whole = self.levels[largest]
+                if whole.driven is None and whole.asset.binding is not None and len(whole.asset.mesh.faces):
+                    whole.driven = MeshDriven(whole.asset.mesh, whole.asset.surfels, whole.asset.binding)
+                few = LoadedAsset(with_surfels(whole.asset, slice(count)), self.stamp)
+                few.driven = None if whole.driven is None else whole.driven.first(count)
+                self.levels[count] = few
+        return self.levels[count]
 
     def surfels_of(self, state: ObjectState) -> MeshDriven | Surfels:
         """The deformation of the asset's surfels, made when an object first needs it; the surfels without a mesh."""

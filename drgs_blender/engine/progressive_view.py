@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,18 +13,20 @@ from ..ipc.protocol import Passes
 from ..render.backend import CPU, RenderBackend
 from ..render.pipeline import Progress
 from ..render.prepared_scene import PreparedScene
-from ..render.progressive import Progressive, coarse, thinned_scene
+from ..render.progressive import Progressive, coarse
+from .level_of_detail import Budget
 
 IsCancelled = Callable[[], bool]
 #: Makes a whole picture of a frame, and reports progress.
 Draw = Callable[[Frame, PreparedScene, Progress], Passes]
 
-#: Seconds that the pixels of a first picture may take (projecting the surfels comes on top, whatever its size).
-FIRST_SECONDS = 0.045
+#: Seconds that the pixels of a first picture may take, and as many surfels as they ask for: for 24 pictures a second
+#: with the way to the screen.
+FIRST_SECONDS = 0.025
 #: Seconds between the pictures that follow.
 STEP_SECONDS = 0.2
 #: Sides of a coarse pixel.
-SIZES = (1, 2, 4, 8)
+SIZES = (1, 2, 3, 4, 6, 8)
 
 
 class Pace:
@@ -56,6 +59,38 @@ class Pace:
         self._sums = 0.9 * self._sums + (1.0, pixels, seconds, pixels * pixels, pixels * seconds)
 
 
+@dataclass(frozen=True, slots=True)
+class Rough:
+    """How the coarse pictures of a view are made, which come before the one with all that it shows.
+
+    Attributes
+    ----------
+    pixel : int
+        Side of the pixels of the first, in those of the frame.
+    by_mesh : bool
+        Whether they show the meshes, which are as detailed as those pictures.
+    most : int
+        Surfels that they show at most; 0: all there are.
+    sharp : bool
+        Whether the last of them has all the pixels, since all the surfels take long.
+    """
+
+    pixel: int
+    by_mesh: bool = False
+    most: int = 0
+    sharp: bool = False
+
+    def seen(self, frame: Frame, pixel: int) -> Frame:
+        """The frame as a picture with such pixels shows it."""
+        if not self.by_mesh or pixel == 0 or (self.sharp and pixel == 1):
+            return frame
+        return replace(frame, settings=replace(frame.settings, camera_sees="mesh"))
+
+    def budget(self, frame: Frame, pixel: int) -> Budget | None:
+        """What a picture with such pixels can show; None for all there is."""
+        return Budget(frame.camera, pixel, self.most) if pixel and self.most else None
+
+
 class View:
     """Progressive state of one viewport's picture.
 
@@ -64,26 +99,30 @@ class View:
     frame : Frame
         The frame, which must not be changed. Where it names a ``history``, coarse pictures are denoised with it.
     pace : Pace
-        For how coarse the first picture is.
+        For how coarse the first picture of the next view is.
     number : int
         Another one for every view: in a history, the noise of one picture must differ from that of the next.
-    by_mesh : bool
-        Whether coarse pictures show the meshes, which are as detailed as those pictures.
+    rough : Rough
+        How it begins.
     backend : RenderBackend
         Where the kernels run.
 
     Attributes
     ----------
+    frame : Frame
+        As given.
     pixel : int
         Side of the pixels of the last picture, in those of the frame.
+    rough : Rough
+        As given.
     backend : RenderBackend
         As given.
     """
 
-    def __init__(self, frame: Frame, pace: Pace, number: int, by_mesh: bool, backend: RenderBackend = CPU) -> None:
-        self.frame, self._pace, self._number, self._by_mesh = frame, pace, number, by_mesh
+    def __init__(self, frame: Frame, pace: Pace, number: int, rough: Rough, backend: RenderBackend = CPU) -> None:
+        self.frame, self._pace, self._number, self.rough = frame, pace, number, rough
         self.backend = backend
-        self.pixel = 1
+        self.pixel = 0
         self._picture: Progressive | None = None
 
     @property
@@ -91,17 +130,22 @@ class View:
         """Part of the samples in the last picture, in [0, 1]; 0 for a coarse one."""
         return 0.0 if self._picture is None else self._picture.fraction
 
-    def begin(self, prepared: PreparedScene, draw: Draw) -> Passes:
-        """The first picture."""
-        x0, y0, x1, y1 = self.frame.camera.window
-        self.pixel = self._pace.size((x1 - x0) * (y1 - y0))
-        return self._coarse(prepared, draw, self.pixel)
+    @property
+    def coming(self) -> int:
+        """Side of the pixels of the next picture; 0 where that has all that the view shows."""
+        if self._picture is not None:
+            return 0
+        if self.pixel == 0:
+            return self.rough.pixel
+        if self.pixel > 4:
+            return max(self.pixel // 4, 2)
+        return 1 if self.rough.sharp and self.pixel > 1 else 0
 
     def advance(self, seen: Frame, prepared: PreparedScene, draw: Draw, cancelled: IsCancelled | None) -> Passes:
         """The next picture: finer pixels, then more samples of the frame as it is `seen`."""
-        if self._picture is None and self.pixel > 4:
-            passes = self._coarse(prepared, draw, self.pixel // 4)
-            self.pixel //= 4
+        if self.coming:
+            passes = self._coarse(prepared, draw, self.coming)
+            self.pixel = self.coming
             return passes
         if self._picture is None:
             picture, seconds = Progressive(seen, self.backend), 0.0
@@ -112,17 +156,17 @@ class View:
         return Passes(pictures, [], {})
 
     def _coarse(self, prepared: PreparedScene, draw: Draw, size: int) -> Passes:
-        frame = coarse(self.frame, size, self._by_mesh)
+        frame = coarse(self.rough.seen(self.frame, size), size)
         if frame.history:
             frame.noise_index += self._number
-        projected = 0.0
+        began, projected = time.perf_counter(), 0.0
 
         def watch(part: float, phase: str) -> None:
             nonlocal projected
             if phase == "Rendering" and not projected:
                 projected = time.perf_counter()
 
-        pixels = frame.camera.width * frame.camera.height
-        passes = draw(frame, thinned_scene(prepared, pixels), watch)
-        self._pace.note(pixels, time.perf_counter() - projected)
+        passes = draw(frame, prepared, watch)
+        began = began if self.rough.most else projected  # else surfels are as many as pixels ask for
+        self._pace.note(frame.camera.width * frame.camera.height, time.perf_counter() - began)
         return passes

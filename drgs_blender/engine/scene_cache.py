@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..compute.threads import interruptible
 from ..compute.warp.posed_surfels import DevicePosedSurfels, joined
 from ..core.asset.container import read_asset
 from ..core.asset.model import Asset, PosedSurfels
@@ -33,18 +34,18 @@ from ..render.scene.see_through import MOST
 from ..render.scene.trace_scene import TraceScene
 from ..render.surfels.captured import CapturedObject
 from ..render.surfels.surfel_bvh import SurfelBVH
-from .cached_objects import CachedObject, begun, emission_of, surfel_mask
+from .cached_objects import CachedObject, begun, emission_of
 from .captured_objects import captured_faults, captured_object, shows_captured
+from .level_of_detail import Budget, counts, grown, reduced
 from .loaded_assets import LoadedAsset
 from .optional_channels import channel_faults, may_need, surfel_emission
 from .part_cache import PartCache
 from .scene_objects import check_surface, in_asset_order, join, moved_vertices, posed_surfels
 from .surfel_sheets import meets_sheets, sheet_mesh
+from .surfel_trees import SurfelTree
 
 Array = np.ndarray
 
-#: Surfels a vertex up to which a mesh is taken for as detailed as a coarse picture.
-_SURFELS_A_VERTEX = 16
 #: Passes that are black without light.
 _LIT = frozenset({"Combined", *COLOURS})
 
@@ -89,7 +90,7 @@ class SceneCache:
         self.scene = TraceScene()
         self.tree: SurfelBVH | None = None
         self.seen_tree: SurfelBVH | None = None
-        self._in_tree: list[CachedObject] = []
+        self._trees = SurfelTree(), SurfelTree()  # of all surfels, and of fewer
         self._current = True
         self.world: World | None = None
         self.environment: EnvironmentLight | None = None
@@ -134,21 +135,14 @@ class SceneCache:
         """The loaded asset of `key`."""
         return self._assets[key].asset
 
-    def detailed(self, frame: Frame) -> bool:
-        """Whether the meshes of all objects are detailed enough to stand for their surfels in coarse pictures."""
-        if frame.settings.rays_see != "mesh":
-            return False
-        known = [state for state in frame.objects if state.asset in self._assets]
-        assets = [self._assets[state.asset].asset for state in known]
-        if any(shows_captured(*of, frame) or meets_sheets(*of, frame) for of in zip(known, assets, strict=True)):
-            return False  # points on a mesh would lie among sheets, in their shade
-        return all(len(a.surfels) <= _SURFELS_A_VERTEX * len(a.mesh.vertices) for a in assets)
+    def known(self, frame: Frame) -> list[tuple[ObjectState, Asset]]:
+        """Objects of a frame whose assets are loaded."""
+        return [(state, self._assets[state.asset].asset) for state in frame.objects if state.asset in self._assets]
 
     def jobs_of(self, frame: Frame) -> tuple[str, ...]:
         """Jobs of `compute.manifest` that a frame needs for what its assets are."""
-        known = [self._assets.get(state.asset) for state in frame.objects]
-        given = [loaded.asset for loaded in known if loaded is not None]
-        return ("lights", "mesh") if len(given) == len(known) and may_need(frame, given) else ()
+        given = [asset for _, asset in self.known(frame)]
+        return ("lights", "mesh") if len(given) == len(frame.objects) and may_need(frame, given) else ()
 
     def snapshot(self, frame: Frame) -> Frame:
         """Copy of a frame that is safe from later changes of its arrays; those of the scene are copies already."""
@@ -158,8 +152,17 @@ class SceneCache:
         known = replace(frame, objects=states, meshes=self.meshes, images=self.images, world=world)
         return reuse_equal(replace(known, background=background), None)
 
-    def pose(self, frame: Frame, backend: RenderBackend = CPU) -> PosedSurfels:
-        """Bring the trace scene up to date; return the surfels of all objects, posed where they will be needed."""
+    def pose(
+        self,
+        frame: Frame,
+        backend: RenderBackend = CPU,
+        budget: Budget | None = None,
+        check: Callable[[], None] = lambda: None,
+    ) -> PosedSurfels:
+        """Bring the trace scene up to date; return the surfels of all objects, posed where they will be needed.
+
+        With a `budget` these are no more than a picture can show, enlarged. What `check` raises ends it half way.
+        """
         seen, met = frame.settings.camera_sees == "surfels", frame.settings.rays_see == "surfels"
         objects: list[CachedObject] = []
         faults: list[str] = []
@@ -187,16 +190,11 @@ class SceneCache:
                 if known is not None and known.loaded is loaded and known.state is kept and known.mode[:2] == mode[:2]:
                     # Only how the camera sees it is another: its surfels stand where they stood.
                     item.posed, item.hidden_count, item.emission = known.posed, known.hidden_count, known.emission
-            if (seen or met) and item.posed is None:
-                given = item.state, index, loaded.surfels_of(item.state), item.traced
-                item.posed, item.hidden_count = posed_surfels(*given, self._poser(backend))
+            if item.sheeted:
+                with interruptible(check):
+                    self._place_surfels(item, index, frame, backend)
             if item.sheeted and item.sheet is None and item.posed is not None:
                 item.sheet = sheet_mesh(item.state, item.posed)
-            if shown and item.captured is None and item.posed is not None:
-                item.captured = captured_object(item.state, loaded.asset, item.posed)
-            if seen and item.posed is not None and item.emission is None and not (shown or item.seen_by_mesh):
-                driven = loaded.driven if isinstance(loaded.surfels_of(item.state), MeshDriven) else None
-                item.emission = surfel_emission(item.state, loaded.asset, driven)
             objects.append(item)
             faults += captured_faults(kept, loaded.asset, frame)
             if not shown:
@@ -221,8 +219,17 @@ class SceneCache:
         for key, loaded in self._assets.items():
             if key not in used:
                 loaded.driven = loaded.glow = loaded.textured = None
+                loaded.levels.clear()
         along_rays = seen and bool(frame.camera.panorama)
-        tree = self._surfel_bvh(objects if met or along_rays else None)
+        self.tree = self.seen_tree = tree = None  # an update that fails half way leaves nothing to be taken for current
+        if not (met or along_rays):
+            self._trees = SurfelTree(), SurfelTree()
+        with interruptible(check):
+            objects = objects if budget is None else list(map(reduced, objects, counts(objects, budget)))
+            for index, item in enumerate(objects):
+                self._place_surfels(item, index, frame, backend)
+            if met or along_rays:
+                tree = self._trees[budget is not None].of(objects)
         self.tree, self.seen_tree = tree if met else None, tree if along_rays else None
         visible = [item for item in objects if item.state.visibility.camera] if seen else []
         self.captured = tuple(item.captured for item in visible if item.captured is not None)
@@ -236,6 +243,21 @@ class SceneCache:
         if any(item.state.visibility.camera and not item.seen_by_mesh for item in self.objects):
             return frame
         return replace(frame, settings=replace(frame.settings, camera_sees="mesh"))
+
+    def _place_surfels(self, item: CachedObject, index: int, frame: Frame, backend: RenderBackend) -> None:
+        """Pose the surfels of an object, where they are needed, and find what they emit."""
+        seen, met, loaded = frame.settings.camera_sees == "surfels", item.mode[0], item.loaded
+        if not (seen or met):
+            return
+        driven = loaded.surfels_of(item.state)
+        if item.posed is None:
+            posed, item.hidden_count = posed_surfels(item.state, index, driven, item.traced, self._poser(backend))
+            item.posed = posed if item.detail is None else grown(posed, item.detail)
+        if item.mode[1]:
+            item.captured = item.captured or captured_object(item.state, loaded.asset, item.posed)
+        elif seen and item.emission is None and not item.seen_by_mesh:
+            bound = driven if isinstance(driven, MeshDriven) else None
+            item.emission = surfel_emission(item.state, loaded.asset, bound)
 
     def _poser(self, backend: RenderBackend) -> Callable[..., PosedSurfels]:
         """Who poses surfels: `MeshDriven.pose`, or a device as long as it can."""
@@ -259,22 +281,6 @@ class SceneCache:
         if launcher is None or len(parts) < 2 or not any(isinstance(part, DevicePosedSurfels) for part in parts):
             return on_cpu()
         return backend.with_fallback(lambda: joined(launcher, parts, on_cpu), on_cpu)
-
-    def _surfel_bvh(self, objects: list[CachedObject] | None) -> SurfelBVH | None:
-        """The tree of the surfels of all objects; None when nothing meets surfels."""
-        known = self.seen_tree if self.tree is None else self.tree
-        self.tree = self.seen_tree = None  # an update that fails half way leaves nothing to be taken for current
-        if objects is None:
-            self._in_tree = []
-            return None
-        same = len(objects) == len(self._in_tree) and all(a is b for a, b in zip(objects, self._in_tree))
-        if known is not None and same:
-            return known
-        tree = SurfelBVH() if known is None else known
-        masks = [surfel_mask(item) for item in objects]
-        tree.update(join([item.posed for item in objects if item.posed is not None]), np.array(masks, np.int32))
-        self._in_tree = objects
-        return tree
 
     def scene_state(self, frame: Frame, step: MotionStep | None) -> SceneState | None:
         """The scene at another time; None when no pass asks for it."""

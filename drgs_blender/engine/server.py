@@ -144,7 +144,7 @@ class Server:
             raise DrgsError("frame", f"cannot be read: {error}", "Report it with the engine's log") from error
         session = self._open_session()
         if isinstance(message, protocol.View):
-            self._send_passes(message, session.view(message.view, frame, self._progress, self._cancelled))
+            self._send_passes(message, session.view(message.view, frame, self._progress, self._cancelled, message.most))
         else:
             self._send_passes(message, session.render(frame, self._progress, self._cancelled))
 

@@ -19,20 +19,20 @@ from ..compute.threads import use_threads
 from ..core.asset.model import Asset, PosedSurfels
 from ..core.errors import Cancelled, UsageError
 from ..core.frame import Frame, Light, MeshState, ObjectState, RenderSettings
-from ..core.passes import AOVS, COLOURS
+from ..core.level_of_detail import MOST_SURFELS
 from ..ipc.change_detection import reuse_equal
 from ..ipc.protocol import Passes
 from ..render.backend import CPU, RenderBackend, needs_paths
-from ..render.film.surface_film import CHANNELS
 from ..render.gpu.select_backend import Backends
 from ..render.integrator.adaptive import part_count
-from ..render.lights.light_groups import groups_of
 from ..render.pipeline import Progress, render
 from ..render.prepared_scene import PreparedScene
 from ..render.scene.trace_scene import TraceObject
 from .denoise_history import Histories
+from .kernel_jobs import jobs_of
+from .level_of_detail import Budget, check_most, is_detailed, too_many
 from .optional_channels import surfel_emission
-from .progressive_view import Pace, View
+from .progressive_view import Pace, Rough, View
 from .scene_cache import SceneCache
 
 logger = logging.getLogger(__name__)
@@ -81,6 +81,10 @@ class _StageTimer:
     def __call__(self, stage: str) -> None:
         now = time.perf_counter()
         self.seconds[f"seconds.{stage}"], self._clock = now - self._clock, now
+        self.check()
+
+    def check(self) -> None:
+        """Raise `Cancelled` where that is asked for."""
         if self._cancelled is not None and self._cancelled():
             raise Cancelled
 
@@ -192,12 +196,20 @@ class Session:
         return prepared, posed
 
     def view(
-        self, name: str, frame: Frame, progress: OnProgress | None = None, cancelled: IsCancelled | None = None
+        self,
+        name: str,
+        frame: Frame,
+        progress: OnProgress | None = None,
+        cancelled: IsCancelled | None = None,
+        most: int = MOST_SURFELS,
     ) -> Passes:
         """Begin the picture of a viewport: a first one at once, of coarse pixels where that is quicker.
 
         ``statistics["view.fraction"]`` is the part of the samples in it; below 1, `refine` gives the next picture.
-        ``passes`` may have fewer pixels than the camera's window, which they then cover evenly.
+        ``passes`` may have fewer pixels than the camera's window, which they then cover evenly. Until it has samples,
+        it shows no more surfels than these pixels can and at most `most`, enlarged to cover as much, or meshes that are
+        as detailed; 0 has it show all surfels from the first. ``statistics["view.surfels"]`` of ``["view.all"]`` are
+        shown.
 
         Raises
         ------
@@ -207,19 +219,16 @@ class Session:
         self._views.pop(name, None)
         self._compile(frame, ("viewport",), progress, cancelled)
         timer, backend = _StageTimer(cancelled), self._backends.select(frame.settings.device)
-        by_mesh = self._scene_cache.detailed(frame)
-        rough = replace(frame, settings=replace(frame.settings, camera_sees="mesh")) if by_mesh else frame
-        prepared = self._prepare(rough, timer, progress, backend)
-        view = View(self._scene_cache.snapshot(frame), self._pace, self._views_begun, by_mesh, backend)
+        rough = self._rough(frame, most)
+        seen, budget = rough.seen(frame, rough.pixel), rough.budget(frame, rough.pixel)
+        prepared = self._prepare(seen, timer, progress, backend, budget)
+        view = View(self._scene_cache.snapshot(frame), self._pace, self._views_begun, rough, backend)
         self._views_begun += 1
-        passes = view.begin(
-            prepared, lambda frame, prepared, report: self._draw(frame, prepared, report, cancelled, backend)
-        )
-        timer("render")
+        passes = self._next_picture(view, prepared, timer, cancelled)
         self._views[name] = view
         while len(self._views) > _VIEWS:
             del self._views[next(iter(self._views))]
-        return self._with_statistics(view, passes, prepared, timer)
+        return passes
 
     def refine(
         self, name: str, progress: OnProgress | None = None, cancelled: IsCancelled | None = None
@@ -234,17 +243,34 @@ class Session:
         view = self._views.get(name)
         if view is None:
             return None
-        timer = _StageTimer(cancelled)
-        backend = view.backend
-        prepared = self._prepare(view.frame, timer, progress, backend)  # other views may have changed the scene
-        draw = lambda frame, prepared, report: self._draw(frame, prepared, report, cancelled, backend)  # noqa: E731
+        timer, rough = _StageTimer(cancelled), view.rough
+        seen, budget = rough.seen(view.frame, view.coming), rough.budget(view.frame, view.coming)
+        prepared = self._prepare(seen, timer, progress, view.backend, budget)  # other views may have changed the scene
+        return self._next_picture(view, prepared, timer, cancelled)
+
+    def _rough(self, frame: Frame, most: int) -> Rough:
+        """How the view of a frame begins."""
+        check_most(most)
+        x0, y0, x1, y1 = frame.camera.window
+        pixels = (x1 - x0) * (y1 - y0)
+        if most == 0:
+            return Rough(self._pace.size(pixels))
+        given = self._scene_cache.known(frame)
+        return Rough(self._pace.size(pixels), is_detailed(frame, given), most, too_many(frame, given, most))
+
+    def _next_picture(
+        self, view: View, prepared: PreparedScene, timer: _StageTimer, cancelled: IsCancelled | None
+    ) -> Passes:
+        def draw(frame: Frame, prepared: PreparedScene, report: Progress) -> Passes:
+            return self._draw(frame, prepared, report, cancelled, view.backend)
+
         passes = view.advance(self._scene_cache.as_seen(view.frame), prepared, draw, cancelled)
         timer("render")
-        return self._with_statistics(view, passes, prepared, timer)
-
-    def _with_statistics(self, view: View, passes: Passes, prepared: PreparedScene, timer: _StageTimer) -> Passes:
         passes.statistics |= self._statistics(view.frame, prepared, timer)
         passes.statistics |= {"view.fraction": view.fraction, "view.pixel": float(view.pixel)}
+        seen = [i for i in self._scene_cache.objects if i.state.visibility.camera and not i.seen_by_mesh]
+        whole = sum(len(i.loaded.asset.surfels) for i in seen) if view.frame.settings.camera_sees == "surfels" else 0
+        passes.statistics |= {"view.surfels": passes.statistics["surfels"], "view.all": float(whole)}
         passes.warnings = self._warnings(view.frame)
         return passes
 
@@ -283,14 +309,19 @@ class Session:
             self._compiled.update(missing)
 
     def _prepare(
-        self, frame: Frame, timer: _StageTimer, progress: OnProgress | None, backend: RenderBackend = CPU
+        self,
+        frame: Frame,
+        timer: _StageTimer,
+        progress: OnProgress | None,
+        backend: RenderBackend = CPU,
+        budget: Budget | None = None,
     ) -> PreparedScene:
-        """Bring scene and light up to date with the frame."""
+        """Bring scene and light up to date with the frame, with no more surfels than a budget allows."""
         _check(frame)
         use_threads(frame.settings.threads)
         if progress is not None:
             progress("Deforming", 0.0)
-        posed = self._scene_cache.pose(frame, backend)
+        posed = self._scene_cache.pose(frame, backend, budget, timer.check)
         timer("deform")
         environment, lights = self._scene_cache.environment_of(frame.world), self._scene_cache.lights_of(frame)
         background = self._scene_cache.background_of(frame.background)
@@ -317,47 +348,6 @@ class Session:
             "triangles": float(len(self._scene_cache.scene.faces)),
             "surfels": float(len(prepared.surfels) + sum(len(item.rest) for item in prepared.captured)),
         }
-
-
-def jobs_of(frame: Frame) -> list[str]:
-    """Jobs of `compute.manifest` whose kernels a frame needs, in the order of the stages."""
-    settings, jobs = frame.settings, ["frame"]
-    if settings.camera_sees == "mesh" or not any(state.visibility.camera for state in frame.objects):
-        jobs.append("mesh")
-    if any(state.captured_colours for state in frame.objects):
-        jobs += ["captured", "lights"]
-    if settings.rays_see == "surfels" or (frame.camera.panorama and settings.camera_sees == "surfels"):
-        jobs.append("surfel rays")
-    if settings.denoise == "svgf":
-        jobs.append("denoise")
-    if frame.lights or frame.meshes:
-        jobs.append("lights")
-    if frame.previous is not None or frame.next is not None:
-        jobs.append("motion")
-    if any(name.startswith("Crypto") for name in frame.passes):
-        jobs.append("mattes")
-    if {*CHANNELS, *COLOURS}.intersection(frame.passes) or any(name.startswith(AOVS) for name in frame.passes):
-        jobs.append("surface passes")
-    if frame.camera.panorama:
-        jobs.append("panorama")
-    sources: list[Light | MeshState] = [*frame.lights, *frame.meshes]
-    if any(source.receivers >= 0 or source.blockers >= 0 for source in sources):
-        jobs.append("linked lights")
-    if groups_of(frame.passes):
-        jobs.append("light groups")
-    return jobs + _jobs_of_lobes(frame, jobs)
-
-
-def _jobs_of_lobes(frame: Frame, jobs: list[str]) -> list[str]:
-    """Jobs of surfaces with more lobes than two: the kernel of paths takes some of the longest to compile."""
-    if frame.settings.shading_model != "principled":
-        return []
-    if not any(material.has_more_lobes for mesh in frame.meshes for material in mesh.materials):
-        return []
-    kinds = {"linked lights": "linked paths", "light groups": "grouped paths"}
-    paths = [own for lights, own in kinds.items() if lights in jobs] or ["paths"]
-    coloured = {*COLOURS, *COLOURS.values()}.intersection(frame.passes)
-    return paths + (["lobe colours"] if coloured else [])
 
 
 def _ignored_lobes(settings: RenderSettings, meshes: list[MeshState]) -> list[str]:

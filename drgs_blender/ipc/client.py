@@ -28,6 +28,7 @@ from ..core.errors import (
     VersionError,
 )
 from ..core.frame import Frame
+from ..core.level_of_detail import MOST_SURFELS
 from . import protocol
 from .child_process import Child
 from .codec import CodecError, encode_frame
@@ -176,8 +177,12 @@ class EngineClient:
         go_on: bool = False,
         on_progress: OnProgress | None = None,
         cancelled: IsCancelled | None = None,
+        most: int = MOST_SURFELS,
     ) -> Passes:
         """The first picture of `frame` in the viewport `name`; with `go_on` the next one, of more samples.
+
+        Until it has samples, it shows at most `most` surfels, or all with 0, see `Session.view`.
+
 
         ``statistics["view.fraction"]`` is the part of all samples that the picture has. A coarse picture has fewer
         pixels than the window of the frame's camera, which they cover evenly. A new engine that does not know the
@@ -195,7 +200,10 @@ class EngineClient:
                 if isinstance(answer, protocol.Result):
                     return Passes(pictures, answer.warnings, answer.statistics)
             return self._picture(
-                ready, lambda number, slots: protocol.View(number, name, description, slots), on_progress, cancelled
+                ready,
+                lambda number, slots: protocol.View(number, name, description, slots, most),
+                on_progress,
+                cancelled,
             )
 
         with self._exclusive(cancelled):

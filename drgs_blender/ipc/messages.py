@@ -120,12 +120,16 @@ class Render:
 
 @dataclass(slots=True)
 class View:
-    """Begin the picture of the viewport `view`: fields as of Render. The answer is its first, rough state."""
+    """Begin the picture of the viewport `view`: fields as of Render. The answer is its first, rough state.
+
+    Until it has samples it shows `most` surfels at most; 0: all.
+    """
 
     id: int
     view: str
     frame: dict[str, Any]
     slots: dict[str, int]
+    most: int
 
 
 @dataclass(slots=True)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..compute.threads import use_threads
+from ..compute.threads import interruptible, use_threads
 from ..compute.warp.posed_surfels import with_fields
 from ..core.cryptomatte import KINDS
 from ..core.errors import Cancelled, UsageError
@@ -107,7 +107,8 @@ def render(
 
     report(0.0, "Projecting")
     scene, lights = prepared.scene, prepared.lights
-    visible = VisibleSurfaces(prepared, frame, parameters, backend)
+    with interruptible(check):
+        visible = VisibleSurfaces(prepared, frame, parameters, backend)
     film, numbers = Film(camera, settings, parameters), object_numbers(scene)
     mattes = [
         CryptoFilm(kind, scene, frame)
@@ -131,7 +132,8 @@ def render(
     for y0 in range(top, bottom, height):
         report(end * (y0 - top) / (bottom - top), "Rendering")
         y1 = min(y0 + height, bottom)
-        buffer = visible.rows(y0, y1)
+        with interruptible(check):
+            buffer = visible.rows(y0, y1)
         check()
         radiance = batches.light(buffer)
         film.add(buffer, radiance, numbers, prepared.seen)

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..compute.jit import njit
-from ..compute.threads import use_threads
-from ..core.asset.model import PosedSurfels
+from ..compute.threads import interruptible, use_threads
 from ..core.errors import Cancelled
 from ..core.frame import Frame, RenderSettings
 from .backend import CPU, RenderBackend
@@ -38,8 +37,6 @@ Array = np.ndarray
 
 #: Bytes of camera samples that a picture keeps between its steps; those of further strips are found again in each step.
 KEPT_BYTES = 512 << 20
-#: Surfels of a first picture, at most twice as many.
-SURFELS_PER_PIXEL = 3
 #: Parts of a sub-pixel sample at most, and samples of a part.
 _MOST_PARTS, _FEWEST = 32, 4
 
@@ -58,12 +55,11 @@ def parts_of(settings: RenderSettings) -> list[tuple[int, tuple[int, int]]]:
     return [(sample, (i, n)) for i in range(n) for sample in range(settings.subpixel_count)]
 
 
-def coarse(frame: Frame, size: int, by_mesh: bool = False) -> Frame:
+def coarse(frame: Frame, size: int) -> Frame:
     """The frame with pixels of `size` by `size`, one sample each of every strategy, for a first picture.
 
     Its picture covers exactly the window of ``frame.camera``. Where the frame is to be denoised, or names a ``history``
-    to continue, it is by SVGF. With `by_mesh` the camera sees meshes: surfels are never smaller than a pixel, and large
-    pixels let them grow beyond their object.
+    to continue, it is by SVGF.
     """
     camera = frame.camera
     x0, y0, x1, y1 = camera.window
@@ -82,37 +78,9 @@ def coarse(frame: Frame, size: int, by_mesh: bool = False) -> Frame:
     samples, by_strategy = min(3, frame.settings.samples), frame.settings.strategy_samples
     few = by_strategy and (min(1, by_strategy[0]), min(1, by_strategy[1]), min(1, by_strategy[2]))
     settings = replace(frame.settings, samples=samples, strategy_samples=few, subpixel_samples=1, noise_threshold=0.0)
-    if by_mesh:
-        settings.camera_sees = "mesh"
     if settings.denoise != "none" or frame.history:
         settings.denoise = "svgf"
     return replace(frame, camera=view, settings=settings, previous=None, next=None)
-
-
-def thinned_scene(prepared: PreparedScene, pixels: int) -> PreparedScene:
-    """The scene with the surfels that a picture of `pixels` can show, see `thinned`."""
-    shown = thinned(prepared.surfels, pixels)
-    step = sum(len(item.rest) for item in prepared.captured) // max(1, SURFELS_PER_PIXEL * pixels)
-    captured = prepared.captured if step < 2 else tuple(item.thinned(step) for item in prepared.captured)
-    emission = prepared.emission
-    if emission is not None and prepared.seen_surfels is None:  # else they are of the tree, which stays
-        emission = np.ascontiguousarray(emission[:: _step(len(emission), pixels)])
-    return replace(prepared, surfels=shown, captured=captured, emission=emission)
-
-
-def _step(count: int, pixels: int) -> int:
-    """Every which of `count` surfels a picture of `pixels` can show."""
-    return max(1, count // max(1, SURFELS_PER_PIXEL * pixels))
-
-
-def thinned(posed: PosedSurfels, pixels: int) -> PosedSurfels:
-    """Keep every n-th surfel, enlarged, where there are far more surfels than a picture of `pixels` can show."""
-    step = _step(len(posed), pixels)
-    if step < 2:
-        return posed
-    few = {f.name: np.ascontiguousarray(getattr(posed, f.name)[::step]) for f in fields(posed)}
-    larger = np.float32(np.sqrt(step))
-    return PosedSurfels(**few | {name: few[name] * larger for name in ("tangent_u", "tangent_v")})
 
 
 @dataclass(slots=True)
@@ -216,7 +184,8 @@ class Progressive:
         use_threads(self.frame.settings.threads)
         check()
         if self._visible is None:
-            self._visible = VisibleSurfaces(prepared, self.frame, self._parameters, self._backend)
+            with interruptible(check):
+                self._visible = VisibleSurfaces(prepared, self.frame, self._parameters, self._backend)
         batches = Batches(prepared, self.frame, check, self._backend)
         began = time.perf_counter()
         while self._next < len(self._parts):
@@ -232,7 +201,8 @@ class Progressive:
         for strip in self._strips:
             if strip.light is not None and not len(strip.light.going):
                 continue
-            points = self._samples(strip).points
+            with interruptible(check):
+                points = self._samples(strip).points
             check()
             assert strip.light is not None
             chosen = strip.light.going[points.sample[strip.light.going] == sample]
@@ -265,7 +235,8 @@ class Progressive:
         surfaces = SurfaceFilm(prepared.scene, self.frame, self._parameters, put_lobe_colours)
         groups = LightGroupFilm(prepared.scene, lights, self.frame, self._parameters)
         for strip in self._strips:
-            buffer = self._samples(strip)
+            with interruptible(check):
+                buffer = self._samples(strip)
             check()
             exact = self._adaptive and self.fraction == 1.0
             radiance = strip.radiance(buffer.points, exact)

@@ -19,8 +19,8 @@ from drgs_blender.core.frame import Adjustment, Frame, Layer, Light, MeshState, 
 from drgs_blender.core.materials import Material, Texture
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.mesh_driven import MeshDriven
+from drgs_blender.engine.level_of_detail import Budget
 from drgs_blender.engine.session import Session
-from drgs_blender.render.progressive import thinned_scene
 
 RADIANCE = (3.0, 1.5, 0.25)
 
@@ -358,14 +358,13 @@ def test_surfels_without_a_mesh_emit_to_the_camera_alone(asset_path, make_frame,
     assert any("seen by the camera alone" in text for text in picture.warnings)
 
 
-def test_a_coarse_view_thins_emission_with_its_surfels(glowing_path, make_frame) -> None:
+def test_a_coarse_view_has_the_emission_of_its_surfels(glowing_path, make_frame) -> None:
     frame = make_frame()
-    prepared, _ = use(frame, glowing_path).prepare(frame)
-    assert len(prepared.emission) == len(prepared.surfels)
-    for pixels in (1, 7, 50, 10**6):
-        few = thinned_scene(prepared, pixels)
-        assert len(few.emission) == len(few.surfels)
-    assert len(thinned_scene(prepared, 1).surfels) < len(prepared.surfels)
+    session = use(frame, glowing_path)
+    for pixel in (1, 4, 100):
+        budget = Budget(frame.camera, pixel, 500)
+        assert len(session._scene_cache.pose(frame, budget=budget)) == len(session._scene_cache.emission)
+        assert len(session._scene_cache.emission) < len(session.asset(frame.objects[0].asset).surfels)
 
 
 def test_linked_lights_know_the_object_behind_its_mesh(glowing_path, make_frame) -> None:

@@ -17,7 +17,7 @@ from drgs_blender.core.frame import Light, ObjectState, Visibility
 from drgs_blender.engine.progressive_view import FIRST_SECONDS, Pace
 from drgs_blender.engine.session import Session
 from drgs_blender.render import progressive
-from drgs_blender.render.progressive import coarse, parts_of, thinned
+from drgs_blender.render.progressive import coarse, parts_of
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 
@@ -178,20 +178,6 @@ def test_coarse_pixels_cover_the_window(make_frame, size):
         assert np.isclose((y - small.cy) / small.fy, (py - big.cy) / big.fy)
 
 
-def test_thin_surfels_cover_as_much(session, make_frame):
-    session.render(make_frame())
-    posed = session._scene_cache.objects[0].posed
-    n = len(posed)
-    assert thinned(posed, n) is posed
-    few = thinned(posed, n // 30)
-    assert n / 16 < len(few) < n / 6
-
-    def area(p):
-        return np.linalg.norm(np.cross(p.tangent_u, p.tangent_v), axis=1).sum()
-
-    assert area(few) == pytest.approx(area(posed), rel=0.1)
-
-
 def test_coarse_pictures_are_like_the_last(session, make_frame, monkeypatch):
     """Whatever the size of their pixels: of the detailed mesh, and of the surfels where the mesh is not."""
     frame = make_frame(0.2, size=(192, 144), samples=16)
@@ -204,7 +190,7 @@ def test_coarse_pictures_are_like_the_last(session, make_frame, monkeypatch):
         return np.abs(first - final.reshape(144 // size, size, 192 // size, size, 4).mean(axis=(1, 3))).mean()
 
     of_mesh = {size: error(size) for size in (2, 4)}
-    monkeypatch.setattr("drgs_blender.engine.scene_cache._SURFELS_A_VERTEX", 0)
+    monkeypatch.setattr("drgs_blender.engine.level_of_detail._SURFELS_A_VERTEX", 0)
     of_surfels = {size: error(size) for size in (2, 4)}
     assert max(of_mesh.values()) < 0.1
     assert max(of_surfels.values()) < 0.1

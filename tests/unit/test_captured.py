@@ -274,11 +274,3 @@ def test_a_device_blends_the_same(device):
     there = blend(splats, device.prepare(lit, camera, parameters), 0, camera.height, device.rasterise)
     assert np.array_equal(here.captured, there.captured)
     assert np.allclose(here.radiance[here.captured], there.radiance[here.captured], atol=1e-5)
-
-
-def test_fewer_surfels_for_a_coarse_picture_are_larger():
-    surfels = cloud(90, 9, thick=True)
-    few = CapturedObject(pose_by_matrix(surfels, np.eye(4)), surfels, False).thinned(9)
-    assert len(few.posed) == len(few.rest) == 10
-    assert np.allclose(few.posed.tangent_u, 3 * pose_by_matrix(surfels, np.eye(4)).tangent_u[::9])
-    assert np.array_equal(few.rest.sh, surfels.sh[::9])

@@ -12,7 +12,8 @@ from test_surface import mesh_state
 from drgs_blender.compute import manifest, threads
 from drgs_blender.core.frame import Camera, Frame, Layer, Light, RenderSettings, Visibility, World
 from drgs_blender.core.materials import TEXTURED, Image, Material, Part, SurfaceDetail, Texture
-from drgs_blender.engine.session import Session, jobs_of
+from drgs_blender.engine.kernel_jobs import jobs_of
+from drgs_blender.engine.session import Session
 from drgs_blender.render.integrator import paths
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drgs_blender.compute.jit import njit
-from drgs_blender.compute.threads import get_num_threads, over_range, use_threads
+from drgs_blender.compute.threads import checkpoint, get_num_threads, interruptible, over_range, use_threads
 
 
 @njit
@@ -81,3 +81,43 @@ def test_calls_within_calls_end(monkeypatch):
     calling.join(60)
     assert not calling.is_alive()
     assert sum(ended) == 8**3
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_what_is_interrupted_ends_between_two_pieces(monkeypatch, threads):
+    """On all threads, before the rest is done, and only while it is asked for."""
+    monkeypatch.setattr("drgs_blender.compute.threads.get_num_threads", lambda: threads)
+    done = np.zeros(2400, int)
+
+    def kernel(first, last):
+        done[first:last] += 1
+        if threading.current_thread() is not threading.main_thread():
+            time.sleep(0.05)  # else it may have done everything before it is asked
+
+    def check():
+        if done.sum() > 300:
+            raise InterruptedError
+
+    with interruptible(check):
+        with pytest.raises(InterruptedError):
+            over_range(kernel, len(done))
+        assert done.sum() < len(done)
+        with pytest.raises(InterruptedError):
+            checkpoint()
+        ended = done.copy()
+    time.sleep(0.1)
+    assert np.array_equal(done, ended), "no thread works on"
+    done[:] = 0
+    over_range(kernel, len(done))
+    checkpoint()
+    assert (done == 1).all()
+
+
+def test_who_is_interruptible_inside_is_so_outside_again():
+    asked = []
+    with interruptible(lambda: asked.append("outside")):
+        with interruptible(lambda: asked.append("inside")):
+            checkpoint()
+        checkpoint()
+    checkpoint()
+    assert asked == ["inside", "outside"]

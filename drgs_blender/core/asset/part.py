@@ -148,9 +148,20 @@ def _surfels_of(face: Array, part: Part, faces: int) -> tuple[Array, Array]:
     return rows[order], hangs_on[order]
 
 
-def taken(surfels: Surfels, rows: Array) -> Surfels:
-    """The surfels `rows`, (k,) int array."""
+def taken(surfels: Surfels, rows: Array | slice) -> Surfels:
+    """The surfels `rows`, (k,) int array or a slice."""
     names = ("centre", "scale", "rotation", "opacity", *_MATERIALS, "sh", *SURFEL_CHANNELS)
     values: dict[str, Any] = {name: getattr(surfels, name) for name in names}
     chosen: dict[str, Any] = {name: None if value is None else value[rows] for name, value in values.items()}
     return Surfels(**chosen, extras={name: values[rows] for name, values in surfels.extras.items()})
+
+
+def taken_binding(binding: Binding, rows: Array | slice) -> Binding:
+    """The binding of the surfels `rows`, (k,) int array or a slice."""
+    return Binding(binding.face[rows], binding.barycentric[rows], binding.offset[rows], binding.normal[rows])
+
+
+def with_surfels(asset: Asset, rows: Array | slice) -> Asset:
+    """The asset with the surfels `rows` alone, (k,) int array or a slice, in that order."""
+    binding = None if asset.binding is None else taken_binding(asset.binding, rows)
+    return replace(asset, surfels=taken(asset.surfels, rows), binding=binding)

@@ -18,7 +18,7 @@ by the one rasteriser: a splat's record says on which ellipse and at which depth
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -81,16 +81,6 @@ class CapturedObject:
     posed: PosedSurfels
     rest: Surfels
     mirrored: bool
-
-    def thinned(self, step: int) -> CapturedObject:
-        """Every `step`-th surfel, enlarged."""
-        rest, larger = self.rest, np.float32(np.sqrt(step))
-        few = {f.name: np.ascontiguousarray(getattr(self.posed, f.name)[::step]) for f in fields(PosedSurfels)}
-        few |= {name: few[name] * larger for name in ("tangent_u", "tangent_v")}
-        names = [f.name for f in fields(rest) if f.name != "extras" and getattr(rest, f.name) is not None]
-        own = {name: getattr(rest, name)[::step] for name in names}
-        extras = {name: values[::step] for name, values in rest.extras.items() if name == "thickness"}
-        return replace(self, posed=PosedSurfels(**few), rest=Surfels(**own, extras=extras))
 
 
 class RestSurfels(NamedTuple):

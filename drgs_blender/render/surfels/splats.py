@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compute.jit import inlined, njit, plain
-from ...compute.threads import ELEMENTS, over_range
+from ...compute.threads import ELEMENTS, checkpoint, over_range
 from ...core.asset.model import PosedSurfels
 from ...core.frame import Camera
 from ..camera import CLIP_END, CLIP_START, CX, CY, FILTER, FX, FY, LEAN, ORTHOGRAPHIC, POSITION, SUBPIXELS
@@ -153,9 +153,11 @@ def arranged(
     surface = np.empty((len(order), SPLAT), np.float32)
     over_range(_gather_surface, len(order), order, posed, surface, fewest=ELEMENTS)
     box = box.take(order, axis=0)  # faster than an index
+    checkpoint()
     tiles_x = (x1 - 1) // TILE - x0 // TILE + 1
     tiles_y = (y1 - 1) // TILE - y0 // TILE + 1
     start, listed = list_by_tile(box, x0 // TILE, y0 // TILE, tiles_x, tiles_y)
+    checkpoint()
     splats = Splats(
         screen.take(order, axis=0),
         surface,

@@ -1,0 +1,128 @@
+"""Level of detail in viewports: what is asked of the engine, what is said, and that final frames do not know of it."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+from scenes import new_world, part, read_exr
+from test_viewport import bits
+from test_viewport_blur import asked, converged
+
+pytestmark = pytest.mark.blender_api
+
+MOST = 1000
+
+
+@pytest.fixture
+def views():
+    module = part("addon.viewport.views")
+    module.forget()
+    yield module
+    module.stop()
+    part("addon.engine_link").stop()
+
+
+@pytest.fixture
+def dense(ball, ball_file):
+    """The ball with more surfels than the least limit."""
+    assets, containers = part("addon.assets"), part("drgs_blender.core.asset.container")
+    asset = containers.read_asset(ball_file)
+    parts = part("drgs_blender.core.asset.part")
+    many = np.repeat(np.arange(len(asset.surfels)), 1 + 4 * MOST // len(asset.surfels))
+    containers.write_asset(ball_file, parts.with_surfels(asset, many))
+    assets.forget()
+    new_world(bpy.context.scene)
+    return ball
+
+
+def until(condition):
+    end = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_settings_are_asked_for_and_limited(scene, ball, views):
+    settings, limit = scene.drgs, part("drgs_blender.core.level_of_detail").MOST_SURFELS
+    assert settings.level_of_detail == "AUTOMATIC"
+    assert asked(views, scene).most == limit
+    assert asked(views, scene) is None
+    settings.viewport_surfels = 5
+    assert asked(views, scene).most == settings.viewport_surfels == MOST, "the least that there is"
+    settings.level_of_detail = "FULL"
+    assert asked(views, scene).most == 0
+    settings.viewport_surfels = 2000
+    assert asked(views, scene) is None, "nothing of it counts then"
+
+
+def test_what_moves_has_fewer_surfels_and_says_so_until_it_rests(scene, dense, views, monkeypatch):
+    worker = part("addon.viewport.worker")
+    scene.drgs.viewport_surfels = MOST
+    monkeypatch.setattr(worker, "REST_SECONDS", 1e6)  # it does not rest yet
+    request = asked(views, scene)
+    until(lambda: views.worker.picture("view") is not None)
+    picture = views.worker.picture("view")
+    few, whole = picture.surfels
+    assert 0 < few <= MOST < whole and picture.fraction == 0.0
+    assert views.reduction("view") == f"{few:,} of {whole:,} surfels"
+    assert views.worker._next() is None, "all are not begun while it moves"
+    monkeypatch.setattr(worker, "REST_SECONDS", 0.0)
+    with views.worker._changed:
+        views.worker._changed.notify()
+    last = converged(views, request)
+    assert views.worker.picture("view").surfels == (whole, whole)
+    assert views.reduction("view") == ""
+    bpy.ops.render.render(write_still=True)
+    np.testing.assert_allclose(last, read_exr(scene.render.filepath, 64, 48), rtol=1e-3, atol=1e-4)
+
+
+def test_full_shows_all_from_the_first(scene, dense, views):
+    scene.drgs.level_of_detail = "FULL"
+    asked(views, scene)
+    until(lambda: views.worker.picture("view") is not None)
+    shown, whole = views.worker.picture("view").surfels
+    assert shown == whole > MOST and views.reduction("view") == ""
+
+
+def test_final_frames_are_the_same_to_the_last_bit(scene, dense, export):
+    pictures, frames = [], []
+    for level in ("AUTOMATIC", "FULL"):
+        scene.drgs.level_of_detail, scene.drgs.viewport_surfels = level, MOST
+        frames.append(bits(export()[0]))
+        bpy.ops.render.render(write_still=True)
+        pictures.append(read_exr(scene.render.filepath, 64, 48))
+    assert frames[0] == frames[1]
+    assert pictures[0].tobytes() == pictures[1].tobytes()
+
+
+def test_splats_are_no_more_than_the_limit_and_cover_as_much(dense, ball_file):
+    surfels, asset = part("addon.viewport.surfels"), part("addon.assets").load(ball_file)
+    count = len(asset.surfels)
+    rows, growth = surfels.first_rows(asset, 0.25)
+    assert len(rows) == len(growth) == round(0.25 * count) == len(np.unique(rows))
+    assert (asset.surfels.scale.prod(axis=1)[rows] * growth).sum() > asset.surfels.scale.prod(axis=1).sum()
+    again, _ = surfels.first_rows(asset, 0.25)
+    assert np.array_equal(rows, again)
+    assert surfels.first_rows(asset, 1.0) == (slice(None), 1.0)
+    assert len(surfels.first_rows(asset, 1e-9)[0]) == 1
+    twin = bpy.data.objects.new("Twin", dense.data)
+    twin.drgs.asset = dense.drgs.asset
+    bpy.context.scene.collection.objects.link(twin)
+    assert surfels._count(bpy.context.evaluated_depsgraph_get()) == 2 * count
+
+
+def test_header_says_what_splats_leave_out(scene, ball, monkeypatch):
+    surfels, header = part("addon.viewport.surfels"), part("addon.panels.header")
+    space = SimpleNamespace(shading=SimpleNamespace(type="SOLID"))
+    context = SimpleNamespace(scene=scene, space_data=space, area=SimpleNamespace(regions=[]))
+    monkeypatch.setattr(surfels, "reduction", "500 of 1,000 surfels")
+    for overlay, said in (("OFF", ""), ("SURFELS", "500 of 1,000 surfels"), ("LIT", "")):
+        scene.drgs.overlay = overlay
+        assert header._reduction(context) == said
+    space.shading.type = "RENDERED"
+    scene.drgs.overlay = "SURFELS"
+    assert header._reduction(context) == ""
