@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -19,8 +20,8 @@ from ..drgs_blender.core.errors import DeviceError, EngineError, UsageError
 from ..drgs_blender.core.frame import Frame
 from ..drgs_blender.ipc.child_process import clean_environment
 from ..drgs_blender.ipc.client import EngineClient, Passes, locate_engine
-from ..drgs_blender.ipc.locate import VARIABLE
-from . import engine_environment, messages, preferences
+from ..drgs_blender.ipc.locate import VARIABLE, bundled_command
+from . import engine_bundle, engine_environment, messages, preferences
 
 SET_UP = (
     f"Press Set Up Engine (sidebar > DR-GS), or set {VARIABLE} to a Python environment that has it, such as the folder "
@@ -59,20 +60,23 @@ def engine_folder(create: bool = False) -> Path:
 
 
 def command_line() -> list[str]:
-    """Command of the engine that DRGS_ENGINE or the preferences name, else of the one that was set up here.
+    """Command of the engine: see `origin`.
 
     Raises
     ------
     DeviceError
         There is none; says what to do.
     """
-    named = bpy.path.abspath(preferences.read("engine_python", ""))
-    if named or os.environ.get(VARIABLE):
-        return locate_engine(named or None)
-    folder = engine_folder()
-    found = engine_environment.state(folder)
-    if found == "ready":
-        return locate_engine(engine_environment.interpreter(folder))
+    source = origin()
+    if source == "named":
+        return locate_engine(bpy.path.abspath(preferences.read("engine_python", "")) or None)
+    if source == "environment":
+        return locate_engine(engine_environment.interpreter(engine_folder()))
+    if source == "bundle":
+        return bundled_command(sys.executable, engine_bundle.site_packages())
+    found = engine_environment.state(engine_folder())
+    if fault := engine_bundle.fault():
+        raise DeviceError("", f"The packages that came with the extension {fault}", f"Or: {SET_UP}")
     if found == "old":
         raise DeviceError("", "The DR-GS engine belongs to another version of the extension", UPDATE)
     if found == "partial":
@@ -81,6 +85,32 @@ def command_line() -> list[str]:
         return locate_engine()
     except DeviceError as error:
         raise DeviceError("", "The DR-GS engine is not set up", SET_UP) from error
+
+
+def origin() -> str:
+    """Which engine is used; the first of these that there is.
+
+    "named": what DRGS_ENGINE names, else the preferences, which may lead nowhere; "environment": the one that was set
+    up here, where it is ready; "bundle": Blender's Python with the packages that came with the extension; "": none.
+    """
+    if os.environ.get(VARIABLE) or preferences.read("engine_python", ""):
+        return "named"
+    if engine_environment.state(engine_folder()) == "ready":
+        return "environment"
+    return "bundle" if engine_bundle.wheels() and not engine_bundle.fault() else ""
+
+
+def described() -> str:
+    """Which engine is used, in a sentence for the preferences; "" where there is none."""
+    state = engine_environment.state(engine_folder())
+    left = {"old": "is of another version of the extension", "partial": "is not finished"}.get(state)
+    return {
+        "named": f"Used: the engine that {VARIABLE if os.environ.get(VARIABLE) else 'Engine Python'} names",
+        "environment": "Used: the environment that Set Up Engine made",
+        "bundle": "Used: the engine that came with the extension, in Blender's own Python"
+        + (f"; the environment of Set Up Engine {left}" if left else ""),
+        "": "",
+    }[origin()]
 
 
 def drgs_command() -> list[str]:
@@ -144,20 +174,19 @@ def check_installed(python: str, last: str) -> None:
 
 
 def lacks_reconstruction() -> bool:
-    """Whether the engine in use is the one that was set up here, without what reconstruction needs. Starts nothing."""
+    """Whether the engine in use is known to be without what reconstruction needs. Starts nothing."""
     return _lacks(engine_environment.RECONSTRUCT)
 
 
 def lacks_capture() -> bool:
-    """Whether it is the one that was set up here, without what finds cameras of photographs. Starts nothing."""
+    """Whether it is known to be without what finds cameras of photographs. Starts nothing."""
     return _lacks(engine_environment.CAPTURE)
 
 
 def _lacks(group: engine_environment.Group) -> bool:
-    named = preferences.read("engine_python", "") or os.environ.get(VARIABLE)
-    folder = engine_folder()
-    ready = not named and engine_environment.state(folder) == "ready"
-    return ready and engine_environment.needs_network(folder, group=group)
+    if (source := origin()) == "environment":
+        return engine_environment.needs_network(engine_folder(), group=group)
+    return source == "bundle"
 
 
 def problem() -> str:
@@ -170,7 +199,7 @@ def problem() -> str:
 
 
 def client() -> EngineClient:
-    """The client of the engine that DRGS_ENGINE or the preferences name; a change of them ends the old process.
+    """The client of the engine, see `origin`; a change of that ends the old process.
 
     Raises
     ------

@@ -225,7 +225,7 @@ def without_capture(subject: str, problem: str) -> UsageError:
         bpy.ops.drgs.engine_setup("INVOKE_DEFAULT", capture=True)
     return UsageError(
         subject,
-        f"{problem}, and the engine was set up without what finds them",
+        f"{problem}, and the engine is without what finds them",
         "Press Set Up Engine with Photographs without Cameras",
     )
 

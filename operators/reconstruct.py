@@ -42,7 +42,7 @@ class DRGS_OT_reconstruct(ReconstructFields, CommandOperator, bpy.types.Operator
         if engine_link.lacks_reconstruction():
             raise UsageError(
                 "Engine",
-                "was set up without PyTorch, which reconstruction needs",
+                "is without PyTorch, which reconstruction needs",
                 "Press Set Up Engine with Reconstruction from Photographs",
             )
         capture = Path(bpy.path.abspath(self.filepath)).absolute()

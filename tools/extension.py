@@ -3,8 +3,11 @@
 With it goes ``dist/index.json``: the folder, on any web server, is a repository for Preferences > Get Extensions.
 
     python tools/extension.py [--out dist/drgs-0.1.0.zip] [--kernels]
+    python tools/extension.py --platform linux-x64 --kernels     # or: all
 
-Pure standard library; the archive is the same bytes for the same sources.
+Without a platform the zip has no packages: *Set Up Engine* fetches them. With one there is a zip for each Python that
+Blender has had (`engine_wheels.SERIES`), which brings them as wheels. Pure standard library; the archives are the same
+bytes for the same sources.
 """
 
 from __future__ import annotations
@@ -16,10 +19,12 @@ import re
 import sys
 import tomllib
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import engine_wheels
+from engine_wheels import Series
 from kernel_archive import sources_digest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -37,6 +42,9 @@ CONTENTS = (
 SUFFIXES = {".py", ".typed", ".md", ".toml", ".json", ".js"}
 #: What ``tools/kernels.py build`` makes; a source checkout has none.
 KERNELS = Path("drgs_blender/compute/kernels")
+MANIFEST = "blender_manifest.toml"
+#: Blender's systems -> Python's, as in names of archives of kernels.
+_SYSTEMS = {"linux": "linux", "windows": "win32", "macos": "darwin"}
 REQUIRED = {
     "schema_version": str,
     "id": str,
@@ -101,13 +109,40 @@ def faults(manifest: dict[str, Any], version: str) -> list[str]:
             found.append(f"the reason of permission {name!r} must have 1 to 64 characters and no final punctuation")
     if {"paths", "paths_exclude_pattern"} <= set(manifest.get("build", {})):
         found.append("[build] may have paths or paths_exclude_pattern, not both")
-    if "wheels" in manifest:
-        found.append("wheels are not used: the engine is an environment of its own")
+    platforms = manifest.get("platforms", [])
+    for wheel in manifest.get("wheels", []):
+        if len(platforms) != 1 or not _fits(wheel, platforms[0]):
+            found.append(f"wheel {wheel} is not of the platform {', '.join(platforms)} alone")
     return found
 
 
-def kernels(root: Path = ROOT) -> list[Path]:
+def _fits(wheel: str, platform: str) -> bool:
+    """Whether a wheel is for a platform of Blender's, by its name."""
+    tags = wheel.removesuffix(".whl").rpartition("-")[2].split(".")
+    system, _, machine = platform.partition("-")
+    begin = {"linux": "manylinux", "windows": "win_", "macos": "macosx_"}[system]
+    ends = ("_amd64" if system == "windows" else "_x86_64",) if machine == "x64" else ("_arm64", "_universal2")
+    return tags == ["any"] or all(tag.startswith(begin) and tag.endswith(ends) for tag in tags)
+
+
+def manifest_text(text: str, platform: str, series: Series, names: Iterable[str]) -> str:
+    """The manifest of a zip that brings wheels: for one platform, and the Blenders of one Python.
+
+    Parameters
+    ----------
+    text : blender_manifest.toml
+    names : files of the wheels, which the zip has in its folder ``wheels``
+    """
+    end = f'blender_version_max = "{series.end}"\n' * bool(series.end)
+    listed = "".join(f'  "./wheels/{name}",\n' for name in sorted(names))
+    text = re.sub(r"^blender_version_min = .*\n", f'blender_version_min = "{series.begin}"\n{end}', text, flags=re.M)
+    return re.sub(r"^platforms = .*\n", f'platforms = ["{platform}"]\nwheels = [\n{listed}]\n', text, flags=re.M)
+
+
+def kernels(root: Path = ROOT, platform: str | None = None) -> list[Path]:
     """The archives of compiled kernels and what belongs to them, sorted, relative to `root`.
+
+    Those of other systems than that of `platform` are left out, where that is given.
 
     Raises
     ------
@@ -120,7 +155,9 @@ def kernels(root: Path = ROOT) -> list[Path]:
         raise ValueError(f"{KERNELS} holds no kernels: run tools/kernels.py build") from None
     if made_from != sources_digest(root / "drgs_blender"):
         raise ValueError(f"{KERNELS} was made from other sources: run tools/kernels.py build")
-    return [path.relative_to(root) for path in sorted((root / KERNELS).iterdir()) if path.suffix in {".zip", ".json"}]
+    found = [path.relative_to(root) for path in sorted((root / KERNELS).iterdir()) if path.suffix in {".zip", ".json"}]
+    system = "" if platform is None else _SYSTEMS[platform.partition("-")[0]]
+    return [path for path in found if path.suffix == ".json" or path.name.startswith(system)]
 
 
 def members(root: Path = ROOT) -> Iterator[Path]:
@@ -137,13 +174,37 @@ def members(root: Path = ROOT) -> Iterator[Path]:
                     yield inside
 
 
-def build(out: Path | None = None, root: Path = ROOT, with_kernels: bool = False) -> Path:
-    """Check the manifest and write the zip atomically; returns its path. Raises ValueError naming every fault."""
-    manifest = tomllib.loads((root / "blender_manifest.toml").read_text(encoding="utf-8"))
+def build(
+    out: Path | None = None,
+    root: Path = ROOT,
+    with_kernels: bool = False,
+    bundle: tuple[str, Series] | None = None,
+) -> Path:
+    """Check the manifest and write the zip atomically; returns its path.
+
+    Parameters
+    ----------
+    bundle : platform and Blenders whose packages the zip brings as wheels, which are fetched where they are not here
+
+    Raises
+    ------
+    ValueError
+        Naming every fault.
+    """
+    text = (root / MANIFEST).read_text(encoding="utf-8")
+    packages = (
+        []
+        if bundle is None
+        else [engine_wheels.slim(path) for path in engine_wheels.fetch(bundle[0], bundle[1].python)]
+    )
+    if bundle is not None:
+        text = manifest_text(text, *bundle, (path.name for path in packages))
+    manifest = tomllib.loads(text)
     if wrong := faults(manifest, project_version(root)):
-        raise ValueError("blender_manifest.toml: " + "; ".join(wrong))
-    out = out or root / "dist" / f"{manifest['id']}-{manifest['version']}.zip"
-    names = [*members(root), *(kernels(root) if with_kernels else ())]
+        raise ValueError(f"{MANIFEST}: " + "; ".join(wrong))
+    part = "" if bundle is None else f"-{bundle[0]}-blender-{bundle[1].begin.removesuffix('.0')}"
+    out = out or root / "dist" / f"{manifest['id']}-{manifest['version']}{part}.zip"
+    names = [*members(root), *(kernels(root, bundle and bundle[0]) if with_kernels else ())]
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_name(out.name + ".part")
     with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -151,28 +212,43 @@ def build(out: Path | None = None, root: Path = ROOT, with_kernels: bool = False
             entry = zipfile.ZipInfo(name.as_posix(), date_time=(2025, 1, 1, 0, 0, 0))
             entry.external_attr = 0o644 << 16
             entry.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(entry, (root / name).read_bytes())
+            archive.writestr(entry, text if name.name == MANIFEST else (root / name).read_bytes())
+        for path in packages:
+            archive.write(path, f"wheels/{path.name}", zipfile.ZIP_STORED)
     partial.replace(out)
     return out
 
 
-def write_index(archive: Path, root: Path = ROOT) -> Path:
-    """Write the index of a static repository that holds `archive`, beside it; returns its path.
+def write_index(archives: Sequence[Path]) -> Path:
+    """Write the index of a static repository that holds `archives`, beside them; returns its path.
 
     The same as ``blender --command extension server-generate`` makes.
     """
-    manifest = tomllib.loads((root / "blender_manifest.toml").read_text(encoding="utf-8"))
-    data = archive.read_bytes()
-    entry = {key: manifest[key] for key in LISTED if key in manifest} | {
-        "archive_url": f"./{archive.name}",
-        "archive_size": len(data),
-        "archive_hash": f"sha256:{hashlib.sha256(data).hexdigest()}",
-    }
-    path = archive.with_name("index.json")
+    entries = []
+    for path in archives:
+        with zipfile.ZipFile(path) as archive:
+            manifest = tomllib.loads(archive.read(MANIFEST).decode("utf-8"))
+        data = path.read_bytes()
+        entry = {key: manifest[key] for key in LISTED if key in manifest} | {
+            "archive_url": f"./{path.name}",
+            "archive_size": len(data),
+            "archive_hash": f"sha256:{hashlib.sha256(data).hexdigest()}",
+        }
+        if names := manifest.get("wheels"):
+            entry["python_versions"] = sorted({_python(name) for name in names} - {"3"}) or ["3"]
+        entries.append(entry)
+    path = archives[0].with_name("index.json")
     partial = path.with_name(path.name + ".part")
-    partial.write_text(json.dumps({"version": "v1", "blocklist": [], "data": [entry]}, indent=2), encoding="utf-8")
+    partial.write_text(json.dumps({"version": "v1", "blocklist": [], "data": entries}, indent=2), encoding="utf-8")
     partial.replace(path)
     return path
+
+
+def _python(wheel: str) -> str:
+    """The Python of a wheel as an index has it: "3.11", or "3" for all."""
+    tag, abi = wheel.split("-")[-3:-1]
+    found = re.fullmatch(r"cp(\d)(\d+)", tag)
+    return f"{found[1]}.{found[2]}" if found and not abi.startswith("abi") else "3"
 
 
 def main() -> int:
@@ -180,13 +256,25 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, help="the zip to write (default: dist/drgs-VERSION.zip)")
     parser.add_argument("--kernels", action="store_true", help="with the compiled kernels of tools/kernels.py build")
+    parser.add_argument(
+        "--platform",
+        action="append",
+        choices=("all", *engine_wheels.PLATFORMS),
+        default=[],
+        help="with the engine's packages for a platform, in a zip for each Python of Blender's (repeatable)",
+    )
     options = parser.parse_args()
+    platforms = list(engine_wheels.PLATFORMS) if "all" in options.platform else options.platform
+    bundles: list[tuple[str, Series] | None] = [(name, series) for name in platforms for series in engine_wheels.SERIES]
+    if options.out is not None and bundles:
+        parser.error("--out names one zip, and --platform makes several: leave it out")
     try:
-        out = options.out
-        archive = build(out, with_kernels=options.kernels)
-        print(archive)
-        if out is None:  # another folder may have an index of its own
-            print(write_index(archive))
+        archives = []
+        for bundle in bundles or [None]:
+            archives.append(build(options.out, with_kernels=options.kernels, bundle=bundle))
+            print(f"{archives[-1]}, {archives[-1].stat().st_size / 1e6:.1f} MB", flush=True)
+        if options.out is None:  # another folder may have an index of its own
+            print(write_index(archives))
     except (OSError, ValueError) as error:
         print(f"extension.py: {error}", file=sys.stderr)
         return 1

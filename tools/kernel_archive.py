@@ -24,11 +24,14 @@ VERSIONS = "versions.json"
 _DATE = (2025, 1, 1, 0, 0, 0)
 #: Asked of an interpreter.
 _FACTS = """
-import json, sys, numba, llvmlite
+import importlib.util, json, sys, numba, numpy, llvmlite
 from drgs_blender.compute import closure
 versions = {"numba": numba.__version__, "llvmlite": llvmlite.__version__}
-print(json.dumps([sys.implementation.cache_tag, closure.shipped_index(), versions]))
+name = f"{sys.implementation.cache_tag}-numpy{numpy.__version__.partition('.')[0]}"
+print(json.dumps([name, closure.shipped_index(), importlib.util.find_spec("torch") is not None, versions]))
 """
+#: The job whose kernels need PyTorch.
+_RECONSTRUCT = "reconstruct"
 #: What is still to be compiled, and what cannot be.
 _NOT_COMPILED = """
 import json, sys
@@ -93,20 +96,20 @@ def build(targets: Sequence[str], pythons: Sequence[str], out: Path = FOLDER, jo
         copy = Path(temporary) / "sources"  # what is edited meanwhile is no part of it
         shutil.copytree(PACKAGE, copy / PACKAGE.name, ignore=shutil.ignore_patterns("__pycache__", FOLDER.name))
         for name in targets or known:
-            for python, (tag, index) in asked.items():
-                print(f"{name}, {tag}", flush=True)
+            for python, (tag, index, has_torch) in asked.items():
+                print(f"{name}, {tag}{'' if has_torch else ': no PyTorch, so nothing of reconstruction'}", flush=True)
                 folder = Path(temporary) / name / tag
                 target = {"NUMBA_CPU_NAME": known[name].cpu, "NUMBA_CPU_FEATURES": known[name].features}
-                _compile(python, copy, folder, target, jobs)
+                _compile(python, copy, folder, target, [j for j in jobs if has_torch or j != _RECONSTRUCT])
                 sources[index] = next(folder.glob("sources-*.json")).read_bytes()
             made.append((shipped.archive_name(name), _pack(Path(temporary) / name)))
         digest = sources_digest(copy / PACKAGE.name)
-    facts: dict[str, object] = {"pythons": sorted(tag for tag, _ in asked.values()), **versions, "sources": digest}
+    facts: dict[str, object] = {"pythons": sorted(tag for tag, *_ in asked.values()), **versions, "sources": digest}
     return _write(out, made, sources, facts)
 
 
-def _facts(pythons: Sequence[str]) -> tuple[dict[str, tuple[str, str]], dict[str, str]]:
-    """Interpreter -> tag and name of its index of sources; and the versions that they all have."""
+def _facts(pythons: Sequence[str]) -> tuple[dict[str, tuple[str, str, bool]], dict[str, str]]:
+    """Interpreter -> its name, that of its index of sources, whether it has PyTorch; and the versions of all."""
     asked, found = {}, {}
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     for python in (os.path.abspath(shutil.which(name) or name) for name in pythons):
@@ -114,7 +117,7 @@ def _facts(pythons: Sequence[str]) -> tuple[dict[str, tuple[str, str]], dict[str
         if answer.returncode:
             raise BuildError(f"{python} lacks the engine's packages: {answer.stderr.strip().splitlines()[-1]}")
         *names, found[python] = json.loads(answer.stdout)
-        asked[python] = names[0], names[1]
+        asked[python] = names[0], names[1], names[2]
     if len({json.dumps(versions) for versions in found.values()}) != 1:
         raise BuildError(f"the interpreters have different versions, a release brings one: {found}")
     return asked, next(iter(found.values()))

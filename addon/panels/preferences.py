@@ -17,8 +17,8 @@ class DrgsPreferences(bpy.types.AddonPreferences):
     engine_python: StringProperty(
         name="Engine Python",
         description=(
-            "Python interpreter of the environment in which the DR-GS engine is installed. "
-            "Empty: the one that Set Up Engine made. The variable DRGS_ENGINE comes first"
+            "Python interpreter of the environment in which the DR-GS engine is installed. Empty: the one that Set Up "
+            "Engine made, else the engine that came with the extension. The variable DRGS_ENGINE comes first"
         ),
         subtype="FILE_PATH",
     )

@@ -172,7 +172,7 @@ def engine(args: argparse.Namespace) -> str:
     """Start an engine process as the extension does, and shake hands."""
     from ..ipc.client import EngineClient, engine_command, locate_engine
 
-    command = locate_engine() if os.environ.get("DRGS_ENGINE") else engine_command(sys.executable)
+    command = locate_engine() if os.environ.get("DRGS_ENGINE") else engine_command()
     with EngineClient(command) as client:
         client.start()
         return f"answers, {command[0]}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import sys
 from collections.abc import Generator
 from pathlib import Path
 from types import TracebackType
@@ -55,7 +54,7 @@ class Machine:
 
     def engine(self, memory_mb: int | None = None) -> EngineClient:
         """The engine, which may take `memory_mb`; the same one as before where that limit is the same."""
-        command = engine_command(sys.executable) + ([OPTION, str(memory_mb)] if memory_mb else [])
+        command = engine_command() + ([OPTION, str(memory_mb)] if memory_mb else [])
         if self._engine is not None and self._engine.command != command:
             self._engine.close()
             self._engine = None

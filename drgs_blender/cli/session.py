@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..core import own_python
 from ..core.asset.archive import replace_file
 from ..core.errors import EXIT_INTERRUPTED, EXIT_TERMINATED, EngineError, UsageError
 from ..core.file_lock import FileLock
@@ -70,7 +71,8 @@ def start(folder: Path, idle: int) -> int:
     with FileLock(folder / "lock") as lock:
         if not acquire(lock, folder):
             raise UsageError(f"session {folder}", "is running", "Stop it, or choose another folder")
-    command = [sys.executable, "-m", "drgs_blender.cli.main", "session", "serve", str(folder), f"--idle={idle}"]
+    module = "drgs_blender.cli.main"
+    command = [*own_python.command(), "-m", module, "session", "serve", str(folder), f"--idle={idle}"]
     # It inherits no stream: the caller of this command would wait for its end.
     log = folder / "log"
     apart = {"creationflags": 0x208} if os.name == "nt" else {"start_new_session": True}  # detached, in a group

@@ -165,13 +165,15 @@ class KernelCache(NullCache):
             return None
         cells = self.function.__closure__ or ()
         triple, *target = codegen.magic_tuple()
+        # Machine code calls nothing of NumPy. What it keeps of dtypes is read by all versions of one major number.
+        numpy = np.__version__.partition(".")[0]
         facts = (
             *(self.kind, self.function.__module__, self.function.__qualname__, arguments, self._closure),
             sorted((name, repr(value)) for name, value in self.options.items()),
             *_code_facts(self.function),
             hashlib.sha256(dumps(tuple(cell.cell_contents for cell in cells))).hexdigest() if cells else "",
             re.sub(r"(darwin|macosx?)[\d.]+", r"\1", triple),  # each update of macOS has another, with the same code
-            *(*target, numba.__version__, llvmlite.__version__, np.__version__, sys.implementation.cache_tag),
+            *(*target, numba.__version__, llvmlite.__version__, numpy, sys.implementation.cache_tag),
             [(name, getattr(numba.config, name)) for name in _CONFIG],
         )
         digest = hashlib.sha256("\0".join(map(str, facts)).encode()).hexdigest()

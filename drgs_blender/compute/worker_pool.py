@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from typing import Any
 
+from ..core import own_python
 from ..core.memory import available_memory
 from . import closure
 from .folders import cache_folder
@@ -206,7 +207,7 @@ def start_process() -> subprocess.Popen[str]:
     flag = "-I" if sys.flags.isolated else "-P"
     paths = [str(closure.PACKAGE.parent), *filter(None, [environment.get("PYTHONPATH")])]
     environment["PYTHONPATH"] = os.pathsep.join(paths)
-    command = [sys.executable, flag, "-m", "drgs_blender.compute.worker"]
+    command = [*own_python.command(flag), "-m", "drgs_blender.compute.worker"]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, encoding="utf-8")
 
 

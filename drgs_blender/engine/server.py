@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from ..compute.folders import leave_temporary
+from ..core import own_python
 from ..core.errors import EXIT_INTERNAL, EXIT_OK, EXIT_VERSION, Cancelled, DeviceError, DrgsError
 from ..core.loading import many_imports
 from ..core.phases import PREPARING, STARTING, is_counted
@@ -162,7 +163,8 @@ class Server:
                 from . import jit_events
                 from .session import Session
             except ImportError as error:
-                remedy = "Install DR-GS again in this environment"
+                again = "Disable the extension, enable it again so that Blender unpacks it, or press Set Up Engine"
+                remedy = again if own_python.bundled else "Install DR-GS again in this environment"
                 raise DeviceError(sys.executable, f"lacks a part of the engine ({error})", remedy) from error
             jit_events.watch(self._note_preparing)
             self.session = Session()

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..core import own_python
 from ..core.asset.archive import first_reason
 from ..core.asset.tensors import decode, encode
 from ..core.errors import AssetError, DeviceError, WriteError
@@ -127,7 +128,7 @@ def read_in_subprocess(
         # The package as it is here, wherever that comes from.
         code = f"import sys; sys.path.insert(0, sys.argv[1]); from {module} import main; main(*sys.argv[2:])"
         arguments = Path(__file__).resolve().parents[2], path.absolute(), target, _MEMORY + _RATIO * size, most
-        command = [sys.executable, "-c", code, *map(str, arguments)]
+        command = [*own_python.command(), "-c", code, *map(str, arguments)]
         try:
             done = subprocess.run(command, capture_output=True, timeout=patience * most, stdin=subprocess.DEVNULL)
         except subprocess.TimeoutExpired as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from ..core import own_python
 from ..core.errors import DeviceError
 
 #: Environment variable that names the engine: farms start Blender with factory settings.
@@ -30,9 +31,19 @@ def _interpreter(place: Path) -> Path | None:
     return place if os.access(place, os.X_OK) else None
 
 
-def engine_command(interpreter: str | os.PathLike[str]) -> list[str]:
-    """Command that runs the engine on `interpreter`, which has DR-GS installed; nothing of this process leaks in."""
-    return [os.fspath(interpreter), "-I", "-m", "drgs_blender.engine"]
+def engine_command(interpreter: str | os.PathLike[str] | None = None) -> list[str]:
+    """Command that runs the engine on `interpreter`, which has DR-GS installed, or on this very Python.
+
+    No setting of this process leaks in.
+    """
+    python = own_python.command("-I") if interpreter is None else [os.fspath(interpreter), "-I"]
+    return [*python, "-m", "drgs_blender.engine"]
+
+
+def bundled_command(python: str | os.PathLike[str], site_packages: str | os.PathLike[str]) -> list[str]:
+    """Command that runs the engine of this very package on `python`, with the packages of a folder."""
+    script = Path(__file__).resolve().parents[1] / "cli" / "bundled.py"
+    return [os.fspath(python), "-I", str(script), os.fspath(site_packages), "-m", "drgs_blender.engine"]
 
 
 def locate_engine(preference: str | os.PathLike[str] | None = None) -> list[str]:

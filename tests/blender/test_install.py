@@ -61,7 +61,7 @@ def test_zip_is_reproducible_and_equals_what_blenders_builder_takes(tmp_path):
 
 def test_the_index_is_that_of_blenders_own_repositories(tmp_path):
     archive = extension.build(tmp_path / "drgs.zip")
-    ours = json.loads(extension.write_index(archive).read_text(encoding="utf-8"))
+    ours = json.loads(extension.write_index([archive]).read_text(encoding="utf-8"))
     (tmp_path / "index.json").unlink()
     (builder,) = Path(bpy.utils.resource_path("LOCAL")).glob("scripts/addons_core/bl_pkg/cli/blender_ext.py")
     command = [sys.executable, str(builder), "server-generate", "--repo-dir", str(tmp_path)]

@@ -35,7 +35,8 @@ def energy_tables() -> tuple[Array, Array]:
         _, above, o = reflected(*normals)
         rows.append(np.where(above, shadowed(normals[0], o, alpha), 0).mean(-1))
     energy, mu = np.concatenate(rows), grid_of(_NODES)
-    mean = np.trapezoid(2 * mu[:, None] * energy, mu, axis=0)
+    weighted = 2 * mu[:, None] * energy
+    mean = (np.diff(mu)[:, None] * (weighted[1:] + weighted[:-1]) / 2.0).sum(axis=0)  # NumPy 1 has no trapezoid
     return np.clip(energy, 0, 1).astype(np.float32), np.clip(mean, 0, 1).astype(np.float32)
 
 

@@ -1,0 +1,61 @@
+"""The packages that came with the extension, by which Blender's own Python runs the engine.
+
+Blender unpacks the wheels of its manifest into a folder of extensions' packages. The zip for developers has none.
+Standard library only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+#: The extension's folder.
+SOURCE = Path(__file__).resolve().parents[1]
+_PYTHON = re.compile(r"cp(\d)(\d+)$")
+
+
+@functools.cache
+def wheels(source: Path = SOURCE) -> tuple[str, ...]:
+    """File names of the wheels that the extension's manifest names; none where the zip brought none."""
+    manifest = tomllib.loads((source / "blender_manifest.toml").read_text(encoding="utf-8"))
+    return tuple(path.rpartition("/")[2] for path in manifest.get("wheels", ()))
+
+
+def fault(source: Path = SOURCE) -> str:
+    """What the packages lack, "" where they are complete or the zip brought none. Reads names of folders alone."""
+    names = wheels(source)
+    unpacked = _unpacked() if names else {}
+    for name in names:
+        distribution, version, *_, tag, abi, _ = name.removesuffix(".whl").split("-")
+        made = _PYTHON.match(tag)
+        if made and not abi.startswith("abi") and (int(made[1]), int(made[2])) != sys.version_info[:2]:
+            ours = ".".join(map(str, sys.version_info[:2]))
+            return f"are for Python {made[1]}.{made[2]}, and this Blender has {ours}: get the zip for this Blender"
+        if not any(distribution.lower() in found for found in unpacked.values()):
+            return f"lack {distribution} {version}: disable and enable the extension, and Blender unpacks it again"
+    return ""
+
+
+def site_packages(source: Path = SOURCE) -> Path:
+    """The folder into which Blender unpacked them; FileNotFoundError where there is none."""
+    # That of extensions is the last: Blender's own may have packages of the same names
+    for folder, found in reversed(_unpacked().items()):
+        if any(name.partition("-")[0].lower() in found for name in wheels(source)):
+            return Path(folder)
+    raise FileNotFoundError("Blender has not unpacked the packages of the extension")
+
+
+def _unpacked() -> dict[str, set[str]]:
+    """Folders of packages -> names of those in them, of any version: another extension may have a newer one."""
+    found = {}
+    for folder in sys.path:
+        if folder.endswith("site-packages"):
+            with contextlib.suppress(OSError):
+                names = os.listdir(folder)
+                found[folder] = {n.partition("-")[0].lower() for n in names if n.endswith(".dist-info")}
+    return found

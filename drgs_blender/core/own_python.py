@@ -1,0 +1,13 @@
+"""This Python as a command: what a process starts of itself has the packages that the process has."""
+
+from __future__ import annotations
+
+import sys
+
+#: Set by `cli/bundled.py`, where that began this process: all that stands before ``-m`` or ``-c``.
+bundled: list[str] = []
+
+
+def command(*flags: str) -> list[str]:
+    """What stands before ``-m`` or ``-c``; `flags` are for a Python that finds the packages by itself."""
+    return list(bundled) or [sys.executable, *flags]
