@@ -120,7 +120,9 @@ def test_a_picture_that_is_refined_says_it_too(scene, monkeypatch):
     frame = SimpleNamespace(settings=SimpleNamespace(sample_count=8))
     picture = SimpleNamespace(request=SimpleNamespace(frame=frame), fraction=0.5)
     phase = [("Rendering", 0.5)]
-    worker = SimpleNamespace(state=lambda name: ("", ""), progress=lambda name: phase[0], names=lambda: ["a"])
+    worker = SimpleNamespace(
+        state=lambda name: ("", ""), progress=lambda name: phase[0], names=lambda: ["a"], picture=lambda name: None
+    )
     monkeypatch.setattr(views, "worker", worker)
     monkeypatch.setattr(views, "_viewports", {"a": views.ViewportState(picture=picture)})
     assert views.status("a") == ("Sample 4/8", "") and views.preparation() == ("", 0.0)
