@@ -29,8 +29,9 @@ logger = logging.getLogger(__name__)
 
 Array = np.ndarray
 
-#: Seconds of work after which an engine that was asked to stop is killed: later, and before its first picture.
-OBEY_SECONDS, OBEY_SECONDS_COLD = 2.0, 15.0
+#: Seconds after which an engine that was asked to stop is killed: later, and before its first picture. It asks every
+#: second or more often also on a busy machine with millions of surfels; to start another one takes longer than to wait.
+OBEY_SECONDS, OBEY_SECONDS_COLD = 5.0, 15.0
 
 _LOG_LINES = 500
 _LOG_LINE = 2000
@@ -77,6 +78,7 @@ class Child:
         self.warm = False
         self.idle = threading.Event()
         self.idle.set()
+        self._asked = 0  # the latest request
         self.link: Link | None = None
         self._outbox: queue.SimpleQueue[tuple[Any, dict[str, Array]] | None] = queue.SimpleQueue()
         self._log: deque[str] = deque(maxlen=_LOG_LINES)
@@ -132,18 +134,19 @@ class Child:
 
     def request(self, message: Any, arrays: dict[str, Array] | None = None) -> None:
         """Send a message that will be answered."""
+        self._asked = message.id
         self.idle.clear()
         self.send(message, arrays)
 
     def cancel(self, request: int) -> None:
-        """Ask the engine to stop; kill it when it has not within `OBEY_SECONDS` of work.
+        """Ask the engine to stop; kill it when it has not within `OBEY_SECONDS`.
 
         Compiling kernels does not count, and the first picture may take longer: both happen once, cannot be
         interrupted, and would otherwise never be done by a viewport that cancels with every movement of the mouse.
         """
         self.send(protocol.Cancel(request))
         patience = OBEY_SECONDS if self.warm else OBEY_SECONDS_COLD
-        threading.Thread(target=self._enforce, args=(patience,), name="drgs-cancel", daemon=True).start()
+        threading.Thread(target=self._enforce, args=(request, patience), name="drgs-cancel", daemon=True).start()
 
     def kill(self) -> None:
         """End the process at once."""
@@ -261,9 +264,9 @@ class Child:
             if rest:
                 self._log.append(rest.decode("utf-8", "replace"))
 
-    def _enforce(self, patience: float) -> None:
+    def _enforce(self, request: int, patience: float) -> None:
         tick = 0.05
-        while not self.idle.wait(tick):
+        while not self.idle.wait(tick) and self._asked == request:  # a later one was not cancelled
             patience -= 0.0 if self.preparing else tick
             if patience <= 0:
                 logger.warning("the engine did not stop when it was asked to; it is ended")

@@ -183,7 +183,6 @@ class EngineClient:
 
         Until it has samples, it shows at most `most` surfels, or all with 0, see `Session.view`.
 
-
         ``statistics["view.fraction"]`` is the part of all samples that the picture has. A coarse picture has fewer
         pixels than the window of the frame's camera, which they cover evenly. A new engine that does not know the
         viewport begins it again.

@@ -138,6 +138,39 @@ def test_engine_that_does_not_obey_is_ended(client, make_frame, expected):
     assert client.pid != pid
 
 
+#: An engine whose later pictures take longer than one may that was asked to stop.
+SLOW = """
+import time
+from drgs_blender.engine.session import Session
+original = Session.render
+
+def render(self, frame, progress=None, cancelled=None):
+    time.sleep(0.8 * frame.noise_index)
+    return original(self, frame, progress, cancelled)
+
+Session.render = render
+"""
+
+
+def test_a_cancel_that_comes_too_late_ends_no_later_request(make_client, make_frame, asset_path, monkeypatch):
+    """The answer was on its way; whoever looks whether the engine obeys may see the next request begun."""
+    monkeypatch.setattr("drgs_blender.ipc.child_process.OBEY_SECONDS", 0.3)
+    client, frame = make_client(SLOW), make_frame()
+    client.load_asset(str(asset_path))
+    frame.noise_index = 0
+    client.render(frame)
+    frame.noise_index, pid, answered, asked = 1, client.pid, client._number, []
+
+    def stop() -> bool:
+        if not asked:
+            client._child.cancel(answered)
+        asked.append(True)
+        return False
+
+    client.render(frame, None, stop)
+    assert asked and client.pid == pid
+
+
 @pytest.mark.slow
 @posix
 def test_killed_engine_is_replaced_and_the_picture_is_the_same(client, make_frame, expected):
