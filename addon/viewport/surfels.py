@@ -6,8 +6,8 @@ points are seen before them.
 
 from __future__ import annotations
 
-import contextlib
 from functools import partial
+from typing import Any
 
 import bpy
 import gpu
@@ -22,7 +22,7 @@ from .. import assets, mesh_arrays, surfel_points
 from ..export.export_cache import ExportCache, uid
 from ..export.objects import appearance_of
 from ..level_of_detail import most_surfels
-from . import draw
+from . import draw, views
 
 Array = np.ndarray
 
@@ -33,14 +33,20 @@ _KEPT_ORDERS = 8
 cache = ExportCache()
 #: Orders of surfels, by the place of the array of their centres, which they keep.
 _orders: dict[int, tuple[Array, Detail]] = {}
-#: What is shown in place of all surfels, in words; "" where all are.
-reduction = ""
+#: What viewports show in place of all surfels, in words, by `views.name_of`.
+_reductions: dict[str, str] = {}
 
 
 def forget() -> None:
     """Drop everything."""
     cache.clear()
     _orders.clear()
+    _reductions.clear()
+
+
+def reduction(name: str) -> str:
+    """What a viewport shows in place of all surfels, in words; "" where it shows them."""
+    return _reductions.get(name, "")
 
 
 def posed_centres(asset: Asset, vertices: Array, rows: Array | slice = slice(None)) -> Array:
@@ -65,23 +71,14 @@ def posed_centres(asset: Asset, vertices: Array, rows: Array | slice = slice(Non
 
 def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
     """Draw the surfels of all visible DR-GS objects, no more than the scene's limit."""
-    global reduction
     region, rv3d = context.region, context.region_data
-    most, whole = most_surfels(depsgraph.scene), _count(depsgraph)
-    share = min(1.0, most / whole) if most and whole else 1.0
-    told = f"{round(whole * share):,} of {whole:,} surfels" if share < 1.0 else ""
-    if told != reduction:
-        reduction = told
-        for other in context.area.regions:
-            other.tag_redraw()  # the header says it
+    share = _share(context, depsgraph)
     for instance in depsgraph.object_instances:
         obj = instance.object
         if not instance.show_self or not assets.is_drgs(obj):
             continue
-        look = obj.drgs.show_captured, obj.drgs.adjustment.values(), surfel_points.state_of(obj), share
-        key = "object", uid(obj), obj.data.as_pointer(), obj.mode, look
-        owners = uid(obj), uid(obj.data), uid(obj.original.drgs.surfel_points)
-        found = cache.get(key, owners, partial(_batch, obj, depsgraph, share))
+        key, owners = _state(obj)
+        found = cache.get(("discs", *key, share), owners, partial(_batch, obj, depsgraph, share))
         if found is None:
             continue
         batch, size = found
@@ -94,6 +91,32 @@ def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
             transform = set_back(rv3d.window_matrix, depth, size * matrix.median_scale) @ transform
         draw.discs(batch, transform, scale, rv3d.is_perspective)
     cache.end()
+
+
+def _share(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> float:
+    """The part of all surfels that the scene's limit allows, which the viewport's header says."""
+    name, most, whole = views.name_of(context.region), most_surfels(depsgraph.scene), number(depsgraph)
+    share = most / whole if 0 < most < whole else 1.0
+    told = f"{most:,} of {whole:,} surfels" if share < 1.0 else ""
+    if told != reduction(name):
+        for other in context.area.regions:
+            if other.type == "HEADER":
+                other.tag_redraw()
+    _reductions[name] = told
+    return share
+
+
+def number(depsgraph: bpy.types.Depsgraph) -> int:
+    """Surfels of all visible objects, as far as these were not cut; those of instances once more."""
+    shown = (i.object for i in depsgraph.object_instances if i.show_self and assets.is_drgs(i.object))
+    return sum(0 if (found := _shown(obj, depsgraph)) is None else len(found[0].surfels) for obj in shown)
+
+
+def _state(obj: bpy.types.Object) -> tuple[tuple[Any, ...], tuple[int, ...]]:
+    """On what the surfels of an object depend: as the cache's key, and its owners."""
+    look = obj.drgs.show_captured, obj.drgs.adjustment.values(), surfel_points.state_of(obj)
+    owners = uid(obj), uid(obj.data), uid(obj.original.drgs.surfel_points)
+    return (uid(obj), obj.data.as_pointer(), obj.mode, look), owners
 
 
 def is_edited(obj: bpy.types.Object) -> bool:
@@ -123,25 +146,27 @@ def set_back(window: Matrix, depth: float, distance: float) -> Matrix:
     return moved
 
 
-def _count(depsgraph: bpy.types.Depsgraph) -> int:
-    """Surfels of all visible objects, those of instances once more."""
-    total = 0
-    for instance in depsgraph.object_instances:
-        if instance.show_self and assets.is_drgs(instance.object):
-            with contextlib.suppress(DrgsError):  # reported when the object is rendered
-                total += len(assets.load(assets.file_of(instance.object)).surfels)
-    return total
+def _shown(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[Asset, Array] | None:
+    """`shown_asset` of an object, read once; None where it has none."""
+
+    def read() -> tuple[Asset, Array] | None:
+        try:
+            return shown_asset(obj, assets.load(assets.file_of(obj)), depsgraph)
+        except DrgsError:  # reported when the object is rendered
+            return None
+
+    key, owners = _state(obj)
+    return cache.get(("shown", *key), owners, read)
 
 
 def _batch(
     obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, share: float
 ) -> tuple[gpu.types.GPUBatch, float] | None:
     """Discs, and the median of their diameters."""
-    try:
-        asset = assets.load(assets.file_of(obj))
-    except DrgsError:  # reported when the object is rendered
+    found = _shown(obj, depsgraph)
+    if found is None:
         return None
-    shown, vertices = shown_asset(obj, asset, depsgraph)
+    shown, vertices = found
     rows, growth = first_rows(shown, share)
     scale = shown.surfels.scale[rows]
     sizes = _WIDTH * np.maximum(scale.max(axis=1, initial=0), np.sqrt(scale.prod(axis=1) * growth))

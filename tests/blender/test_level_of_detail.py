@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from types import SimpleNamespace
 
+import bmesh
 import bpy
 import numpy as np
 import pytest
@@ -112,14 +113,53 @@ def test_splats_are_no_more_than_the_limit_and_cover_as_much(dense, ball_file):
     twin = bpy.data.objects.new("Twin", dense.data)
     twin.drgs.asset = dense.drgs.asset
     bpy.context.scene.collection.objects.link(twin)
-    assert surfels._count(bpy.context.evaluated_depsgraph_get()) == 2 * count
+    assert surfels.number(bpy.context.evaluated_depsgraph_get()) == 2 * count
+    surfels.forget()
+
+
+def test_what_was_cut_away_does_not_count(dense, ball_file):
+    """What an object has left is not reduced where that alone is within the limit."""
+    surfels, asset = part("addon.viewport.surfels"), part("addon.assets").load(ball_file)
+    surfels.forget()
+    edited = bmesh.new()
+    edited.from_mesh(dense.data)
+    bmesh.ops.delete(edited, geom=[f for f in edited.faces if f.calc_center_median().x > 0], context="FACES")
+    edited.to_mesh(dense.data)
+    left = surfels.number(bpy.context.evaluated_depsgraph_get())
+    assert 0 < left < 0.7 * len(asset.surfels)
+    surfels.forget()
+
+
+@pytest.mark.parametrize("limits", [(MOST, MOST), (MOST, 10**9)])
+def test_viewports_of_two_scenes_each_say_what_they_leave_out_and_then_rest(scene, dense, limits):
+    """Another window shows another scene: neither has the other drawn again."""
+    surfels, views = part("addon.viewport.surfels"), part("addon.viewport.views")
+    surfels.forget()
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    whole = surfels.number(depsgraph)
+    tagged, windows = [], []
+    for limit in limits:
+        header = SimpleNamespace(type="HEADER", tag_redraw=lambda: tagged.append(True))
+        window = SimpleNamespace(type="WINDOW", as_pointer=lambda number=len(windows): number)
+        space = SimpleNamespace(area=SimpleNamespace(regions=[header, window]), region=window)
+        windows.append((space, SimpleNamespace(scene=depsgraph.scene), limit))
+    for _ in range(3):
+        for context, of, limit in windows:
+            of.scene.drgs.viewport_surfels = limit
+            share = surfels._share(context, depsgraph)
+            assert share == min(1.0, limit / whole)
+            said = surfels.reduction(views.name_of(context.region))
+            assert said == (f"{limit:,} of {whole:,} surfels" if share < 1 else "")
+    assert len(tagged) == sum(limit < whole for limit in limits)
+    surfels.forget()
 
 
 def test_header_says_what_splats_leave_out(scene, ball, monkeypatch):
     surfels, header = part("addon.viewport.surfels"), part("addon.panels.header")
     space = SimpleNamespace(shading=SimpleNamespace(type="SOLID"))
-    context = SimpleNamespace(scene=scene, space_data=space, area=SimpleNamespace(regions=[]))
-    monkeypatch.setattr(surfels, "reduction", "500 of 1,000 surfels")
+    window = SimpleNamespace(type="WINDOW", as_pointer=lambda: 7)
+    context = SimpleNamespace(scene=scene, space_data=space, area=SimpleNamespace(regions=[window]))
+    monkeypatch.setitem(surfels._reductions, part("addon.viewport.views").name_of(window), "500 of 1,000 surfels")
     for overlay, said in (("OFF", ""), ("SURFELS", "500 of 1,000 surfels"), ("LIT", "")):
         scene.drgs.overlay = overlay
         assert header._reduction(context) == said
