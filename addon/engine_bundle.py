@@ -30,6 +30,8 @@ def fault(source: Path = SOURCE) -> str:
     """What the packages lack, "" where they are complete or the zip brought none. Reads names of folders alone."""
     names = wheels(source)
     unpacked = _unpacked() if names else {}
+    if names and not Path(sys.executable or "").stem.lower().startswith("python"):
+        return f"need Blender's own Python as a program, which this Blender lacks (it names {sys.executable!r})"
     for name in names:
         distribution, version, *_, tag, abi, _ = name.removesuffix(".whl").split("-")
         made = _PYTHON.match(tag)
@@ -43,17 +45,18 @@ def fault(source: Path = SOURCE) -> str:
 
 def site_packages(source: Path = SOURCE) -> Path:
     """The folder into which Blender unpacked them; FileNotFoundError where there is none."""
-    # That of extensions is the last: Blender's own may have packages of the same names
-    for folder, found in reversed(_unpacked().items()):
-        if any(name.partition("-")[0].lower() in found for name in wheels(source)):
-            return Path(folder)
-    raise FileNotFoundError("Blender has not unpacked the packages of the extension")
+    brought = {name.partition("-")[0].lower() for name in wheels(source)}
+    # Blender's own and those of other add-ons may have some of them, too
+    found = max(((len(brought & names), folder) for folder, names in _unpacked().items()), default=(0, ""))
+    if not found[0]:
+        raise FileNotFoundError("Blender has not unpacked the packages of the extension")
+    return Path(found[1])
 
 
 def _unpacked() -> dict[str, set[str]]:
     """Folders of packages -> names of those in them, of any version: another extension may have a newer one."""
     found = {}
-    for folder in sys.path:
+    for folder in map(str, sys.path):  # some add-ons append a Path
         if folder.endswith("site-packages"):
             with contextlib.suppress(OSError):
                 names = os.listdir(folder)

@@ -88,6 +88,8 @@ _UNUSED = re.compile(
     # programs and cards of OIDN, and copies that stand for links
     r"|^pyoidn/.*(_device_(cuda|hip|sycl)|/bin/oidn|/(lib)?(ur_|umf|sycl)|/libtbb\w*\.so(\.\d+\.\d+)?$)"
 )
+#: Stays wherever it lies: licences ask for it.
+_LICENCE = re.compile(r"(^|/)(licen[cs]e|copying|notice|third.party|authors)[^/]*$", re.IGNORECASE)
 #: Bytes from which a file is packed by LZMA, which takes a third of libraries such as LLVM's off.
 _LARGE = 1 << 16
 _DATE = (2025, 1, 1, 0, 0, 0)
@@ -151,7 +153,7 @@ def slim(wheel: Path) -> Path:
     target.parent.mkdir(exist_ok=True)
     partial = target.with_suffix(".part")
     with zipfile.ZipFile(wheel) as old, zipfile.ZipFile(partial, "w") as new:
-        for name in sorted(i.filename for i in old.infolist() if not i.is_dir() and not _UNUSED.search(i.filename)):
+        for name in sorted(i.filename for i in old.infolist() if not i.is_dir() and not _is_unused(i.filename)):
             data = old.read(name)
             if re.fullmatch(r"[^/]+\.dist-info/RECORD", name):
                 data = _without_unused(data)
@@ -164,7 +166,7 @@ def slim(wheel: Path) -> Path:
 
 
 def _slimmed(wheel: Path) -> Path:
-    rules = hashlib.sha256(f"{_LARGE} {_UNUSED.pattern}".encode()).hexdigest()[:8]
+    rules = hashlib.sha256(f"{_LARGE} {_UNUSED.pattern} {_LICENCE.pattern}".encode()).hexdigest()[:8]
     return wheel.parent / f"slim-{rules}" / wheel.name
 
 
@@ -173,10 +175,14 @@ def is_ready(platform: str, python: str) -> bool:
     return all((CACHE / name).is_file() and _slimmed(CACHE / name).is_file() for name in locked(platform, python))
 
 
+def _is_unused(name: str) -> bool:
+    return _UNUSED.search(name) is not None and _LICENCE.search(name) is None
+
+
 def _without_unused(record: bytes) -> bytes:
     rows = csv.reader(io.StringIO(record.decode("utf-8"), newline=""))
     out = io.StringIO(newline="")
-    csv.writer(out, lineterminator="\n").writerows(row for row in rows if row and not _UNUSED.search(row[0]))
+    csv.writer(out, lineterminator="\n").writerows(row for row in rows if row and not _is_unused(row[0]))
     return out.getvalue().encode()
 
 

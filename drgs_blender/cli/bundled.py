@@ -11,6 +11,7 @@ last, so that what Blender's Python has, NumPy among it, is found first.
 
 import runpy
 import sys
+import traceback
 from pathlib import Path
 
 
@@ -28,6 +29,7 @@ def main() -> None:
         else:
             exec(compile(what, "<string>", "exec"), {"__name__": "__main__"})
     except ImportError as error:
+        traceback.print_exc()
         sys.exit(f"A package that came with the extension is broken: {error}")
 
 

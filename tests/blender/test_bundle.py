@@ -110,6 +110,8 @@ def test_slim_wheels_are_the_same_packages_without_what_nobody_reads(tmp_path):
         "small/lib.so": big,
         "small/tests/test_it.py": b"",
         "share/doc/a.pdf": big,
+        "share/doc/third-party-programs.txt": b"licences of others",
+        "small/tests/LICENSE": b"another",
     }
     rows = "".join(f"{name},sha256=,1\n" for name in files) + "small-1.0.dist-info/RECORD,,\n"
     with zipfile.ZipFile(path, "w") as archive:
@@ -119,8 +121,9 @@ def test_slim_wheels_are_the_same_packages_without_what_nobody_reads(tmp_path):
     with zipfile.ZipFile(slim) as archive:
         kept = {name: archive.read(name) for name in archive.namelist()}
     record = kept.pop("small-1.0.dist-info/RECORD").decode()
-    assert kept == {name: files[name] for name in ("small/__init__.py", "small/lib.so")}
-    assert [row.partition(",")[0] for row in record.splitlines()] == [*kept, "small-1.0.dist-info/RECORD"]
+    unused = {"small/tests/test_it.py", "share/doc/a.pdf"}
+    assert kept == {name: data for name, data in files.items() if name not in unused}
+    assert {row.partition(",")[0] for row in record.splitlines()} == {*kept, "small-1.0.dist-info/RECORD"}
     once = slim.read_bytes()
     slim.unlink()
     assert engine_wheels.slim(path).read_bytes() == once
@@ -140,6 +143,14 @@ def test_what_a_bundle_lacks_is_named(tmp_path, monkeypatch):
     assert bundle.fault(source_with(tmp_path / "plain")) == "" and not bundle.wheels(tmp_path / "plain")
     whole = source_with(tmp_path / "whole", there, "pluggy-2-cp39-abi3-linux_x86_64.whl")
     assert bundle.fault(whole) == "" and bundle.site_packages(whole).is_dir()
+    for name in ("first", "last"):  # other add-ons have their own folders, with one of the packages
+        (tmp_path / name / "site-packages" / "pytest-2.dist-info").mkdir(parents=True)
+    others = [tmp_path / name / "site-packages" for name in ("first", "last")]
+    monkeypatch.setattr(sys, "path", [others[0], *sys.path, str(others[1])])
+    assert bundle.fault(whole) == "" and bundle.site_packages(whole) not in others
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "executable", "/opt/blender/blender")
+        assert "lacks (it names '/opt/blender/blender')" in bundle.fault(whole) and not bundle.fault(tmp_path / "plain")
     lacking = source_with(tmp_path / "lacking", there, "numbo-0.68-py3-none-any.whl")
     assert "lack numbo 0.68" in bundle.fault(lacking)
     foreign = source_with(tmp_path / "foreign", "pytest-1.0-cp39-cp39-linux_x86_64.whl")

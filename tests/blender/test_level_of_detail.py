@@ -138,9 +138,9 @@ def test_viewports_of_two_scenes_each_say_what_they_leave_out_and_then_rest(scen
     depsgraph = bpy.context.evaluated_depsgraph_get()
     whole = surfels.number(depsgraph)
     tagged, windows = [], []
-    for limit in limits:
+    for number, limit in enumerate(limits):
         header = SimpleNamespace(type="HEADER", tag_redraw=lambda: tagged.append(True))
-        window = SimpleNamespace(type="WINDOW", as_pointer=lambda number=len(windows): number)
+        window = SimpleNamespace(type="WINDOW", as_pointer=lambda number=number: number)
         space = SimpleNamespace(area=SimpleNamespace(regions=[header, window]), region=window)
         windows.append((space, SimpleNamespace(scene=depsgraph.scene), limit))
     for _ in range(3):
