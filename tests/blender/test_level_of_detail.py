@@ -9,6 +9,7 @@ import bmesh
 import bpy
 import numpy as np
 import pytest
+from mathutils import Matrix
 from scenes import new_world, part, read_exr
 from test_viewport import bits
 from test_viewport_blur import asked, converged
@@ -127,6 +128,28 @@ def test_what_was_cut_away_does_not_count(dense, ball_file):
     edited.to_mesh(dense.data)
     left = surfels.number(bpy.context.evaluated_depsgraph_get())
     assert 0 < left < 0.7 * len(asset.surfels)
+    surfels.forget()
+
+
+def test_splats_that_are_drawn_are_read_once_and_as_many_as_allowed(scene, dense, ball_file, monkeypatch):
+    """A redraw reads nothing again, another limit not the object; without a limit all are drawn."""
+    surfels, asset = part("addon.viewport.surfels"), part("addon.assets").load(ball_file)
+    surfels.forget()
+    read, drawn, original = [], [], surfels.shown_asset
+    monkeypatch.setattr(surfels, "shown_asset", lambda *given: read.append(1) or original(*given))
+    monkeypatch.setattr(surfels.draw, "disc_batch", lambda places, colours, sizes: (places, sizes))
+    monkeypatch.setattr(surfels.draw, "discs", lambda batch, *_: drawn.append(len(batch[0])))
+    identity = Matrix.Identity(4)
+    view = SimpleNamespace(
+        window_matrix=identity, perspective_matrix=identity, view_matrix=identity, is_perspective=True
+    )
+    region = SimpleNamespace(type="WINDOW", height=100, as_pointer=lambda: 7)
+    context = SimpleNamespace(region=region, region_data=view, area=SimpleNamespace(regions=[]))
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    for limit in (MOST, MOST, 2 * MOST, 10**9):
+        scene.drgs.viewport_surfels = limit
+        surfels.show(context, depsgraph)
+    assert drawn == [MOST, MOST, 2 * MOST, len(asset.surfels)] and len(read) == 1
     surfels.forget()
 
 
