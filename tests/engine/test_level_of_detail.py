@@ -173,6 +173,36 @@ def test_what_is_near_gets_more_of_its_object(session, frame_of_dense, monkeypat
     assert shown(session.view("A", frame))[0] <= counts[40.0]
 
 
+def test_what_is_posed_counts_where_it_stands(session, frame_of_dense, monkeypatch):
+    """An object that its matrix or its vertices bring near, not the camera."""
+    sized(session, monkeypatch, 3)
+    monkeypatch.setattr(level_of_detail, "_LEAST", 100)
+    frame = frame_of_dense(size=(192, 144))
+    frame.camera.matrix_world[1, 3] = -40.0
+    far = shown(session.view("A", frame))[0]
+    near = np.eye(4)
+    near[1, 3] = -36.0
+    by_matrix = replace(frame, objects=[replace(frame.objects[0], matrix_world=near)])
+    vertices = frame.objects[0].vertices + np.float32([0, -36, 0])
+    by_vertices = replace(frame, objects=[replace(frame.objects[0], vertices=vertices)])
+    counts = [shown(session.view("A", each))[0] for each in (by_matrix, by_vertices)]
+    assert counts[0] == counts[1] > far
+
+
+def test_an_orthographic_view_counts_by_its_scale_not_by_the_distance(session, frame_of_dense, monkeypatch):
+    sized(session, monkeypatch, 3)
+    monkeypatch.setattr(level_of_detail, "_LEAST", 100)
+
+    def count(distance, scale):
+        frame = frame_of_dense(size=(192, 144))
+        frame.camera.orthographic, frame.camera.fx, frame.camera.fy = True, scale, scale
+        frame.camera.matrix_world[1, 3] = -distance
+        return shown(session.view("A", frame))[0]
+
+    assert count(4.0, 50.0) == count(40.0, 50.0) < count(4.0, 500.0)
+    assert count(4.0, 5.0) < count(4.0, 50.0)
+
+
 @pytest.mark.parametrize("most", [-1, 1.5, "many", True, None, float("nan")])
 def test_a_limit_that_is_none_is_refused(session, frame_of_dense, most):
     with pytest.raises(UsageError, match="viewport surfels"):
