@@ -231,6 +231,19 @@ def test_light_meets_fewer_surfels_too(session, frame_of_dense, monkeypatch):
     assert after["Combined"].tobytes() == final["Combined"].tobytes()
 
 
+def test_light_meets_the_fewer_surfels_of_this_pose_and_number(session, frame_of_dense, dense_path, monkeypatch):
+    """Not those of the picture before."""
+    fresh = Session()
+    fresh.load_asset(dense_path)
+    for each in (session, fresh):
+        sized(each, monkeypatch, 1)
+    frame = frame_of_dense(0.3, rays_see="surfels")
+    session.view("A", frame_of_dense(-0.3, rays_see="surfels"), most=MOST)
+    session.view("A", frame, most=MOST // 4)
+    again, first = session.view("A", frame, most=MOST), fresh.view("A", frame, most=MOST)
+    assert again["Combined"].tobytes() == first["Combined"].tobytes()
+
+
 def test_cancelled_half_way_it_goes_on_where_it_was(session, frame_of_dense):
     """However far the work on all surfels has come."""
     frame = frame_of_dense(0.2)
