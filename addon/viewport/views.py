@@ -200,7 +200,7 @@ def reduction(name: str) -> str:
     shown, whole = picture.surfels
     if shown >= whole:
         return ""
-    return f"{shown:,} of {whole:,} surfels" if shown else f"Mesh for {whole:,} surfels"
+    return f"{shown:,} of {whole:,} surfels" if shown else f"Mesh in place of {whole:,} surfels"
 
 
 def preparation() -> tuple[str, float]:
