@@ -35,10 +35,10 @@ def draw(header: bpy.types.Header, context: bpy.types.Context) -> None:
 def _reduction(context: bpy.types.Context) -> str:
     """What is shown in place of all surfels, in words, where Blender writes nothing over the picture."""
     shown = context.scene.drgs.overlay
-    window = next((r for r in context.area.regions if r.type == "WINDOW"), None)
-    if shown == "OFF" or window is None or views.is_rendered(context.space_data, context.scene):
+    if shown == "OFF" or views.is_rendered(context.space_data, context.scene):
         return ""
-    return (surfels if shown == "SURFELS" else views).reduction(views.name_of(window))
+    window = next((r for r in context.area.regions if r.type == "WINDOW"), None)
+    return "" if window is None else (surfels if shown == "SURFELS" else views).reduction(views.name_of(window))
 
 
 def register() -> None:
