@@ -15,6 +15,7 @@ import numpy as np
 
 from ..core.asset import Mesh
 from ..core.asset.archive import replace_by, replace_file
+from ..core.asset.model import neutral_values
 from ..core.errors import AssetError, UsageError, WriteError
 from ..core.file_types import USD_KERNELS
 from ..core.version import __version__
@@ -22,6 +23,7 @@ from ..geometry.normals import VertexNormals
 from .mesh_groups import corner_normals, face_groups
 from .splats import Splats, writable
 from .usd_mesh import material_text, picture_files, write_package
+from .usd_samples import Samples
 from .usd_splats import check_usd, define_field, field_values
 
 Array = np.ndarray
@@ -30,6 +32,8 @@ Array = np.ndarray
 _CHANNELS = ("albedo", "roughness", "metallic", "opacity", "emission", "specular", "coat")
 #: Bytes that a zip without extensions holds.
 _LARGEST_PACKAGE = 0xFFFF0000
+#: Vertices and surfels of frames that are held in memory before they are written, 100 bytes and more each.
+_HELD = 1 << 21
 
 
 @dataclass(slots=True)
@@ -70,7 +74,8 @@ def write_usd_sequence(
 ) -> list[str]:
     """Write a stage, Z up, in metres, whose time codes are the numbers of the frames; return what is to be told.
 
-    Images lie beside the stage, in the folder ``<stem>_textures``, or are in a USDZ.
+    Frames are written as they come, and not held in memory; the file is put in place when it is whole. Images lie
+    beside the stage, in the folder ``<stem>_textures`` (an @ of the stem is _), or are in a USDZ.
 
     Parameters
     ----------
@@ -95,101 +100,91 @@ def write_usd_sequence(
         Naming the file and the system's reason.
     """
     check_usd(str(path))
-    from pxr import Usd, UsdGeom
-
-    package = path.suffix.lower() == ".usdz"
-    folder = "textures/" if package else f"{path.stem}_textures/"
-    pictures: dict[str, bytes] = {}
-    objects: dict[str, _Object] = {}
-    numbers: list[int] = []
-    try:
-        stage = Usd.Stage.CreateInMemory()
-        UsdGeom.SetStageUpAxis(stage, "Z")
-        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        stage.GetRootLayer().documentation = f"DR-GS {__version__}"
-        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/root").GetPrim())
-        for number, moving in frames:
-            for state in moving:
-                if state.name not in objects:
-                    of_kind = kernel, materials, folder
-                    made = _Object(stage, _prim_name(stage, state.name), state, *of_kind, str(path))
-                    objects[state.name] = made
-                    pictures |= made.pictures
-                    if numbers:
-                        made.hide(numbers[0], numbers[-1])
-                objects[state.name].add(number, state)
-            for name in objects.keys() - {state.name for state in moving}:
-                objects[name].hide(number, number)
-            numbers.append(number)
-        if not objects:
-            raise UsageError(str(path), "would hold no object", "Choose frames in which there is one")
-        for made in objects.values():
-            made.finish()
-        stage.SetStartTimeCode(numbers[0])
-        stage.SetEndTimeCode(numbers[-1])
-        stage.SetTimeCodesPerSecond(fps)
-        stage.SetFramesPerSecond(fps)
-    except RuntimeError as error:  # what errors of USD derive from
-        raise WriteError(str(path), f"cannot be written ({error})", "Report it") from error
-    if package:
-        _write_usdz(path, stage, pictures)
-    else:
-        for name, data in pictures.items():
-            target = path.with_name(folder.rstrip("/")) / name
-            target.parent.mkdir(exist_ok=True)
-            replace_file(target, [data])
-        replace_by(path, lambda temporary: stage.GetRootLayer().Export(str(temporary)))
-    return [note for made in objects.values() for note in made.notes]
-
-
-def _write_usdz(path: Path, stage: Any, pictures: dict[str, bytes]) -> None:
-    """The stage and its pictures in one file."""
+    suffix, notes = path.suffix.lower(), []
+    folder = "textures" if suffix == ".usdz" else f"{path.stem.replace('@', '_')}_textures"
 
     def save(temporary: Path) -> None:
-        crate = temporary.with_name("asset.usdc")
-        stage.GetRootLayer().Export(str(crate))
-        if crate.stat().st_size + sum(map(len, pictures.values())) > _LARGEST_PACKAGE:
-            raise UsageError(
-                str(path), "would be larger than 4 GB, which USDZ cannot be", "Write .usdc, or fewer frames"
+        crate = temporary if suffix in (".usdc", ".usd") else temporary.with_name("asset.usdc")
+        objects = _write_crate(crate, path, frames, fps, (kernel, materials, f"{folder}/"))
+        pictures = {name: data for made in objects for name, data in made.pictures.items()}
+        notes.extend(note for made in objects for note in made.notes)
+        if suffix == ".usdz":
+            if crate.stat().st_size + sum(map(len, pictures.values())) > _LARGEST_PACKAGE:
+                problem = "would be larger than 4 GB, which USDZ cannot be"
+                raise UsageError(str(path), problem, "Write .usdc, or fewer frames")
+            write_package(
+                temporary, {crate.name: crate.read_bytes()} | {f"{folder}/{n}": d for n, d in pictures.items()}
             )
-        write_package(temporary, {crate.name: crate.read_bytes()} | {f"textures/{n}": d for n, d in pictures.items()})
+            return
+        if suffix == ".usda":
+            _as_text(crate, temporary)
+        if pictures:
+            _write_pictures(path.with_name(folder), pictures)
 
     replace_by(path, save)
+    return notes
 
 
-class _Samples:
-    """Values of an attribute over time: no samples while nothing changes; what stood still does so until it moves."""
+def _write_crate(
+    crate: Path,
+    path: Path,
+    frames: Iterable[tuple[int, list[MovingObject]]],
+    fps: float,
+    options: tuple[str, bool, str],
+) -> list[_Object]:
+    """Write the stage of `path` as a crate, which is closed then; what it has."""
+    from pxr import Usd, UsdGeom
 
-    def __init__(self, attribute: Any) -> None:
-        self._attribute = attribute
-        self._value: Any = None
-        self._first = self._last = self._written = 0
-        self._moves = False
+    stage = Usd.Stage.CreateNew(str(crate))
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.GetRootLayer().documentation = f"DR-GS {__version__}"
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/root").GetPrim())
+    objects: dict[str, _Object] = {}
+    numbers: list[int] = []
+    held = 0
+    for number, moving in frames:
+        for state in moving:
+            if state.name not in objects:
+                objects[state.name] = _Object(stage, _prim_name(stage, state.name), state, *options, str(path))
+                if numbers:
+                    objects[state.name].hide(numbers[0], numbers[-1])
+            objects[state.name].add(number, state)
+            held += sum(len(part) for part in (state.mesh and state.mesh.vertices, state.splats) if part is not None)
+        for name in objects.keys() - {state.name for state in moving}:
+            objects[name].hide(number, number)
+        numbers.append(number)
+        if held > _HELD:
+            stage.Save()
+            held = 0
+    if not objects:
+        raise UsageError(str(path), "would hold no object", "Choose frames in which there is one")
+    for made in objects.values():
+        made.finish()
+    stage.SetStartTimeCode(numbers[0])
+    stage.SetEndTimeCode(numbers[-1])
+    stage.SetTimeCodesPerSecond(fps)
+    stage.SetFramesPerSecond(fps)
+    stage.Save()
+    return list(objects.values())
 
-    def add(self, number: int, value: Any) -> bool:
-        """The value in the frame of this number, which comes after all others; whether it is another."""
-        changed = self._value is not None and self._value != value
-        if self._value is None:
-            self._first = number
-        elif changed:
-            if not self._moves:
-                self._set(self._first)
-                self._moves = True
-            if self._written != self._last:
-                self._set(self._last)
-            self._value = value
-            self._set(number)
-        self._value, self._last = value, number
-        return changed
 
-    def finish(self) -> None:
-        """Write what never changed."""
-        if not self._moves and self._value is not None:
-            self._attribute.Set(self._value)
+def _as_text(crate: Path, path: Path) -> None:
+    """Write a stage as USDA."""
+    from pxr import Sdf
 
-    def _set(self, number: int) -> None:
-        self._attribute.Set(self._value, number)
-        self._written = number
+    Sdf.Layer.FindOrOpen(str(crate)).Export(str(path))
+
+
+def _write_pictures(folder: Path, pictures: dict[str, bytes]) -> None:
+    """Files by name. Raises WriteError."""
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        reason = f"is the folder of the images, which cannot be made ({error.strerror})"
+        raise WriteError(str(folder), reason, "Move what has that name, or write a .usdz") from error
+    for name, data in pictures.items():
+        replace_file(folder / name, [data])
 
 
 class _Object:
@@ -201,9 +196,10 @@ class _Object:
         from pxr import UsdGeom
 
         self._subject, self._name, self._materials = subject, state.name, materials
-        self._samples: dict[Any, _Samples] = {}
+        self._samples: dict[Any, Samples] = {}
         self._rotation: Array | None = None
         self._first: MovingObject = state
+        self._span: tuple[int, ...] = ()  # the first and the last frame of its mesh
         self.pictures: dict[str, bytes] = {}
         self.notes: list[str] = []
         self._xform = UsdGeom.Xform.Define(stage, f"/root/{name}")
@@ -214,7 +210,8 @@ class _Object:
             self._mesh = UsdGeom.Mesh.Define(stage, f"/root/{name}/{name}")
             self._define_mesh(stage, name, state.mesh, folder)
         if state.points is not None:
-            self._points = UsdGeom.Points.Define(stage, f"/root/{name}/particles")
+            particles = _prim_name(stage, "particles", f"/root/{name}")
+            self._points = UsdGeom.Points.Define(stage, f"/root/{name}/{particles}")
         if state.splats is not None:
             self._field = define_field(stage, f"/root/{name}_surfels", kernel)
 
@@ -237,6 +234,7 @@ class _Object:
             coordinates = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
             coordinates.Set(Vt.Vec2fArray.FromNumpy(uvs.reshape(-1, 2)))
         names = ["Material"] if len(groups) == 1 else [f"Material{k}" for k in range(len(groups))]
+        names = [_prim_name(stage, own, f"/root/{name}") for own in names]
         folders = f"./{folder}{name}_"
         texts = [material_text(n, g.material, f"/root/{name}", folders) for n, g in zip(names, groups, strict=True)]
         whole = "\n".join(["#usda 1.0", 'def "root"', "{", f'def "{name}"', "{", *texts, "}", "}"])
@@ -299,16 +297,20 @@ class _Object:
         self._set(number, attribute, _vectors(own))
         primvars = UsdGeom.PrimvarsAPI(prim)
         for channel in _CHANNELS:
-            values = mesh.channel(channel) if getattr(first, channel) is not None else None
-            if values is None:
+            if getattr(mesh, channel) is None and not primvars.HasPrimvar(channel):
                 continue
+            values = mesh.channel(channel)
             coloured = values.ndim == 2
             kinds = Sdf.ValueTypeNames.Color3fArray if coloured else Sdf.ValueTypeNames.FloatArray
-            primvar = primvars.CreatePrimvar(channel, kinds, UsdGeom.Tokens.vertex)
-            array = _vectors(values) if coloured else Vt.FloatArray.FromNumpy(np.ascontiguousarray(values, np.float32))
-            if self._set(number, primvar.GetAttr(), array) and first.textures is None and not self.notes:
-                text = f"its material changes in frame {number}: its attributes follow, its images stay those of before"
+            write = _vectors if coloured else lambda v: Vt.FloatArray.FromNumpy(np.ascontiguousarray(v, np.float32))
+            attribute = primvars.CreatePrimvar(channel, kinds, UsdGeom.Tokens.vertex).GetAttr()
+            if attribute not in self._samples:  # it was neutral, if there was a frame before
+                for before in dict.fromkeys(self._span):
+                    self._set(before, attribute, write(neutral_values(channel, len(mesh.vertices))))
+            if self._set(number, attribute, write(values)) and not self.notes:
+                text = f"its material changes in frame {number}: its images stay those of its first one"
                 self.notes.append(f"{self._name}: {text}")
+        self._span = (*self._span[:1], number)
 
     def _add_splats(self, number: int, splats: Splats) -> None:
         """Rotations keep their sign from frame to frame, so that programs find the shorter way between two."""
@@ -342,7 +344,7 @@ class _Object:
 
     def _set(self, number: int, attribute: Any, value: Any) -> bool:
         """Give an attribute its value; whether that differs from the one before."""
-        samples = self._samples.setdefault(attribute, _Samples(attribute))
+        samples = self._samples.setdefault(attribute, Samples(attribute))
         return samples.add(number, value)
 
     def _refuse(self, number: int, what: str) -> None:
@@ -362,13 +364,13 @@ def _extent(values: Array) -> Any:
     return _vectors(np.stack([values.min(axis=0), values.max(axis=0)]) if len(values) else np.zeros((2, 3)))
 
 
-def _prim_name(stage: Any, name: str) -> str:
-    """A name that USD takes, below the root and of no prim yet, as Blender makes it of an object's."""
+def _prim_name(stage: Any, name: str, parent: str = "/root") -> str:
+    """A name that USD takes, below `parent` and of no prim yet, as Blender makes it of an object's."""
     from pxr import Tf
 
     plain = Tf.MakeValidIdentifier(name)
     found, count = plain, 0
-    while stage.GetPrimAtPath(f"/root/{found}") or stage.GetPrimAtPath(f"/root/{found}_surfels"):
+    while stage.GetPrimAtPath(f"{parent}/{found}") or stage.GetPrimAtPath(f"{parent}/{found}_surfels"):
         count += 1
         found = f"{plain}_{count:03d}"
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from pxr import Usd, UsdGeom, UsdShade, UsdValidation, UsdVol
 from drgs_blender.cli.main import main
 from drgs_blender.core.asset import Mesh
 from drgs_blender.core.asset.container import read_asset
-from drgs_blender.core.errors import AssetError, UsageError
+from drgs_blender.core.errors import AssetError, UsageError, WriteError
 from drgs_blender.core.file_types import USD_SUFFIXES
 from drgs_blender.formats.point_cache import write_point_cache
 from drgs_blender.formats.usd_sequence import MovingObject, write_usd_sequence
@@ -153,6 +154,63 @@ def test_a_material_that_changes_is_told(tmp_path: Path) -> None:
     frames[3][1][0].mesh = replace(ball(VERTICES), roughness=np.zeros(len(VERTICES)))
     (note,) = write_usd_sequence(tmp_path / "a.usdc", frames, 24.0)
     assert "Ball" in note and "frame 14" in note and "images" in note
+
+
+def test_a_channel_that_comes_later_is_neutral_before(tmp_path: Path) -> None:
+    frames = moving()
+    glow = np.full((len(VERTICES), 3), 2, np.float32)
+    for number, (state,) in frames[2:4]:
+        state.mesh = replace(ball(VERTICES), emission=glow * number)
+    write_usd_sequence(tmp_path / "a.usdc", frames, 24.0)
+    stage = checked(tmp_path / "a.usdc")
+    primvar = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/root/Ball/Ball")).GetPrimvar("emission")
+    for number, wanted in zip(range(11, 17), (0, 0, 13, 14, 0, 0), strict=True):
+        np.testing.assert_array_equal(np.array(primvar.Get(number)), glow * wanted)
+
+
+@pytest.mark.parametrize(
+    ("name", "file"), [("Material", "a.usdc"), ("particles", "a@b.usda"), ("Würfel 日本", "é.usdz")]
+)
+def test_all_names_are_taken(tmp_path: Path, name: str, file: str) -> None:
+    """An object may be called as what is below it, a file have what ends a path in USD's text."""
+    write_usd_sequence(tmp_path / file, moving(name, points=VERTICES), 24.0)
+    stage = checked(tmp_path / file)
+    (mesh,) = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+    assert UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()[0]
+    assert len([prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Points)]) == 1
+    texture = next(s for prim in stage.Traverse() if (s := UsdShade.Shader(prim)).GetInput("file"))
+    assert texture.GetInput("file").Get().resolvedPath
+
+
+@pytest.mark.parametrize("suffix", USD_SUFFIXES)
+def test_frames_are_written_as_they_come(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    """What is stopped leaves the file of before, and nothing else."""
+    monkeypatch.setattr("drgs_blender.formats.usd_sequence._HELD", 0)
+    path = tmp_path / f"a{suffix}"
+    path.write_text("before")
+    noise = np.random.default_rng(0)
+
+    def frames(last: int) -> Iterator[tuple[int, list[MovingObject]]]:
+        for number in range(8):
+            written = sum(file.stat().st_size for file in tmp_path.glob(".*/*"))
+            assert written >= number * VERTICES.nbytes
+            if number == last:
+                raise KeyboardInterrupt
+            yield number, [MovingObject("A", ball(noise.random(VERTICES.shape).astype(np.float32)), np.eye(4))]
+
+    with pytest.raises(KeyboardInterrupt):
+        write_usd_sequence(path, frames(5), 24.0)
+    assert [path] == list(tmp_path.iterdir()) and path.read_text() == "before"
+    write_usd_sequence(path, frames(9), 24.0)
+    stage = checked(path)
+    assert len(UsdGeom.Mesh(stage.GetPrimAtPath("/root/A/A")).GetPointsAttr().GetTimeSamples()) == 8
+
+
+def test_a_file_in_the_place_of_its_folder_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a_textures").write_text("mine")
+    with pytest.raises(WriteError, match=r"a_textures.*folder of the images"):
+        write_usd_sequence(tmp_path / "a.usdc", moving(), 24.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["a_textures"]
 
 
 def test_a_posed_asset_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
