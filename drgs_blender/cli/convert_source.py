@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -239,20 +240,22 @@ class FrameSource:
         return join_splats(lit), _COLOUR_NAMES["scene"]
 
     def moving(self, meshes: bool, surfels: bool) -> list[MovingObject]:
-        """The objects; instances of one get numbers."""
-        found: list[MovingObject] = []
-        count: dict[str, int] = {}
+        """The objects; instances of one get numbers that no other object has in its name."""
+        names: dict[str, None] = {}
+        own = {item.state.name for item in self._objects}
         for i in self._visible:
             name = self._objects[i].state.name
-            count[name] = count.get(name, 0) + 1
-            found.append(self._moving(i, f"{name}.{count[name] - 1:03d}" if count[name] > 1 else name, meshes, surfels))
-        return found
+            numbered = (f"{name}.{k:03d}" for k in itertools.count(1))
+            names[name if name not in names else next(n for n in numbered if n not in names and n not in own)] = None
+        return [self._moving(i, name, meshes, surfels) for i, name in zip(self._visible, names, strict=True)]
 
     def _moving(self, index: int, name: str, meshes: bool, surfels: bool) -> MovingObject:
+        from ..formats.mesh_groups import corner_normals
         from ..formats.usd_sequence import MovingObject
 
         item = self._objects[index]
         state, traced, mesh = item.state, item.mesh, None
+        normals = state.corner_normals
         if meshes and len(traced.faces):
             rest = item.asset.mesh
             bare = state.adjustment is None and all(getattr(state, channel) is None for channel in MATERIAL_CHANNELS)
@@ -260,6 +263,8 @@ class FrameSource:
                 note = f"{name}: is painted or adjusted, so its images are left out for the materials of its vertices"
                 self.notes.append(note)
             mesh = posed_mesh(rest, rest.vertices if state.vertices is None else state.vertices)
+            if normals is None and mesh.textures is not None and mesh.textures.normals is not None:
+                normals = corner_normals(mesh)  # which stay where the images do not
             values = {channel: getattr(traced, channel) for channel in BASE_CHANNELS} | item.channels
             mesh = replace(mesh, **values, textures=mesh.textures if bare else None)
             if traced.torn is not None and traced.torn.any():
@@ -271,7 +276,7 @@ class FrameSource:
                     splats = self._lit(index, progress)
             else:
                 splats = _unlit(self._surfels(index), self._args.colour or "captured")[0]
-        return MovingObject(name, mesh, state.matrix_world, state.corner_normals, splats)
+        return MovingObject(name, mesh, state.matrix_world, normals, splats)
 
     def _surfels(self, index: int) -> Surfels:
         from ..build.export import faded, surfels_of_pose

@@ -100,7 +100,8 @@ def write_usd_sequence(
         Naming the file and the system's reason.
     """
     check_usd(str(path))
-    suffix, notes = path.suffix.lower(), []
+    suffix = path.suffix.lower()
+    notes: list[str] = []
     folder = "textures" if suffix == ".usdz" else f"{path.stem.replace('@', '_')}_textures"
 
     def save(temporary: Path) -> None:
@@ -150,7 +151,7 @@ def _write_crate(
                 if numbers:
                     objects[state.name].hide(numbers[0], numbers[-1])
             objects[state.name].add(number, state)
-            held += sum(len(part) for part in (state.mesh and state.mesh.vertices, state.splats) if part is not None)
+            held += (0 if state.mesh is None else len(state.mesh.vertices)) + len(state.splats or ())
         for name in objects.keys() - {state.name for state in moving}:
             objects[name].hide(number, number)
         numbers.append(number)

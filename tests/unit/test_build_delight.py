@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from drgs_blender.build.delight import LIMITS, remove_light
+from drgs_blender.build.light_estimate import estimate_light
 from drgs_blender.build.relit import captured_along, relit_colours
 from drgs_blender.cli.main import main
 from drgs_blender.core.asset import Asset, Environment, Mesh, Surfels
@@ -149,6 +150,32 @@ def unlit(capture: tuple[Asset, np.ndarray, np.ndarray]) -> Asset:
 def aligned(albedo: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Errors after the one factor that nobody can know."""
     return np.abs(albedo * (albedo * truth).sum() / (albedo**2).sum() - truth)
+
+
+def test_surfels_that_no_light_reaches_are_no_estimate(
+    capture: tuple[Asset, np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A capture within a closed mesh; the error says what to do."""
+    monkeypatch.setattr("drgs_blender.build.light_estimate._SETTINGS", replace(FEW, samples=4))
+    asset = copied(capture[0])
+    box = np.array([[x, y, z] for x in (-2, 2) for y in (-2, 2) for z in (-2, 2)], np.float32)
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    m, n = asset.mesh, len(asset.mesh.vertices)
+    faces = np.concatenate([m.faces, quads[:, [0, 1, 2]] + n, quads[:, [0, 2, 3]] + n])
+    vertices, k = np.concatenate([m.vertices, box]), n + len(box)
+    asset.mesh = Mesh(vertices, faces, np.full((k, 3), 0.4), np.full(k, 0.5), np.zeros(k))
+    asset.environment = None
+    with pytest.raises(UsageError, match=r"0 surfels that are .* reached by light from outside.*--env"):
+        remove_light(asset)
+
+
+def test_the_estimate_is_the_same_each_time(
+    capture: tuple[Asset, np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drgs_blender.build.light_estimate._SETTINGS", replace(FEW, samples=4))
+    monkeypatch.setattr("drgs_blender.build.light_estimate._ROUNDS", np.array([1.0]))
+    one, two = (estimate_light(capture[0]).radiance for _ in range(2))
+    np.testing.assert_array_equal(one, two)
 
 
 @pytest.mark.slow

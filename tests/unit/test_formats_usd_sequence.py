@@ -16,14 +16,18 @@ pytest.importorskip("pxr", reason="usd-core is an optional package")
 from pxr import Usd, UsdGeom, UsdShade, UsdValidation, UsdVol
 
 from drgs_blender.cli.main import main
-from drgs_blender.core.asset import Mesh
-from drgs_blender.core.asset.container import read_asset
+from drgs_blender.core.asset import Asset, Mesh, Surfels
+from drgs_blender.core.asset.container import read_asset, write_asset
 from drgs_blender.core.errors import AssetError, UsageError, WriteError
 from drgs_blender.core.file_types import USD_SUFFIXES
+from drgs_blender.core.frame import ObjectState
+from drgs_blender.deform.binding import bind
 from drgs_blender.formats.point_cache import write_point_cache
 from drgs_blender.formats.usd_sequence import MovingObject, write_usd_sequence
+from drgs_blender.ipc.frame_file import write_frame_file
 
-from test_cli_convert_frame import plate  # isort: skip
+from test_cli_convert_frame import frame_of, plate  # isort: skip
+from test_mesh_textures import textured, uniform  # isort: skip
 
 VERTICES, FACES = sphere_mesh(1)
 #: Vertices of six frames: still, then moving, then still.
@@ -239,3 +243,40 @@ def test_a_posed_asset_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixt
         assert main([*command, *more]) == 64 and words in capsys.readouterr().err
     one = ["convert", str(asset), str(tmp_path / "one.spz"), "--surfels"]
     assert main(one) == 64 and "--surfels: is no option of SPZ" in capsys.readouterr().err
+
+
+def frames_of(tmp_path: Path, frames: list[list[ObjectState]]) -> list[str]:
+    """The beginning of a command that converts frames as Blender describes them."""
+    for number, states in enumerate(frames, 1):
+        write_frame_file(tmp_path / f"{number:04d}.drgsframe", frame_of(states))
+    return ["convert", str(tmp_path / "####.drgsframe"), str(tmp_path / "a.usdc"), "--as", "sequence"]
+
+
+def test_instances_have_names_that_no_other_object_has(tmp_path: Path) -> None:
+    """The copy that Blender calls A.001 stands after the instances of A."""
+    file = str(plate(tmp_path / "plate.drgs"))
+    states = [ObjectState(name, file, matrix_world=np.eye(4)) for name in ("A", "A", "A.001", "A")]
+    for k, state in enumerate(states):
+        state.matrix_world[0, 3] = 3 * k
+    assert main(frames_of(tmp_path, [states])) == 0
+    stage = checked(tmp_path / "a.usdc")
+    cache = UsdGeom.XformCache(1)
+    found = {p.GetName(): cache.GetLocalToWorldTransform(p)[3][0] for p in stage.GetPrimAtPath("/root").GetChildren()}
+    assert found == {"A": 0, "A_002": 3, "A_001": 6, "A_003": 9}
+
+
+def test_normals_of_textures_stay_where_they_give_way_to_paint(tmp_path: Path) -> None:
+    asset = textured(uniform((200, 100, 50)))
+    textures = asset.mesh.textures
+    assert textures is not None
+    bent = np.tile(np.float32([0.6, -0.8, 0]), (len(asset.mesh.faces), 3, 1))
+    surfels = Surfels([[0, 0, 0]], [[0.1, 0.1]], [[1, 0, 0, 0]], [1], [[0.5] * 3], [0.5], [0])
+    mesh = replace(asset.mesh, textures=replace(textures, normals=bent))
+    write_asset(tmp_path / "t.drgs", Asset(surfels, mesh, bind(mesh, surfels)[0]))
+    painted = np.full((len(mesh.vertices), 3), 0.1, np.float32)
+    states = [ObjectState("A", str(tmp_path / "t.drgs"), albedo=albedo) for albedo in (None, painted)]
+    assert main(frames_of(tmp_path, [[state] for state in states])) == 0
+    stage = checked(tmp_path / "a.usdc")
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/root/A/A"))
+    for number in (1, 2):
+        np.testing.assert_allclose(np.array(shape.GetNormalsAttr().Get(number)), bent.reshape(-1, 3), atol=1e-6)
