@@ -96,7 +96,7 @@ WRITTEN: dict[str, WriteType] = {
 }
 
 #: What Alembic lacks, in a sentence for the user.
-LOST_IN_ALEMBIC = "surfels, materials and their attributes are left out: Alembic has shape, motion and UV maps"
+LOST_IN_ALEMBIC = "surfels, materials, attributes and instances are left out: Alembic has shape, motion and UV maps"
 
 #: Videos of which `drgs capture` takes frames.
 VIDEOS = frozenset((".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts"))

@@ -168,7 +168,7 @@ WRITERS: tuple[Writer, ...] = (
         write_alembic,
         "transforms, and the evaluated meshes of all frames, with UV maps, as Blender's own exporter writes them, and "
         "only where it was built with Alembic: *File > Export*, or a .blend as IN",
-        "surfels, materials and their attributes",
+        "surfels, materials and their attributes; instances (of collections, Geometry Nodes)",
     ),
     Writer(
         "OpenEXR",

@@ -131,6 +131,19 @@ def test_alembic_moves_as_the_scene(walker, scene, tmp_path):
     assert_moves_like(imported(bpy.ops.wm.alembic_import, tmp_path / "walk.abc"), walker)
 
 
+def test_instances_are_objects_of_their_own(ball, scene, tmp_path):
+    """A collection that stands somewhere else, too."""
+    stage, again = bpy.data.collections.new("Stage"), bpy.data.objects.new("Again", None)
+    stage.objects.link(ball)
+    again.instance_type, again.instance_collection, again.location = "COLLECTION", stage, (5, 0, 0)
+    scene.collection.objects.link(again)
+    export(tmp_path / "two.usdc", "USD sequence")
+    before = set(bpy.data.objects)
+    assert bpy.ops.wm.usd_import(filepath=str(tmp_path / "two.usdc")) == {"FINISHED"}
+    middles = sorted(world_points(o)[:, 0].mean() for o in bpy.data.objects if o not in before and o.type == "MESH")
+    np.testing.assert_allclose(middles, [world_points(ball)[:, 0].mean() + x for x in (0, 5)], atol=1e-4)
+
+
 def test_what_cannot_be_written_is_refused_by_name(walker, scene, tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="frames are skipped"):
         export(tmp_path / "walk.abc", "Alembic sequence", frame_step=2)
