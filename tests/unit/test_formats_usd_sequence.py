@@ -245,6 +245,15 @@ def test_a_posed_asset_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(one) == 64 and "--surfels: is no option of SPZ" in capsys.readouterr().err
 
 
+def test_frames_per_second_are_those_of_the_cache(tmp_path: Path) -> None:
+    asset = plate(tmp_path / "plate.drgs")
+    rest = read_asset(asset).mesh.vertices
+    write_point_cache(tmp_path / "walk.mdd", [rest, rest + 1], 2, len(rest), 1, 48.0)
+    given = ["--vertices", str(tmp_path / "walk.mdd"), "--frames"]
+    assert main(["convert", str(asset), str(tmp_path / "walk.usdc"), *given]) == 0
+    assert checked(tmp_path / "walk.usdc").GetTimeCodesPerSecond() == 48
+
+
 def frames_of(tmp_path: Path, frames: list[list[ObjectState]]) -> list[str]:
     """The beginning of a command that converts frames as Blender describes them."""
     for number, states in enumerate(frames, 1):
@@ -258,11 +267,11 @@ def test_instances_have_names_that_no_other_object_has(tmp_path: Path) -> None:
     states = [ObjectState(name, file, matrix_world=np.eye(4)) for name in ("A", "A", "A.001", "A")]
     for k, state in enumerate(states):
         state.matrix_world[0, 3] = 3 * k
-    assert main(frames_of(tmp_path, [states])) == 0
+    assert main([*frames_of(tmp_path, [states]), "--scale", "2"]) == 0
     stage = checked(tmp_path / "a.usdc")
     cache = UsdGeom.XformCache(1)
     found = {p.GetName(): cache.GetLocalToWorldTransform(p)[3][0] for p in stage.GetPrimAtPath("/root").GetChildren()}
-    assert found == {"A": 0, "A_002": 3, "A_001": 6, "A_003": 9}
+    assert found == {"A": 0, "A_002": 6, "A_001": 12, "A_003": 18}
 
 
 def test_normals_of_textures_stay_where_they_give_way_to_paint(tmp_path: Path) -> None:
