@@ -75,19 +75,26 @@ def _of_surfels(points: bpy.types.Object, obj: bpy.types.Object) -> Array:
     source = mesh_arrays.source_rows(obj.data, asset.mesh)
     if asset.binding is None or source is None:
         raise UsageError(f'Object "{obj.name}"', "has surfels that are bound to no vertices", "Import it with a mesh")
-    chosen = rows[selected & (rows >= 0) & (rows < len(asset.surfels))]
-    return np.where(source >= 0, vertex_shares(asset, chosen)[source], 0)
+    own = (rows >= 0) & (rows < len(asset.surfels))
+    return np.where(source >= 0, vertex_shares(asset, rows[own & selected], rows[own])[source], 0)
 
 
-def vertex_shares(asset: Asset, chosen: Array) -> Array:
-    """(n,) float32: the part of the surfels around each vertex of an asset that are among the `chosen`, (k,) int.
+def vertex_shares(asset: Asset, chosen: Array, left: Array) -> Array:
+    """(n,) float32: the part of the surfels around each vertex of an asset that are chosen.
 
     A vertex on whose faces none hangs has the mean of its neighbours.
+
+    Parameters
+    ----------
+    asset : Asset
+    chosen, left : (k,) int array
+        Surfels; those that were removed are not `left`, and count nowhere.
     """
     mesh, binding = asset.mesh, asset.binding
     assert binding is not None
     corner = mesh.faces[binding.face].reshape(-1)
     weight = binding.barycentric.clip(0, 1).astype(np.float64)
+    weight *= np.isin(np.arange(len(weight)), left)[:, None]
     of_chosen = np.zeros(len(asset.surfels), bool)
     of_chosen[chosen] = True
     total = np.bincount(corner, weight.reshape(-1), len(mesh.vertices))

@@ -84,6 +84,10 @@ class DRGS_OT_swap_mesh(CommandOperator, selection.ObjectMode, bpy.types.Operato
         make_drgs(other, obj, self._target, rest)
         if obj.animation_data is not None and obj.animation_data.action is not None:
             self.warn(f'"{other.name}" moves by its own rig: keyframes of "{obj.name}" itself are not taken over')
+        mask = other.drgs.adjustment.mask
+        if mask and mesh_arrays.read_mask(other, other.data, mask) is None:
+            problem = f'adjustments want the mask "{mask}", which "{other.name}" lacks: they count nowhere'
+            self.warn(f"{problem}. Transfer it (Data Transfer), or choose another")
         if not self.use_original:
             obj.hide_set(True)
             obj.hide_render = True

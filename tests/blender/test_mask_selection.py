@@ -91,10 +91,30 @@ def test_vertices_without_surfels_have_the_share_of_those_around(scene):
         model.Binding(b.face[kept], b.barycentric[kept], b.offset[kept], b.normal[kept]),
     )  # fmt: skip
     shares = part("operators.mask_selection").vertex_shares
-    np.testing.assert_allclose(shares(few, np.arange(len(kept))), 1, atol=1e-6)
-    share = shares(few, np.flatnonzero(few.surfels.centre[:, 2] > 0))
+    every = np.arange(len(kept))
+    np.testing.assert_allclose(shares(few, every, every), 1, atol=1e-6)
+    upper = np.flatnonzero(few.surfels.centre[:, 2] > 0)
+    share = shares(few, upper, every)
     z = asset.mesh.vertices[:, 2]
     assert (share[z > 0.7] > 0.9).all() and (share[z < -0.7] < 0.1).all()
+
+
+def test_surfels_that_were_removed_do_not_dilute_the_mask(scene, tmp_path):
+    """Every other one is deleted; all that are left are selected."""
+    asset = asset_of(*sphere(24, 36))
+    container.write_asset(tmp_path / "fine.drgs", asset)
+    bpy.ops.import_scene.drgs(filepath=str(tmp_path / "fine.drgs"))
+    obj = bpy.context.active_object
+    bpy.ops.drgs.edit_surfels()
+    mesh = bmesh.from_edit_mesh(bpy.context.edit_object.data)
+    for vertex in mesh.verts:
+        vertex.select_set(vertex.index % 2 == 0)
+    bmesh.update_edit_mesh(bpy.context.edit_object.data)
+    bpy.ops.mesh.delete(type="VERT")
+    bpy.ops.mesh.select_all(action="SELECT")
+    assert bpy.ops.drgs.mask_selection() == {"FINISHED"}
+    mask = part("addon.mesh_arrays").read_mask(obj, obj.data, "Selection")
+    np.testing.assert_array_equal(mask, 1)
 
 
 def test_painted_materials_are_taken_back_where_a_mask_says_so(half, export):

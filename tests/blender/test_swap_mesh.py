@@ -104,6 +104,18 @@ def test_what_is_painted_cut_and_deleted_comes_along(dense, export, tmp_path):
     assert "has no surfels on" in told  # where they were deleted
 
 
+@pytest.mark.parametrize("has", [False, True])
+def test_a_mask_that_the_new_mesh_lacks_is_told(dense, tmp_path, has):
+    dense.vertex_groups.new(name="Half").add([0, 1], 1.0, "REPLACE")
+    dense.drgs.adjustment.hue, dense.drgs.adjustment.mask = 1.0, "Half"
+    other = retopology()
+    if has:
+        other.vertex_groups.new(name="Half").add([0], 1.0, "REPLACE")
+    swap(dense, other, tmp_path)
+    told = " ".join(message.text for message in part("addon.messages").history)
+    assert ('adjustments want the mask "Half"' in told) != has
+
+
 def test_a_copy_that_was_remeshed_is_a_new_mesh_too(dense, export, tmp_path):
     select(dense)
     bpy.ops.object.duplicate()
