@@ -89,7 +89,7 @@ def _sources(args: argparse.Namespace, numbers: Sequence[int], several: bool) ->
     session = Session() if suffix == SUFFIX else None
     moving = is_point_cache(args.vertices)
     for number in numbers:
-        own = vars(args) | {"frame": number if moving else None}
+        own = vars(args) | {"frame": number if moving else None, "name": args.input.stem.rstrip("#_.-") or "asset"}
         for name in ("input", "vertices"):
             if several and getattr(args, name) is not None:
                 own[name] = frame_path(str(getattr(args, name)), number)

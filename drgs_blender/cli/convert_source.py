@@ -129,12 +129,12 @@ class AssetSource:
         return posed_mesh(self._asset.mesh, self._vertices) if self._posed else self._asset.mesh
 
     def moving(self, meshes: bool, surfels: bool) -> list[MovingObject]:
-        """The asset, named as its file."""
+        """The asset, named as its file, or as those of all frames."""
         from ..formats.usd_sequence import MovingObject
 
         mesh = self.mesh() if "mesh" in self.kinds and meshes else None
         splats = self.splats()[0] if "splats" in self.kinds and (surfels or mesh is None) else None
-        return [MovingObject(self._args.input.stem.rstrip("#_.-") or "asset", mesh, np.eye(4), splats=splats)]
+        return [MovingObject(self._args.name, mesh, np.eye(4), splats=splats)]
 
     def splats(self) -> tuple[Splats, str]:
         """The surfels, posed, in the colour that was chosen."""

@@ -21,6 +21,7 @@ from drgs_blender.core.asset.container import read_asset, write_asset
 from drgs_blender.core.errors import AssetError, UsageError, WriteError
 from drgs_blender.core.file_types import USD_SUFFIXES
 from drgs_blender.core.frame import ObjectState
+from drgs_blender.core.frame_sequences import frame_path
 from drgs_blender.deform.binding import bind
 from drgs_blender.formats.point_cache import write_point_cache
 from drgs_blender.formats.usd_sequence import MovingObject, write_usd_sequence
@@ -252,6 +253,18 @@ def test_frames_per_second_are_those_of_the_cache(tmp_path: Path) -> None:
     given = ["--vertices", str(tmp_path / "walk.mdd"), "--frames"]
     assert main(["convert", str(asset), str(tmp_path / "walk.usdc"), *given]) == 0
     assert checked(tmp_path / "walk.usdc").GetTimeCodesPerSecond() == pytest.approx(48)
+
+
+@pytest.mark.parametrize(("pattern", "name"), [("walk_####", "walk"), ("####", "asset")])
+def test_assets_of_frames_are_one_object(tmp_path: Path, pattern: str, name: str) -> None:
+    asset = read_asset(plate(tmp_path / "plate.drgs"))
+    for number in (1, 2):
+        shape = replace(asset.mesh, vertices=asset.mesh.vertices * np.float32(number))
+        write_asset(Path(frame_path(str(tmp_path / f"{pattern}.drgs"), number)), replace(asset, mesh=shape))
+    assert main(["convert", str(tmp_path / f"{pattern}.drgs"), str(tmp_path / "a.usdc"), "--frames"]) == 0
+    stage = checked(tmp_path / "a.usdc")
+    assert [prim.GetName() for prim in stage.GetPrimAtPath("/root").GetChildren()] == [name]
+    np.testing.assert_allclose(points(stage, 2, f"/root/{name}/{name}"), 2 * asset.mesh.vertices)
 
 
 def frames_of(tmp_path: Path, frames: list[list[ObjectState]]) -> list[str]:
