@@ -64,6 +64,9 @@ class DRGS_OT_mask_selection(DrgsOperator, bpy.types.Operator):
             bpy.ops.object.mode_set(mode="EDIT")
         obj.drgs.adjustment.mask, obj.drgs.adjustment.use_invert = group.name, False
         obj.update_tag()
+        others = [o for o in bpy.data.objects if o.data == obj.data and o != obj]  # weights are of the mesh
+        if names := [f'"{o.name}"' for o in others if o.drgs.adjustment.mask == group.name]:
+            self.warn(f'{", ".join(names)} have the same mesh and mask "{group.name}": it changes there, too')
         self.report({"INFO"}, f'Adjustments of "{obj.name}" count at {int((levels > 0).sum()):,} vertices')
         return {"FINISHED"}
 

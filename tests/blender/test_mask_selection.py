@@ -117,6 +117,20 @@ def test_surfels_that_were_removed_do_not_dilute_the_mask(scene, tmp_path):
     np.testing.assert_array_equal(mask, 1)
 
 
+@pytest.mark.parametrize("mask", ["Upper", "Other"])
+def test_linked_duplicates_whose_mask_changes_are_named(half, scene, mask):
+    """Weights are of the mesh, which they share."""
+    twin = half.copy()
+    scene.collection.objects.link(twin)
+    twin.drgs.adjustment.mask = mask
+    bpy.ops.object.mode_set(mode="EDIT")
+    choose(half, 0.5)
+    assert bpy.ops.drgs.mask_selection(name="Upper") == {"FINISHED"}
+    bpy.ops.object.mode_set(mode="OBJECT")
+    told = " ".join(message.text for message in part("addon.messages").history)
+    assert (f'"{twin.name}" have the same mesh and mask' in told) == (mask == "Upper")
+
+
 def test_painted_materials_are_taken_back_where_a_mask_says_so(half, export):
     bpy.ops.drgs.set_material(preset="GOLD")
     half.drgs.adjustment.hue = 0.5
