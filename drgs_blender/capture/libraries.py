@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import signal
-import sys
 import threading
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from typing import Any, NamedTuple
 import PIL.Image  # noqa: F401
 
 from ..core.errors import DeviceError
+from ..core.own_python import install_remedy
 
 
 class Library(NamedTuple):
@@ -71,9 +71,9 @@ def absent(*needed: str) -> list[str]:
 
 
 def install_command(names: Iterable[str]) -> str:
-    """Command that installs rows of `LIBRARIES` into this Python's environment, however DR-GS came there."""
+    """What installs rows of `LIBRARIES` into this Python's environment, however DR-GS came there."""
     packages = " ".join(f'"{LIBRARIES[name].package}"' for name in names)
-    return f'"{sys.executable}" -m pip install {packages}'
+    return install_remedy(packages, "Photographs without Cameras")
 
 
 def is_there(name: str) -> bool:

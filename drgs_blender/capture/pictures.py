@@ -71,6 +71,8 @@ class Picture:
         Whether its alpha says what is the object; else it is left out.
     merged : tuple of str
         Names of the files of the exposure bracket that it was merged from; it is EXR then, and stays EXR.
+    behind : (h, w, 3) uint8 array, optional
+        What it would show without the object, small, where that is known.
     """
 
     path: Path
@@ -81,6 +83,7 @@ class Picture:
     notes: list[str] = field(default_factory=list)
     alpha: bool = True
     merged: tuple[str, ...] = ()
+    behind: Array | None = None
 
     @property
     def lens(self) -> tuple[int, int, str]:

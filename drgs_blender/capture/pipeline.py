@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from .features import Photo, Tell
 from .inspection import check_count, inspect
 from .marker_sheet import MarkerSheet, recognise
 from .masks import stage as mask_stage
+from .masks.still_background import StillBackground, find_still_background, small_copies, write_turned
 from .pictures import Picture
 from .preparation import Prepared, prepare
 from .registration import FEWEST, Registration, register
@@ -27,6 +28,11 @@ logger = logging.getLogger(__name__)
 POSES = ("auto", "markers", "features")
 #: Part of the pictures that must show the sheet for it alone to give the cameras.
 _MARKED = 0.8
+_STOOD_STILL = "shows the same surroundings in all pictures: the camera stood still, and the object was turned"
+_STILL_REMEDY = (
+    "Draw masks (white on the object, folder masks), or lay a marker sheet under the object and turn it with it "
+    "(drgs markers)"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,8 +150,14 @@ def _make(source: Path, folder: Path, work: Path, film: Path | None, given: list
     photos = [photo for photo, picture in zip(ready.photos, ready.pictures) if any(picture is one for one in fit)]
     by_file = {photo.file: picture for photo, picture in zip(ready.photos, ready.pictures)}
     ups = {photo.file: up for photo in photos if (up := by_file[photo.file].exif.up) is not None}
+    still = _still_background(ready, photos, settings, str(source), _part(tell, 0.2, 0.22), cancelled)
+    sought = ready
+    if still is not None:
+        sought = replace(ready, masks=write_turned(still, work / "turned", photos))
+        for file, behind in still.behind.items():
+            by_file[file].behind = behind
     found, alignment = _cameras(
-        ready, photos, ups, film is not None, source, settings, _part(tell, 0.2, 0.85), cancelled
+        sought, photos, ups, film is not None, source, settings, _part(tell, 0.22, 0.85), cancelled
     )
     alignment.apply(found)
     for photo in photos:
@@ -158,6 +170,11 @@ def _make(source: Path, folder: Path, work: Path, film: Path | None, given: list
         mode, found, by_file, ready.folder, work / "object_masks", folder / mask_stage.CONTACT_SHEET,
         ready.masks, str(source), _part(tell, 0.85, 0.96), cancelled,
     )  # fmt: skip
+    if still is not None and not any(picture.mask for picture in by_file.values()):
+        raise AssetError(
+            str(source), f"{_STOOD_STILL}, and no masks could be made: the room would become part of the object",
+            _STILL_REMEDY,
+        )  # fmt: skip
     made.lines = _lines(made) + bracket_lines + masked.lines
     _tell_left_out(found, photos, by_file, source)
     tell("writing the capture", 0.96)
@@ -223,8 +240,6 @@ def _cameras(ready: Prepared, photos: list[Photo], ups: dict[str, gravity.Vector
         enough = len(marked.matrices) >= max(FEWEST, _MARKED * len(photos))
         if settings.poses == "markers" or enough:
             return marked, _of_sheet(sheet)
-    if ready.masks is None:
-        _check_surroundings(ready, photos, settings, str(source))
     try:
         found = _by_features(ready, photos, ordered, str(source), tell, cancelled)
         check_directions(found, str(source))
@@ -246,23 +261,33 @@ def _cameras(ready: Prepared, photos: list[Photo], ups: dict[str, gravity.Vector
     return found, alignment
 
 
-def _check_surroundings(ready: Prepared, photos: list[Photo], settings: Settings, subject: str) -> None:
-    """Refuse pictures without masks of an object that was turned before a camera that stood still.
+def _still_background(ready: Prepared, photos: list[Photo], settings: Settings, subject: str, tell: Tell,
+                      cancelled: Callable[[], bool]) -> StillBackground | None:  # fmt: skip
+    """What stood still, where pictures without masks show an object that was turned before a still camera, else None.
 
+    Refused where masks are not to be made, or nothing is seen to turn, unless the object turned with a marker sheet;
     `Settings.poses` "features" tries them all the same.
     """
     files = {photo.file for photo in photos}
     looks = [one.signature for photo, one in zip(ready.photos, ready.looks, strict=True) if photo.file in files]
-    if not stood_still(looks):
-        return
-    problem = "shows the same surroundings in all pictures: the camera stood still, and the object was turned"
-    remedy = (
-        "Features would find the room, not the object. Draw masks (white on the object, folder masks), or lay a marker "
-        "sheet under the object and turn it with it (drgs markers)"
-    )
+    if ready.masks is not None or not stood_still(looks):
+        return None
+    if settings.masks not in ("given", "none"):
+        cv2 = libraries.load("opencv")
+        found = find_still_background(cv2, small_copies(ready.folder, photos), tell, cancelled)
+        if found is not None:
+            logger.info("%s %s: features and masks are sought where something turned", subject, _STOOD_STILL)
+            return found
+        problem = f"{_STOOD_STILL}, and what turned cannot be told from what stood still"
+    else:
+        problem = f"{_STOOD_STILL}: features would find the room, not the object"
     if settings.poses == "features":
-        logger.warning("%s %s. %s", subject, problem, remedy)
-        return
+        logger.warning("%s %s. %s", subject, problem, _STILL_REMEDY)
+        return None
+    marked = {photo.file for photo in photos if ready.markers.get(photo.file)}
+    if len(marked) >= max(FEWEST, _MARKED * len(photos)):
+        return None
+    remedy = _STILL_REMEDY if settings.masks != "given" else f"Give --masks auto. Else: {_STILL_REMEDY}"
     raise AssetError(subject, problem, f"{remedy}; --poses features tries it all the same")
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from ..compute import numba_variables, targets
 from ..core.errors import EXIT_NO_DEVICE, EXIT_OK, DeviceError, DrgsError
+from ..core.own_python import install_remedy
 from ..core.version import __version__
 
 EXAMPLES = """examples:
@@ -209,7 +210,9 @@ def torch(args: argparse.Namespace) -> str:
         return importlib.metadata.version("torch")
     except importlib.metadata.PackageNotFoundError:
         raise DeviceError(
-            "torch", "is not installed", f"Only reconstruction needs it: pip install '{_PACKAGE}[reconstruct]'"
+            "torch",
+            "is not installed",
+            f"Only reconstruction needs it: {install_remedy('torch', 'Reconstruction from Photographs')}",
         ) from None
 
 

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..core.errors import Cancelled, DeviceError, UsageError
 from ..core.file_types import CAMERAS, TURNTABLE
+from ..core.own_python import install_remedy
 from ..core.phases import is_preparing
 from ..formats.axes import UP_AXES
 from .frame_lines import emit
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
     from ..reconstruct.settings import Reading, Settings
 
 logger = logging.getLogger(__name__)
+
+#: As pip is told.
+_TORCH = '"torch>=2.5"'
 
 EXAMPLES = """examples:
   drgs reconstruct lego --out lego.drgs --resolution 400 --time-budget 10
@@ -245,9 +249,8 @@ def reconstruction() -> Callable[..., Asset]:
     except ImportError as error:
         if error.name != "torch":
             raise
-        raise DeviceError(
-            "reconstruct", "needs PyTorch", f'Install it: "{sys.executable}" -m pip install "torch>=2.5"'
-        ) from error
+        remedy = f"Install it: {install_remedy(_TORCH, 'Reconstruction from Photographs')}"
+        raise DeviceError("reconstruct", "needs PyTorch", remedy) from error
     return reconstruct
 
 

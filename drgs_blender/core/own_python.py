@@ -11,3 +11,10 @@ bundled: list[str] = []
 def command(*flags: str) -> list[str]:
     """What stands before ``-m`` or ``-c``; `flags` are for a Python that finds the packages by itself."""
     return list(bundled) or [sys.executable, *flags]
+
+
+def install_remedy(packages: str, part: str) -> str:
+    """What brings `packages`, words for pip, into this Python: pip, or in Blender the `part` of *Set Up Engine*."""
+    if bundled:
+        return f'press Set Up Engine in Blender, with "{part}"'
+    return f'"{sys.executable}" -m pip install {packages}'

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from drgs_blender.capture import libraries
+from drgs_blender.core import own_python
 from drgs_blender.ipc.locate import bundled_command
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -63,3 +65,11 @@ def test_a_package_that_is_broken_is_told_after_where_that_was_found(command):
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].endswith("is broken: No module named 'no_such_package'")
     assert "in inner" in done.stderr
+
+
+@pytest.mark.parametrize(("bundled", "said"), [(["python", "-I"], "Set Up Engine"), ([], "pip install")])
+def test_what_is_absent_is_installed_where_the_engine_is(monkeypatch, bundled, said):
+    """Blender's own Python is nobody's to install into."""
+    monkeypatch.setattr(own_python, "bundled", bundled)
+    remedy = libraries.install_command(["av"])
+    assert said in remedy and ("pip install" in remedy) == (said == "pip install")

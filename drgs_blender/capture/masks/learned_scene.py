@@ -3,7 +3,8 @@
 Stage (i) of `reconstruct` learns the object together with the ground on which it stands. The ground begins where it is
 known to be; the space in which the object is sought begins full of faint surfels, of which those stay that several
 views agree on. What is behind both is not learned: it is what the photographs show there, or would show without the
-object, so that nothing is gained by surfels that stand before it.
+object, so that nothing is gained by surfels that stand before it. Where the object was turned before a still camera,
+that is what stood still (`still_background`).
 """
 
 from __future__ import annotations
@@ -88,9 +89,14 @@ def learn_scene(cv2: Any, views: Sequence[MaskView], box: ObjectBox, effort: Eff
     schedule = Schedule(effort.steps, effort.surfels, coarse=0.4, rounds=8, reflections=1.0, bands=_BANDS)
     # by steps alone: the time they take would make masks differ from run to run
     training = Training(Capture(Path("photographs"), shown), region, schedule, first_surfels(shown, box, earlier))
-    ground = GroundPicture(cv2, straight, box)
+    ground = None
     for view, target in zip(straight, training.targets, strict=True):
-        target.background = torch.from_numpy(ground.without_object(view, box.outline(cv2, view), near_ground(box)))
+        if view.behind is not None:
+            behind = view.behind.astype(np.float32) / 255
+        else:
+            ground = ground or GroundPicture(cv2, straight, box)
+            behind = ground.without_object(view, box.outline(cv2, view), near_ground(box))
+        target.background = torch.from_numpy(behind)
     while not training.finished:
         if cancelled():
             raise Cancelled

@@ -32,12 +32,15 @@ class MaskView:
         Camera to world, Blender's axes; Z up, ground at 0.
     lens : Lens
         Of `pixels`.
+    behind : (h, w, 3) uint8 array, optional
+        What the photograph would show without the object, where that is known; of any size.
     """
 
     name: str
     pixels: Array
     matrix: Array
     lens: Lens
+    behind: Array | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -89,12 +92,18 @@ class MaskView:
         x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
         y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
         at = [(c - 0.5).astype(np.float32) for c in distort(self.lens, *np.meshgrid(x, y))]
-        pixels, factor = self.pixels, self.shape[1] / camera.width
-        if factor > 1:
-            pixels = cv2.GaussianBlur(pixels, (0, 0), 0.4 * factor)
-        seen = cv2.remap(pixels, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        factor = self.shape[1] / camera.width
+
+        def seen(pixels: Array) -> Array:
+            if factor > 1:
+                pixels = cv2.GaussianBlur(pixels, (0, 0), 0.4 * factor)
+            return cv2.remap(pixels, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+        behind = self.behind
+        if behind is not None:
+            behind = seen(cv2.resize(behind, self.shape[::-1]))
         lens = Lens(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        return MaskView(self.name, seen, self.matrix, lens)
+        return MaskView(self.name, seen(self.pixels), self.matrix, lens, behind)
 
     def distorted(self, cv2: Any, camera: Camera, values: Array) -> Array:
         """(h, w) float32: values of the pixels of a `pinhole` camera at those of the picture."""
@@ -111,9 +120,14 @@ class MaskView:
         size = max(1, round(width * factor)), max(1, round(height * factor))
         resampling = Pillow.Resampling.BOX if factor < 1 else Pillow.Resampling.BICUBIC
         part = Pillow.fromarray(self.pixels[top:bottom, left:right]).resize(size, resampling)
+        behind = self.behind
+        if behind is not None:
+            own = behind.shape[1] / self.shape[1], behind.shape[0] / self.shape[0]
+            edges = (left * own[0], top * own[1], right * own[0], bottom * own[1])
+            behind = np.asarray(Pillow.fromarray(behind).resize(size, Pillow.Resampling.BILINEAR, box=edges))
         old = self.lens
         moved = Lens(width, height, old.fx, old.fy, old.cx - left, old.cy - top, old.model, old.coefficients)
-        return MaskView(self.name, np.asarray(part), self.matrix, moved.scaled(*size))
+        return MaskView(self.name, np.asarray(part), self.matrix, moved.scaled(*size), behind)
 
     def on_ground(self) -> Array:
         """(h, w, 2) where the pixels' rays meet the ground; NaN at and above the horizon."""

@@ -165,7 +165,7 @@ def _view(file: str, picture: Picture, found: Registration, copies: Path) -> Mas
     with Pillow.open(copies / file) as image:
         pixels = np.asarray(image.convert("RGB"))
     lens = found.lenses[file].scaled(pixels.shape[1], pixels.shape[0])
-    return MaskView(picture.path.name, pixels, found.matrices[file], lens)
+    return MaskView(picture.path.name, pixels, found.matrices[file], lens, picture.behind)
 
 
 def _learned(cv2: Any, views: list[MaskView], pictures: list[Picture], sheet: Path, found: Registration, subject: str,
