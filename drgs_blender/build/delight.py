@@ -20,7 +20,7 @@ from ..formats.gaussian_ply import CAPTURED_ALBEDO
 from ..render.lights.environment import EnvironmentLight
 from ..render.scene.trace_scene import TraceObject, TraceScene
 from .importer import CAPTURED
-from .light_estimate import estimate_light
+from .light_estimate import estimate_light, subject_of
 from .relit import Progress, captured_along, light_components, points_on_mesh, white_surfels
 from .transfer import surfels_to_vertices
 
@@ -69,10 +69,10 @@ def remove_light(
     surfels, mesh = asset.surfels, asset.mesh
     if asset.binding is None or surfels.sh is None:
         lacking = "a mesh" if asset.binding is None else "captured colours"
-        raise UsageError("removing light", f"needs {lacking}", "Import a capture of splats with their mesh")
+        raise UsageError(subject_of(asset), f"needs {lacking}", "Import a capture of splats with their mesh")
     materials = asset.provenance.get("materials", CAPTURED)
     if not materials.startswith(CAPTURED):
-        raise UsageError("removing light", f"is for captures without materials; these are {materials}", "Leave it out")
+        raise UsageError(subject_of(asset), f"is for captures without materials; these are {materials}", "Leave it out")
     surfels.roughness[:], surfels.metallic[:] = _ROUGHNESS, _METALLIC
     mesh.roughness[:], mesh.metallic[:] = _ROUGHNESS, _METALLIC
     estimated = asset.environment is None
@@ -87,7 +87,7 @@ def remove_light(
         known = arriving > _DARK * np.median(arriving)
         if not known.any() or not diffuse[known].any():
             raise UsageError(
-                "removing light", "the environment does not reach the surfels", "Choose that of the capture"
+                subject_of(asset), "the environment does not reach the surfels", "Choose that of the capture"
             )
         used = exposure or _exposure(seen, diffuse, glossy, known, _USUAL if estimated else _BRIGHTEST)
         albedo = np.clip((seen / used - glossy) / np.maximum(diffuse, 1e-6), 0.0, 1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -81,7 +82,7 @@ def import_asset(
     surfel_name = "surfels" if isinstance(surfels, SurfelFile) else str(surfels)
     file = surfels if isinstance(surfels, SurfelFile) else _read_surfels(surfels)
     report: dict[str, Any] = {"layout": file.layout, "surfel_notes": list(file.notes)}
-    captured, report["not_finite"] = _finite(file.surfels, surfel_name)
+    captured, report["not_finite"] = _finite(file.surfels, surfel_name, file.notes)
     if turned := up or file.up:
         captured = surfels_to_z_up(captured, turned)
     captured = scaled_surfels(captured, scale)
@@ -96,7 +97,7 @@ def import_asset(
 
     if mesh is None:
         mesh_name, surface_known = "mesh built from the surfels", False
-        surface, report["mesh"] = mesh_from_surfels(captured, resolution=resolution)
+        surface, report["mesh"] = mesh_from_surfels(captured, surfel_name, resolution=resolution)
     else:
         mesh_name = "mesh" if isinstance(mesh, MeshFile) else str(mesh)
         mesh_file = _with_materials(read_mesh_file(mesh), materials, mesh_name)
@@ -152,10 +153,11 @@ def _with_materials(mesh: MeshFile, source: str | Path | MaterialsFile | None, n
     )
 
 
-def _finite(surfels: Surfels, name: str) -> tuple[Surfels, int]:
+def _finite(surfels: Surfels, name: str, notes: Sequence[str]) -> tuple[Surfels, int]:
     """Surfels without those that have a number that is not finite, and how many those were."""
     if not len(surfels):
-        raise AssetError(name, "has no surfels", "Export the capture again")
+        why = "".join(f": {note}" for note in notes if "dropped" in note)
+        raise AssetError(name, f"has no surfels{why}", "Export the capture again")
     good = np.ones(len(surfels), bool)
     names = [name for name in Surfels.__dataclass_fields__ if name not in ("sh", "extras")]
     names = [name for name in names if getattr(surfels, name) is not None]

@@ -43,6 +43,12 @@ _EVEN, _NEUTRAL = 5e-5, 3e-3
 _SETTINGS = RenderSettings(samples=192, subpixel_samples=1, bounces=1, shading_model="principled")
 
 
+def subject_of(asset: Asset) -> str:
+    """What messages about the removal of light begin with."""
+    name = asset.provenance.get("surfels")
+    return f"removing light of {name}" if name else "removing light"
+
+
 def estimate_light(asset: Asset, progress: Progress | None = None, seed: int = 0) -> Environment:
     """The environment that explains the captured colours of an asset with the simplest paint.
 
@@ -70,20 +76,20 @@ def estimate_light(asset: Asset, progress: Progress | None = None, seed: int = 0
     points = points_on_mesh(white_surfels(surfels), mesh.vertices, mesh.faces, asset.binding)[rows]
     colour = captured_along(surfels, points.normal, rows)
     shown = np.flatnonzero((colour > _DARKEST).all(axis=1) & (colour < _CLIPPED).all(axis=1))
-    _check_enough(len(shown), "neither black nor clipped")
+    _check_enough(asset, len(shown), "neither black nor clipped")
     transfer = _transfer(mesh, points[shown], progress)
     open_ = transfer.sum(axis=1) > _SHUT
     shown = shown[open_]
-    _check_enough(len(shown), "neither black nor clipped, and reached by light from outside")
+    _check_enough(asset, len(shown), "neither black nor clipped, and reached by light from outside")
     light = _fit(np.log(colour[shown]), transfer[open_], surfels.centre[rows[shown]].astype(np.float64), rng)
     radiance = np.einsum("hwk,ck->hwc", _lobes(directions(_ROWS)), light)
     return Environment(radiance.astype(np.float32))
 
 
-def _check_enough(count: int, what: str) -> None:
+def _check_enough(asset: Asset, count: int, what: str) -> None:
     if count < _FEWEST:
         problem = f"has {count} surfels that are {what}, too few to estimate the light of"
-        raise UsageError("removing light", problem, "Give the environment of the capture with --env")
+        raise UsageError(subject_of(asset), problem, "Give the environment of the capture with --env")
 
 
 def _chosen(asset: Asset, rng: np.random.Generator) -> Array:

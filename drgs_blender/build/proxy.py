@@ -38,13 +38,17 @@ FAINT = 0.05
 SIZES = 0.01, 1e5
 
 
-def mesh_from_surfels(surfels: Surfels, *, resolution: int = 192, views: int = 64) -> tuple[Mesh, dict[str, Any]]:
+def mesh_from_surfels(
+    surfels: Surfels, name: str = "surfels", *, resolution: int = 192, views: int = 64
+) -> tuple[Mesh, dict[str, Any]]:
     """Build a watertight mesh around surfels.
 
     Parameters
     ----------
     surfels : Surfels
         Object space.
+    name : str
+        For messages.
     resolution : int
         Voxels along the longest side.
     views : int
@@ -57,11 +61,11 @@ def mesh_from_surfels(surfels: Surfels, *, resolution: int = 192, views: int = 6
     report : dict
         "resolution", "voxel" (metres), "components_dropped", "volume" (cubic metres), "vertices", "faces".
     """
-    low, high = _bounds(surfels)
-    check_extent(np.stack([low, high]), "surfels")
+    low, high = _bounds(surfels, name)
+    check_extent(np.stack([low, high]), name)
     size = float((high - low).max())
     if not SIZES[0] <= size <= SIZES[1]:
-        mesh, report = mesh_from_surfels(scaled_surfels(surfels, 1 / size), resolution=resolution, views=views)
+        mesh, report = mesh_from_surfels(scaled_surfels(surfels, 1 / size), name, resolution=resolution, views=views)
         mesh.vertices = mesh.vertices * np.float32(size)
         return mesh, report | {"voxel": report["voxel"] * size, "volume": report["volume"] * size**3}
     posed = _as_posed(surfels)
@@ -84,7 +88,7 @@ def mesh_from_surfels(surfels: Surfels, *, resolution: int = 192, views: int = 6
         back = known & (outward @ direction <= 0)
         pixels.cosine[back[pixels.surfel]] = 0  # says nothing about what is before it
         field.add(_depth_maps(camera, *pixels.maps(camera)))
-    mesh, report = field.mesh(WITNESSES, SMOOTH, "Give the mesh that they were captured with")
+    mesh, report = field.mesh(WITNESSES, SMOOTH, "Give the mesh that they were captured with", name)
     report = {"resolution": resolution} | report
     log.info("mesh from surfels: %s", report)
     return mesh, report
@@ -107,11 +111,11 @@ def _as_posed(surfels: Surfels) -> PosedSurfels:
     )
 
 
-def _bounds(surfels: Surfels) -> tuple[Array, Array]:
+def _bounds(surfels: Surfels, name: str) -> tuple[Array, Array]:
     """Box of the surfels that matter, without the outermost thousandth (stray ones)."""
     solid = surfels.opacity >= FAINT
     if not solid.any():
-        raise AssetError("surfels", "are all transparent", "Give the mesh that they were captured with")
+        raise AssetError(name, "has only transparent surfels", "Give the mesh that they were captured with")
     reach = surfels.scale[solid].max(axis=1, keepdims=True)
     low = np.quantile(surfels.centre[solid] - reach, 0.001, axis=0)
     high = np.quantile(surfels.centre[solid] + reach, 0.999, axis=0)

@@ -127,7 +127,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Convert one file, or those of all frames."""
     check_vertex_order(args)
-    args.frame = args.scene_fps = None
+    args.frame = args.scene = args.scene_fps = None
     if args.input.suffix.lower() == ".blend":
         from .convert_blend import evaluated_frames
 
@@ -232,7 +232,7 @@ def convert(args: argparse.Namespace) -> None:
         remedy = f"Name OUT {names_for(source.kinds)}"
         if "environment" in wanted and args.input.suffix.lower() == ".drgs":
             remedy += ", or make the asset with the light of its capture: `drgs import ... --env`"
-        raise UsageError(str(args.input), problem, remedy)
+        raise UsageError(str(args.scene or args.input), problem, remedy)
     writer = find_writer(args.output, [args.kind] if args.kind else source.kinds)
     kind = writer.kind
     if writer.fixed and args.up not in (None, writer.up):

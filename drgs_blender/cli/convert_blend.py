@@ -13,10 +13,12 @@ from typing import Any
 from ..core.errors import AssetError, EngineError, UsageError
 from ..core.file_types import LOST_IN_ALEMBIC
 from ..core.frame_sequences import frame_path
+from ..formats.writers import find_writer
 from ..ipc.frame_file import SUFFIX, write_frame_file
 from .blender_process import BlenderProcess
+from .convert_sequence import check_one_file, is_sequence
 from .find_blender import find_blender
-from .frame_range import parse_frames
+from .frame_range import check_template, parse_frames
 from .output import check_writable
 from .progress import bar
 
@@ -47,6 +49,7 @@ def evaluated_frames(args: argparse.Namespace) -> Iterator[argparse.Namespace | 
             raise UsageError(f"--{option.replace('_', '-')}", "does not go with a .blend", "Leave it out")
     frames = parse_frames(args.frames)
     check_writable(args.output, (scene,))
+    _check_names(args, frames)
     job: dict[str, Any] = {
         "scene": str(scene),
         "frames": frames,
@@ -60,7 +63,17 @@ def evaluated_frames(args: argparse.Namespace) -> Iterator[argparse.Namespace | 
     with tempfile.TemporaryDirectory(prefix="drgs-convert-") as folder:
         template = str(Path(folder) / f"####{SUFFIX}")
         report = _write_frames(args, job | {"report": True, "surfaces": True}, template)
-        yield argparse.Namespace(**(vars(args) | {"input": Path(template), "scene_fps": report["fps"]}))
+        of_scene = {"input": Path(template), "scene": args.input, "scene_fps": report["fps"]}
+        yield argparse.Namespace(**(vars(args) | of_scene))
+
+
+def _check_names(args: argparse.Namespace, frames: list[int]) -> None:
+    """Refuse an OUT that cannot be written before Blender evaluates a frame."""
+    if args.output.suffix.lower() == ALEMBIC:
+        check_one_file(args.output)
+    elif not is_sequence(args, frames):
+        find_writer(args.output, [args.kind] if args.kind else ("mesh", "splats", "environment"))
+        check_template(str(args.output), frames)
 
 
 def _write_frames(args: argparse.Namespace, job: dict[str, Any], template: str) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,17 +33,23 @@ def is_sequence(args: argparse.Namespace, frames: Sequence[int] | None) -> bool:
     return args.kind == "sequence" or (stage and args.kind != "environment" and len(frames or ()) > 1)
 
 
+def check_one_file(path: Path) -> None:
+    """Refuse a number in the name of a file that has all frames."""
+    if "#" in path.name:
+        raise UsageError(str(path), "has all frames, so its name has no number", "Leave out the #")
+
+
 def convert_sequence(args: argparse.Namespace, frames: Sequence[int] | None) -> None:
     """Write the frames, by default the only one that there is, as samples of one stage, and say what was written."""
     from ..formats.usd_sequence import write_usd_sequence
     from ..formats.usd_splats import check_usd
     from ..formats.writers import WRITERS, either
+    from .convert_source import check_objects
 
     (writer,) = (w for w in WRITERS if w.name == "USD sequence")
     if args.output.suffix.lower() not in writer.extensions:
         raise UsageError(str(args.output), "holds no sequence", f"Name OUT {either(writer.extensions)}")
-    if "#" in args.output.name:
-        raise UsageError(str(args.output), "has all frames, so its name has no number", "Leave out the #")
+    check_one_file(args.output)
     if args.up not in (None, writer.up):
         raise UsageError("--up", f"is {args.up}, but {writer.name} is {writer.up} up", "Leave --up out")
     options = writer.chosen({name: getattr(args, name) for name in OPTIONS})
@@ -52,14 +59,17 @@ def convert_sequence(args: argparse.Namespace, frames: Sequence[int] | None) -> 
     check_writable(args.output, (args.input, args.vertices, args.env))
     check_usd(str(args.output))
     numbers = sorted(frames) if frames else [args.frame or 1]
+    span = f"frames {numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else f"frame {numbers[0]}"
     told: dict[str, None] = {}
     counts: dict[str, tuple[int, int]] = {}
+    seen: dict[str, None] = {}
 
     def moving() -> Iterator[tuple[int, list[MovingObject]]]:
         with bar(args, "frames", len(numbers)) as progress:
             for number, source in _sources(args, numbers, frames is not None):
                 objects = [_scaled(state, args) for state in source.moving(args.kind != "splats", surfels)]
                 told.update(dict.fromkeys(source.notes))
+                seen.update(dict.fromkeys(getattr(source, "names", ())))
                 for o in objects:
                     counts[o.name] = (
                         0 if o.mesh is None else len(o.mesh.faces),
@@ -67,9 +77,12 @@ def convert_sequence(args: argparse.Namespace, frames: Sequence[int] | None) -> 
                     )
                 yield number, objects
                 progress.update()
+        check_objects(args, list(seen))
+        if not counts:
+            problem = f"has no DR-GS object that the camera sees in {span}"
+            raise UsageError(str(args.scene or args.input), problem, "Show one in renders, or choose other frames")
 
     told.update(dict.fromkeys(write_usd_sequence(args.output, moving(), _fps(args), **options)))
-    span = f"frames {numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else f"frame {numbers[0]}"
     print(f"{args.output}: {span}, {_fps(args):g} per second, {writer.name}, z up")
     for name, (triangles, splats) in counts.items():
         print(f"  {name}: {triangles} triangles" + (f", {splats} surfels" if surfels or splats else ""))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -80,7 +81,9 @@ def open_source(args: argparse.Namespace) -> Source:
     if args.vertices:
         raise UsageError("--vertices", "poses an asset, but the input is none", "Leave it out")
     if suffix == SUFFIX:
-        return FrameSource(args)
+        frame = FrameSource(args)
+        check_objects(args, frame.names)
+        return frame
     file = read(args.input)
     if isinstance(file, SurfelFile):
         surfels = surfels_to_z_up(file.surfels, args.from_up or file.up or "z")
@@ -96,6 +99,15 @@ def open_source(args: argparse.Namespace) -> Source:
         mesh, report = mesh_with_materials(file, str(args.input), up=args.from_up, max_texture=MAX_TEXTURE)
         return AssetSource(args, Asset(_nothing(), mesh), report["notes"])
     raise UsageError(str(args.input), "holds materials alone", "Make an asset of it and its mesh first")
+
+
+def check_objects(args: argparse.Namespace, seen: Sequence[str]) -> None:
+    """Refuse an ``--object`` that is not among those that are seen, of one frame or of all."""
+    if unseen := [name for name in args.object or () if name not in seen]:
+        known = ", ".join(dict.fromkeys(seen)) or "none"
+        problem = f"is no DR-GS object that the camera sees in {args.scene or args.input}, which has {known}"
+        remedy = "Choose one of them" if seen else "Show it in renders, or choose other frames"
+        raise UsageError(f"--object {unseen[0]}", problem, remedy)
 
 
 class AssetSource:
@@ -165,7 +177,13 @@ class AssetSource:
 
 
 class FrameSource:
-    """The DR-GS objects that the camera may see in a frame of Blender's, where they are in the world, and the light."""
+    """The DR-GS objects that the camera may see in a frame of Blender's, where they are in the world, and the light.
+
+    Attributes
+    ----------
+    names : list of str
+        The objects, those that ``--object`` leaves out among them.
+    """
 
     def __init__(self, args: argparse.Namespace, session: Session | None = None) -> None:
         from ..engine.session import Session
@@ -177,12 +195,8 @@ class FrameSource:
         self.notes: list[str] = []
         self._prepared, self._objects = session.prepare(self._frame)
         self._visible = [i for i, item in enumerate(self._objects) if item.state.visibility.camera]
+        self.names = [self._objects[i].state.name for i in self._visible]
         if args.object:
-            there = [self._objects[i].state.name for i in self._visible]
-            if missing := [name for name in args.object if name not in there]:
-                known = ", ".join(dict.fromkeys(there)) or "none"
-                problem = f"is no DR-GS object that is seen in {args.input.name}, which has {known}"
-                raise UsageError(f"--object {missing[0]}", problem, "Choose one of them")
             self._visible = [i for i in self._visible if self._objects[i].state.name in args.object]
         self._session = session  # keeps the scene
         faces = any(len(self._objects[i].mesh.faces) for i in self._visible)

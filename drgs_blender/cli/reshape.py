@@ -97,8 +97,10 @@ def _swapped(asset: Asset, arrays: dict[str, np.ndarray], args: argparse.Namespa
             read_mesh_file(args.mesh), materials=[], face_material=None, vertex_colours=None, vertex_roughness=None,
             vertex_metallic=None,
         )  # fmt: skip
-        mesh, _ = mesh_with_materials(file, str(args.mesh), up=args.up)
+        mesh, of_file = mesh_with_materials(file, str(args.mesh), up=args.up)
         made, report = swap_mesh(asset, mesh.vertices, mesh.faces, str(args.mesh), mesh.source)
+        for note in of_file["notes"]:
+            print(f"{args.mesh.name}: {note}")
     print(f"bound to {len(made.mesh.faces)} faces, at a median distance of {report['distance_median']:.3g} m")
     return made
 

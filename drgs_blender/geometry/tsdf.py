@@ -108,7 +108,9 @@ class SignedDistanceField:
         """
         over_range(_fuse, len(self._voxels.total), self._voxels, maps, BAND * self._voxels.size)
 
-    def mesh(self, witnesses: int, smoothing: float, advice: str) -> tuple[Mesh, dict[str, Any]]:
+    def mesh(
+        self, witnesses: int, smoothing: float, advice: str, name: str = "mesh from surfels"
+    ) -> tuple[Mesh, dict[str, Any]]:
         """The zero level, as a watertight mesh of the components that matter.
 
         Parameters
@@ -119,6 +121,8 @@ class SignedDistanceField:
             Standard deviation of the filter of the field, in voxels.
         advice : str
             Advice where no mesh can be made, for the message.
+        name : str
+            What the surfels are called there.
 
         Returns
         -------
@@ -139,7 +143,7 @@ class SignedDistanceField:
         np.divide(total, weight, out=field, where=views >= witnesses)
         field = np.pad(gaussian_filter(field, smoothing), 1, constant_values=1.0)
         if not field.min() < 0 < field.max():
-            raise AssetError("surfels", "enclose no volume", advice)
+            raise AssetError(name, "surfels enclose no volume", advice)
         vertices, faces, _, _ = marching_cubes(field, 0.0)
         vertices, faces, dropped, volume = main_parts((vertices - 1) * voxel + low, faces)
         n = len(vertices)

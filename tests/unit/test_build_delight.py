@@ -239,7 +239,8 @@ def test_what_is_lacking_is_said(capture: tuple[Asset, np.ndarray, np.ndarray]) 
     black = copied(asset)
     black.surfels.sh = np.full_like(asset.surfels.sh, -0.5 / SH_C0)
     black.environment = None
-    with pytest.raises(UsageError, match=r"0 surfels that are neither black nor clipped.*--env"):
+    black.provenance["surfels"] = "night.ply"
+    with pytest.raises(UsageError, match=r"night\.ply.*0 surfels that are neither black nor clipped.*--env"):
         remove_light(black)
     with pytest.raises(UsageError, match="needs a mesh"):
         remove_light(Asset(asset.surfels, Mesh.empty()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from splat_files import random_splats
 
 from drgs_blender.build.importer import import_asset
 from drgs_blender.build.proxy import mesh_from_surfels
@@ -193,6 +194,26 @@ def test_surfels_that_are_not_finite_are_dropped_and_counted():
         import_asset(SurfelFile(capture, "IRGS"), sphere_mesh(3))
     with pytest.raises(AssetError, match="has no surfels"):
         import_asset(SurfelFile(sphere_capture(10, keep=lambda p: p[:, 0] > 9), "IRGS"), sphere_mesh(3))
+
+
+def test_a_file_of_which_no_mesh_can_be_made_is_named(tmp_path):
+    """Too few splats enclose nothing; of faint ones there is no outline; of splats that are all NaN none is left."""
+    from drgs_blender.formats.writers import WRITERS
+
+    (writer,) = (w for w in WRITERS if w.kind == "splats" and ".ply" in w.extensions)
+    for count, opacity, problem in ((3, 0.9, "enclose no volume"), (9, 0.001, "only transparent")):
+        file = tmp_path / f"of {count}.ply"
+        splats = random_splats(count, 9)
+        splats.opacity[:] = opacity
+        writer.write(file, splats)
+        with pytest.raises(AssetError, match=rf"of {count}\.ply.*{problem}.*Give the mesh"):
+            import_asset(file)
+    data = bytearray(file.read_bytes())
+    start = data.index(b"end_header") + 11
+    data[start:] = np.full((len(data) - start) // 4, np.nan, np.float32).tobytes()
+    file.write_bytes(data)
+    with pytest.raises(AssetError, match="has no surfels: 9 of 9 splats dropped: NaN"):
+        import_asset(file)
 
 
 def test_bind_reports_what_it_did():

@@ -144,6 +144,28 @@ def test_objects_stand_where_their_matrices_put_them(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.vertices.min(axis=0), [-2, -2, -6], atol=1e-5)
 
 
+def test_an_object_may_be_hidden_in_some_frames_of_a_sequence_but_not_in_all(tmp_path, capsys) -> None:
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    asset = str(plate(tmp_path / "plate.drgs"))
+    for number in (1, 2):
+        states = [ObjectState("a", asset), ObjectState("b", asset, visibility=Visibility(camera=number == 2))]
+        write_frame_file(tmp_path / f"{number}.drgsframe", frame_of(states))
+    given = ["convert", str(tmp_path / "#.drgsframe"), str(tmp_path / "f.usdc"), "--frames", "1-2", "--object"]
+    assert main([*given, "b"]) == 0
+    stage = Usd.Stage.Open(str(tmp_path / "f.usdc"))
+    (prim,) = stage.GetDefaultPrim().GetChildren()
+    seen = [UsdGeom.Imageable(prim).ComputeVisibility(number) for number in (1, 2)]
+    assert prim.GetName() == "b" and seen == ["invisible", "inherited"]
+    (tmp_path / "f.usdc").unlink()
+    assert main([*given, "c"]) == 64
+    assert "--object c" in (told := capsys.readouterr().err) and "#.drgsframe, which has a, b" in told
+    given[4] = "1"
+    assert main([*given, "b", "--as", "sequence"]) == 64
+    assert not (tmp_path / "f.usdc").exists()
+
+
 @pytest.mark.parametrize("rays_see", ["mesh", "surfels"])
 def test_the_light_of_the_scene_is_baked_with_its_lights_and_shadows(tmp_path: Path, rays_see: str) -> None:
     """A sun from above of 1 W/m2 on a plate of albedo a leaves a / pi; half of it lies in the shadow of a mesh."""

@@ -138,6 +138,11 @@ def test_the_command(ball: Asset, coarse: tuple, tmp_path: Path, capsys: pytest.
     np.testing.assert_allclose(made.mesh.vertices, coarse[0], atol=1e-6)
     np.testing.assert_array_equal(made.surfels.centre, ball.surfels.centre)
     assert made.provenance["edited_from"] == "ball.drgs" and "bound to 1280 faces" in capsys.readouterr().out
+    damaged = (tmp_path / "new.obj").read_text().splitlines()
+    damaged[next(i for i, line in enumerate(damaged) if line.startswith("v "))] = "v nan 0 0"
+    (tmp_path / "new.obj").write_text("\n".join(damaged))
+    assert main([*given, "--up", "z", "--out", str(tmp_path / "damaged.drgs")]) == 0
+    assert "new.obj: 1 vertices that are NaN or infinite removed" in capsys.readouterr().out
     assert main([*given, "--edit", "e.npz", "--out", str(tmp_path / "b.drgs")]) == 64
     np.savez(tmp_path / "swap.npz", mesh_vertices=coarse[0], mesh_faces=coarse[1], matrix=np.eye(3))
     given[2:] = ["--edit", str(tmp_path / "swap.npz"), "--out", str(tmp_path / "c.drgs")]
