@@ -33,7 +33,10 @@ def fault(source: Path = SOURCE) -> str:
     if names and not Path(sys.executable or "").stem.lower().startswith("python"):
         return f"need Blender's own Python as a program, which this Blender lacks (it names {sys.executable!r})"
     for name in names:
-        distribution, version, *_, tag, abi, _ = name.removesuffix(".whl").split("-")
+        parts = name.removesuffix(".whl").split("-")
+        if len(parts) < 5:
+            return f"name {name}, which is no wheel: install the zip again"
+        distribution, version, *_, tag, abi, _ = parts
         made = _PYTHON.match(tag)
         if made and not abi.startswith("abi") and (int(made[1]), int(made[2])) != sys.version_info[:2]:
             ours = ".".join(map(str, sys.version_info[:2]))

@@ -155,6 +155,7 @@ def test_what_a_bundle_lacks_is_named(tmp_path, monkeypatch):
     assert "lack numbo 0.68" in bundle.fault(lacking)
     foreign = source_with(tmp_path / "foreign", "pytest-1.0-cp39-cp39-linux_x86_64.whl")
     assert "are for Python 3.9" in bundle.fault(foreign) and "the zip for this Blender" in bundle.fault(foreign)
+    assert "name pytest.whl, which is no wheel" in bundle.fault(source_with(tmp_path / "odd", "pytest.whl"))
     monkeypatch.delenv("DRGS_ENGINE")
     names, complaint = bundle.wheels(lacking), bundle.fault(lacking)
     monkeypatch.setattr(bundle, "wheels", lambda: names)
