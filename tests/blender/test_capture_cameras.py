@@ -40,6 +40,7 @@ def capture(tmp_path):
     return folder, frames
 
 
+@pytest.mark.slow
 def test_a_file_of_the_capture_stands_for_its_folder(scene, capture):
     folder, _ = capture
     (folder / "sparse" / "0").mkdir(parents=True)
@@ -125,6 +126,7 @@ def test_a_copy_and_pictures_of_the_user_stay_when_cameras_are_renewed(scene, ca
     assert sorted(one.image.name for one in first.data.background_images) == ["grid", "photo_2.png"]
 
 
+@pytest.mark.slow
 def test_a_photograph_beside_a_capture_is_not_taken_for_it_and_damage_is_named(scene, capture):
     folder, _ = capture
     (folder / "other").mkdir()
