@@ -47,6 +47,10 @@ class OfArrays(Generic[T]):
             del self._known[next(iter(self._known))]
         return known[1]
 
+    def clear(self) -> None:
+        """Drop everything."""
+        self._known.clear()
+
 
 #: Keys of the meshes of assets, by their faces.
 _keys: OfArrays[int] = OfArrays(8)
@@ -66,14 +70,19 @@ def new_mesh(name: str, source: Mesh) -> bpy.types.Mesh:
     for channel in source.channels:
         write_channel(mesh, channel, getattr(source, channel))
     for group, members in source.groups.items():
-        mask = np.zeros(len(source.vertices), bool)
-        mask[members] = True
-        mesh.attributes.new(group, "BOOLEAN", "POINT").data.foreach_set("value", mask)
+        write_group(mesh, group, members)
     write_source_vertices(mesh, source)
     mesh.attributes.default_color_name = mesh.attributes.active_color_name = "albedo"
     mesh.update(calc_edges=True)
     mesh.shade_smooth()
     return mesh
+
+
+def write_group(mesh: bpy.types.Mesh, name: str, members: Array) -> None:
+    """Say by an attribute which vertices of a mesh are the `members`, (k,) int, of a group."""
+    mask = np.zeros(len(mesh.vertices), bool)
+    mask[members] = True
+    mesh.attributes.new(name, "BOOLEAN", "POINT").data.foreach_set("value", mask)
 
 
 def write_source_vertices(mesh: bpy.types.Mesh, rest: Mesh, rows: Array | None = None) -> None:

@@ -22,13 +22,8 @@ Array = np.ndarray
 SUFFIX = ".drgs"
 
 
-class DRGS_OT_save_shape(CommandOperator, selection.ObjectMode, bpy.types.Operator):
-    """Write the active DR-GS object as a new .drgs asset with the shape of its mesh, as sculpted, cut and mended; new
-    faces, such as filled holes, get surfels. The object uses the new file from then on"""
-
-    bl_idname = "drgs.save_shape"
-    bl_label = "Save Edited Shape"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+class ReshapeOperator(CommandOperator, selection.ObjectMode):
+    """Base of operators for which ``drgs reshape`` writes a new asset, by arrays of what Blender has."""
 
     filepath: StringProperty(
         name="File",
@@ -41,27 +36,48 @@ class DRGS_OT_save_shape(CommandOperator, selection.ObjectMode, bpy.types.Operat
 
     _object, _target = "", Path()
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def choose_file(self, context: bpy.types.Context, name: str) -> set[str]:
+        """Ask for the file, by default `name` beside the .blend."""
         if not self.filepath:
-            name = bpy.path.clean_name(selection.selected(context)[-1].name)
-            self.filepath = os.path.join(os.path.dirname(bpy.data.filepath), f"{name} shape{SUFFIX}")
+            self.filepath = os.path.join(os.path.dirname(bpy.data.filepath), f"{name}{SUFFIX}")
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def run(self, context: bpy.types.Context) -> set[str]:
+    def read_target(self) -> None:
+        """Take over the chosen file. Raises UsageError without one."""
         self._target = Path(bpy.path.ensure_ext(bpy.path.abspath(self.chosen("Asset")), SUFFIX))
+
+    def reshape(
+        self, context: bpy.types.Context, source: Path, arrays: dict[str, Any], subject: str, said: tuple[str, str]
+    ) -> set[str]:
+        """Start ``drgs reshape`` of the asset `source`; `said` are status and failure of `start`."""
+        with self.folder("drgs-reshape-") as folder:
+            edit = folder / "edit.npz"
+            np.savez(edit, **arrays)
+            given = ["reshape", str(source), "--edit", str(edit), "--out", str(self._target)]
+            return self.start(context, given, subject, *said, [self._target])
+
+
+class DRGS_OT_save_shape(ReshapeOperator, bpy.types.Operator):
+    """Write the active DR-GS object as a new .drgs asset with the shape of its mesh, as sculpted, cut and mended; new
+    faces, such as filled holes, get surfels. The object uses the new file from then on"""
+
+    bl_idname = "drgs.save_shape"
+    bl_label = "Save Edited Shape"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return self.choose_file(context, f"{bpy.path.clean_name(selection.selected(context)[-1].name)} shape")
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        self.read_target()
         (obj,) = selection.editable(selection.selected(context)[-1:], data=True)
         surfel_points.check_finished(obj)
         assets.check_unused(self._target)
         self._object = obj.name
         source = assets.file_of(obj)
-        with self.folder("drgs-shape-") as folder:
-            edit = folder / "edit.npz"
-            arrays: dict[str, Any] = edit_of(obj, assets.load(source))
-            np.savez(edit, **arrays)
-            given = ["reshape", str(source), "--edit", str(edit), "--out", str(self._target)]
-            status, failure = f"Saving {self._target.name}", "could not be saved"
-            return self.start(context, given, f'Object "{obj.name}"', status, failure, [self._target])
+        said = f"Saving {self._target.name}", "could not be saved"
+        return self.reshape(context, source, edit_of(obj, assets.load(source)), f'Object "{obj.name}"', said)
 
     def done(self, context: bpy.types.Context) -> set[str]:
         obj = bpy.data.objects.get(self._object)

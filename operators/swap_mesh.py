@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
-from typing import Any
 
 import bpy
 import numpy as np
-from bpy.props import BoolProperty, StringProperty
+from bpy.props import BoolProperty
 
-from ..addon import assets, blend_paths, mesh_arrays, surfel_points
+from ..addon import assets, mesh_arrays, surfel_points
 from ..addon.export.topology_check import REMODELLING
 from ..addon.viewport_material import viewport_material
 from ..drgs_blender.core.asset import MATERIAL_CHANNELS, Asset, Mesh
 from ..drgs_blender.core.asset.part import vertices_of
 from ..drgs_blender.core.errors import UsageError
 from . import selection
-from .engine_command import CommandOperator
-from .save_shape import SUFFIX, edit_of
+from .save_shape import ReshapeOperator, edit_of
 
 Array = np.ndarray
 
 
-class DRGS_OT_swap_mesh(CommandOperator, selection.ObjectMode, bpy.types.Operator):
+class DRGS_OT_swap_mesh(ReshapeOperator, bpy.types.Operator):
     """Select a new mesh at the same place, such as a retopology, then the DR-GS object: the new mesh becomes the DR-GS
     object, with the same surfels and materials, in a new .drgs file. It keeps its rig, weights and shape keys"""
 
@@ -31,44 +28,27 @@ class DRGS_OT_swap_mesh(CommandOperator, selection.ObjectMode, bpy.types.Operato
     bl_label = "Swap Mesh"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
-    filepath: StringProperty(
-        name="File",
-        description="The .drgs file to write",
-        subtype="FILE_PATH",
-        options={"SKIP_SAVE", *blend_paths.RELATIVE},
-    )
-    filter_glob: StringProperty(default="*.drgs", options={"HIDDEN"})
-    check_existing: BoolProperty(default=True, options={"HIDDEN"})
     use_original: BoolProperty(name="Keep Original", description="Leave the old object visible", default=False)
 
-    _object, _other, _target = "", "", Path()
+    _other = ""
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         try:
             _, other = chosen(context)
         except UsageError as error:
             return self.fail(error)
-        if not self.filepath:
-            name = bpy.path.clean_name(other.name)
-            self.filepath = os.path.join(os.path.dirname(bpy.data.filepath), f"{name}{SUFFIX}")
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
+        return self.choose_file(context, bpy.path.clean_name(other.name))
 
     def run(self, context: bpy.types.Context) -> set[str]:
         obj, other = chosen(context)
-        self._target = Path(bpy.path.ensure_ext(bpy.path.abspath(self.chosen("Asset")), SUFFIX))
+        self.read_target()
         assets.check_unused(self._target)
         surfel_points.check_finished(obj)
         check_new(other)
         self._object, self._other = obj.name, other.name
         source = assets.file_of(obj)
-        with self.folder("drgs-swap-") as folder:
-            edit = folder / "edit.npz"
-            arrays: dict[str, Any] = swap_of(obj, assets.load(source), other)
-            np.savez(edit, **arrays)
-            given = ["reshape", str(source), "--edit", str(edit), "--out", str(self._target)]
-            status, failure = f"Binding to {other.name}", "could not be bound to it"
-            return self.start(context, given, f'Object "{other.name}"', status, failure, [self._target])
+        said = f"Binding to {other.name}", "could not be bound to it"
+        return self.reshape(context, source, swap_of(obj, assets.load(source), other), f'Object "{other.name}"', said)
 
     def done(self, context: bpy.types.Context) -> set[str]:
         obj, other = bpy.data.objects.get(self._object), bpy.data.objects.get(self._other)
@@ -169,9 +149,7 @@ def make_drgs(other: bpy.types.Object, obj: bpy.types.Object, path: Path, rest: 
     mesh_arrays.restore_channels(mesh, rest)
     for group, members in rest.groups.items():
         if group not in mesh.attributes:
-            mesh.attributes.new(group, "BOOLEAN", "POINT").data.foreach_set(
-                "value", np.isin(np.arange(len(mesh.vertices)), members)
-            )
+            mesh_arrays.write_group(mesh, group, members)
     mesh_arrays.write_source_vertices(mesh, rest)
     mesh.attributes.default_color_name = mesh.attributes.active_color_name = "albedo"
     mesh.materials.clear()

@@ -67,10 +67,10 @@ class DRGS_PT_sampling(_RenderPanel, bpy.types.Panel):
         draw_detail(column, settings)
 
 
-def draw_detail(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
-    """How many surfels moving viewports show."""
-    layout.prop(settings, "level_of_detail")
-    row = layout.row()
+def draw_detail(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, expand: bool = False) -> None:
+    """How many surfels moving viewports show; `expand` shows the choices as buttons."""
+    layout.row(align=True).prop(settings, "level_of_detail", expand=expand)
+    row = layout.row(align=True)
     row.active = settings.level_of_detail == "AUTOMATIC"
     row.prop(settings, "viewport_surfels")
 

@@ -9,6 +9,7 @@ import bpy
 from .. import assets, reconstruction, running, workflow, world_setup
 from ..viewport import views
 from .engine_setup import draw_engine
+from .render import draw_detail
 from .text_layout import bar_text, wrapped
 
 
@@ -96,13 +97,8 @@ def _view(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
             wrapped(column, context, "Splats are shown as edited, behind the vertices of their mesh", "INFO")
         elif assets.is_drgs(owner := obj.drgs.points_of):
             wrapped(column, context, f"Points are the splats of {owner.name}, which are shown behind them", "INFO")
-    if context.scene.drgs.overlay == "OFF":
-        return
-    column = layout.column(align=True)
-    column.row(align=True).prop(context.scene.drgs, "level_of_detail", expand=True)
-    row = column.row(align=True)
-    row.active = context.scene.drgs.level_of_detail == "AUTOMATIC"
-    row.prop(context.scene.drgs, "viewport_surfels")
+    if context.scene.drgs.overlay != "OFF":
+        draw_detail(layout.column(align=True), context.scene.drgs, expand=True)
 
 
 def _render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

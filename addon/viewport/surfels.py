@@ -28,11 +28,9 @@ Array = np.ndarray
 
 #: Diameter of a disc in standard deviations of its surfel: neighbours just overlap.
 _WIDTH = 2.5
-#: Assets of which the order of surfels is kept.
-_KEPT_ORDERS = 8
 cache = ExportCache()
-#: Orders of surfels, by the place of the array of their centres, which they keep.
-_orders: dict[int, tuple[Array, Detail]] = {}
+#: Orders of the surfels of assets, by their centres.
+_orders: mesh_arrays.OfArrays[Detail] = mesh_arrays.OfArrays(8)
 #: What viewports show in place of all surfels, in words, by `views.name_of`.
 _reductions: dict[str, str] = {}
 
@@ -180,12 +178,7 @@ def first_rows(asset: Asset, share: float) -> tuple[Array | slice, Array | float
     count = max(1, round(share * len(asset.surfels)))
     if share >= 1.0 or count >= len(asset.surfels):
         return slice(None), 1.0
-    place = asset.surfels.centre
-    if id(place) not in _orders:
-        while len(_orders) >= _KEPT_ORDERS:
-            del _orders[next(iter(_orders))]
-        _orders[id(place)] = place, Detail.of(asset.surfels)
-    detail = _orders[id(place)][1]
+    detail = _orders.get(asset.surfels.centre, lambda: Detail.of(asset.surfels))
     return detail.order[:count], detail.growth(count)
 
 

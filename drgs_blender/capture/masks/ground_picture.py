@@ -52,7 +52,7 @@ class GroundPicture:
         enough = np.isfinite(stack[..., 0]).sum(axis=0) >= _FEWEST
         stack[:, ~enough] = 0
         self.colour = _median(stack)
-        gains = [self._gain(picture, self.colour, enough) for picture in stack]
+        gains = [exposure_gain(picture, self.colour, enough) for picture in stack]
         for picture, gain in zip(stack, gains, strict=True):
             picture *= gain
         self.colour = _median(stack)
@@ -77,14 +77,6 @@ class GroundPicture:
         pixels = self._blurred(view.pixels)
         return self._cv2.remap(pixels, at, None, self._cv2.INTER_LINEAR, borderValue=(np.nan,) * 3)
 
-    @staticmethod
-    def _gain(picture: Array, colour: Array, enough: Array) -> Array:
-        """(3,) by which a view's exposure differs from the median."""
-        known = enough & np.isfinite(picture[..., 0]) & (picture.min(axis=-1) > 8) & (colour.min(axis=-1) > 8)
-        if known.sum() < 100:
-            return np.ones(3, np.float32)
-        return np.median(colour[known] / picture[known], axis=0).astype(np.float32)
-
     def without_object(self, view: MaskView, outline: Array, near: tuple[Array, Array]) -> Array:
         """(h, w, 3) float32 in 0..1, sRGB: what the view would show behind the object and the ground `near` it.
 
@@ -101,7 +93,7 @@ class GroundPicture:
         expected = cv2.remap(self.colour, at, None, cv2.INTER_LINEAR, borderValue=(np.nan,) * 3)
         spread = cv2.remap(self.spread, at, None, cv2.INTER_LINEAR, borderValue=np.nan)
         pixels = self._blurred(view.pixels)
-        gain = self._gain(pixels, np.nan_to_num(expected), np.isfinite(expected[..., 0]))
+        gain = exposure_gain(pixels, np.nan_to_num(expected), np.isfinite(expected[..., 0]))
         difference = np.abs(pixels * gain - expected).mean(axis=-1)
         known = np.isfinite(difference)
         weight = cv2.boxFilter(known.astype(np.float32), -1, (3, 3))
@@ -115,6 +107,14 @@ class GroundPicture:
             behind = cv2.inpaint(behind, hidden, 3, cv2.INPAINT_TELEA)
         behind[learned] = self._mean
         return behind.astype(np.float32) / 255
+
+
+def exposure_gain(picture: Array, colour: Array, known: Array) -> Array:
+    """(3,) by which the exposure of a picture differs from that of `colour`, (h, w, 3) each, where that is `known`."""
+    known = known & np.isfinite(picture[..., 0]) & (picture.min(axis=-1) > 8) & (colour.min(axis=-1) > 8)
+    if known.sum() < 100:
+        return np.ones(3, np.float32)
+    return np.median(colour[known] / picture[known], axis=0).astype(np.float32)
 
 
 def _median(stack: Array) -> Array:

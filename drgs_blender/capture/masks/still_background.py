@@ -22,6 +22,7 @@ from ...core.arrays import Array
 from ...core.asset.archive import replace_by
 from ...core.errors import Cancelled
 from ..features import Photo, Tell
+from .ground_picture import exposure_gain
 
 #: Pixels of the longer side at which pictures are compared.
 SIDE = 560
@@ -33,8 +34,8 @@ _RATIO = 0.75
 _DIFFERENT, _AGREED = 0.15, 0.3
 #: Least difference (of 255), and in parts of that of the rims.
 _FLOOR, _NOISES = 10.0, 3.0
-#: Steps of what is behind, of 255 a pixel, at which the object is taken to begin, at least; else that which so many
-#: pixels of the background around stay below.
+#: Steps of what is behind, of 255 a pixel, at which the object is taken to begin: the larger of this and the quantile
+#: of the background around.
 _EDGE, _TEXTURE = 6.0, 0.9
 #: Parts of what turned that are smaller than this part of the largest are passers-by.
 _SMALL = 0.05
@@ -44,6 +45,8 @@ _NOTCH = 0.04
 _MARGIN = 2
 #: Difference from the background at the rims (of 255) above which a picture does not fit the others.
 _UNFIT = 20.0
+#: From there on a channel (of 255) may be clipped, and says nothing of exposure.
+_WHITE = 250
 #: In place of values of pixels that a picture does not show.
 _NOTHING = 32767
 
@@ -89,18 +92,22 @@ def find_still_background(cv2: Any, pictures: Mapping[str, Array], tell: Tell,
     rim = _rim(stack.shape[1:3])
     gains = _gains(stack, rim)
     _brighten(stack, gains)
-    median = _median(stack)
+    found = _sorted(stack)
+    median = _median(*found)
     away = np.array([np.median(np.abs(one - median)[rim & (one[..., 0] >= 0)]) for one in stack])
     fit = away < _UNFIT
     if fit.sum() < _FEWEST:
         return None
-    stack, median = stack[fit], _median(stack[fit])
-    found = _turned(cv2, stack, median, rim)
-    if found is None:
+    if not fit.all():
+        stack = stack[fit]
+        found = _sorted(stack)
+        median = _median(*found)
+    places = _turned(cv2, stack, median, rim)
+    if places is None:
         return None
     tell("finding what turned", 0.9)
-    turned, enclosed, least = found
-    behind = _behind(cv2, stack, turned, enclosed)
+    turned, enclosed, least = places
+    behind = _behind(cv2, *found, turned, enclosed)
     result = StillBackground()
     height, width = turned.shape
     for index, inside in zip(np.flatnonzero(fit), _objects(cv2, stack, behind, turned, least), strict=True):
@@ -182,13 +189,8 @@ def _laid(cv2: Any, picture: Array, move: Array) -> Array:
 
 def _gains(stack: Array, rim: Array) -> Array:
     """(n, 3) by which the exposure of pictures differs from the median, by their rims."""
-    median = _median(stack)
-    found = np.ones((len(stack), 3), np.float32)
-    for gain, one in zip(found, stack, strict=True):
-        known = rim & (one.min(axis=-1) > 8) & (median.min(axis=-1) > 8) & (one.max(axis=-1) < 250)
-        if known.sum() > 100:
-            gain[:] = np.median(median[known] / one[known].astype(np.float32), axis=0)
-    return found
+    median = _median(*_sorted(stack))
+    return np.stack([exposure_gain(one, median, rim & (one.max(axis=-1) < _WHITE)) for one in stack])
 
 
 def _brighten(stack: Array, gains: Array) -> None:
@@ -209,9 +211,8 @@ def _at(order: Array, index: Array) -> Array:
     return np.take_along_axis(order, np.broadcast_to(index, (1, *order.shape[1:])), axis=0)[0]
 
 
-def _median(stack: Array) -> Array:
-    """(h, w, 3) float32."""
-    order, count = _sorted(stack)
+def _median(order: Array, count: Array) -> Array:
+    """(h, w, 3) float32 of pictures that `_sorted` has sorted."""
     return _at(order, np.maximum(count - 1, 0) // 2).astype(np.float32)
 
 
@@ -220,15 +221,13 @@ def _turned(cv2: Any, stack: Array, median: Array, rim: Array) -> tuple[Array, A
 
     Third, the least difference that counts. None where it is nowhere, or nearly all.
     """
-    box = np.ones((3, 3), np.uint8)
     off = _differences(cv2, stack, median)
     order = np.sort(np.where(off < 0, _NOTHING, off), axis=0)
     count = (off >= 0).sum(axis=0)
     away = _at(order, np.maximum(np.floor((1 - _DIFFERENT) * count).astype(int) - 1, 0))
     away = np.where(count * 2 >= len(stack), away, 0).astype(np.float32)
     least = max(_FLOOR, _NOISES * float(np.median(away[rim])))
-    found = cv2.morphologyEx((away > least).astype(np.uint8), cv2.MORPH_OPEN, box)
-    differs = cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)) > 0
+    differs = _without_gaps(cv2, away > least)
     around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(_NOTCH * max(rim.shape)) + 1,) * 2)
     padded = np.pad(differs.astype(np.uint8), len(around))  # or what lies at an edge of the picture would be cut
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, around)[len(around) : -len(around), len(around) : -len(around)]
@@ -240,6 +239,12 @@ def _turned(cv2: Any, stack: Array, median: Array, rim: Array) -> tuple[Array, A
     sizes[0] = 0
     found = (sizes >= _SMALL * sizes.max())[parts]
     return (found, found & ~differs, least) if found.mean() < 0.9 else None
+
+
+def _without_gaps(cv2: Any, differs: Array) -> Array:
+    """(h, w) bool: pixels that differ, without specks, and with the gaps between them."""
+    found = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    return cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)) > 0
 
 
 def _differences(cv2: Any, stack: Array, background: Array) -> Array:
@@ -257,26 +262,24 @@ def _objects(cv2: Any, stack: Array, behind: Array, turned: Array, least: float)
     """(h, w) uint8 each: what of a picture is not the background, with what it encloses and a margin."""
     found = []
     for off in _differences(cv2, stack, behind):
-        own = cv2.morphologyEx(((off > least) & turned).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-        own = binary_fill_holes(cv2.morphologyEx(own, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)) > 0)
+        own = binary_fill_holes(_without_gaps(cv2, (off > least) & turned))
         found.append(cv2.dilate(own.astype(np.uint8), np.ones((2 * _MARGIN + 1,) * 2, np.uint8)))
     return found
 
 
-def _behind(cv2: Any, stack: Array, turned: Array, enclosed: Array) -> Array:
-    """(h, w, 3) float32: the background, also where something `turned`.
+def _behind(cv2: Any, order: Array, count: Array, turned: Array, enclosed: Array) -> Array:
+    """(h, w, 3) float32: the background of pictures that `_sorted` has sorted, also where something `turned`.
 
     There, the values that `_AGREED` of the pictures agree on best, where these go on from the background around; else
     what is around. What is `enclosed` by what turned is never seen past it.
     """
-    order, count = _sorted(stack)
-    most = max(2, int(np.ceil(_AGREED * len(stack))))
+    most = max(2, int(np.ceil(_AGREED * len(order))))
     widths = order[most - 1 :].astype(np.int32) - order[: 1 - most]
     widths[order[most - 1 :] == _NOTHING] = _NOTHING
     first = widths.argmin(axis=0)[None]
     width = np.take_along_axis(widths, first, axis=0)[0].max(axis=-1)
     ends = (np.take_along_axis(order, first + more, axis=0)[0].astype(np.float32) for more in (0, most - 1))
-    middle = _at(order, np.maximum(count - 1, 0) // 2)
+    middle = _median(order, count)
     behind = np.clip(np.where((count < most)[..., None], middle, sum(ends) / 2), 0, 255).astype(np.float32)
     steady = width <= max(_FLOOR, _NOISES * float(np.median(width[~turned])))
     smooth = cv2.GaussianBlur(behind, (0, 0), 1.0)
