@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import bpy
 from mathutils import Matrix, Vector
 
@@ -14,6 +12,8 @@ from . import selection
 from .base import DrgsOperator
 
 ENGINE = "DRGS"
+#: How often, and after how many seconds each, a sidebar is asked whether it has tabs.
+TRIES, PAUSE = 100, 0.05
 #: Kind of object -> the mode in which it is posed.
 MODES = {"ARMATURE": "POSE", "LATTICE": "EDIT", "MESH": "EDIT"}
 
@@ -124,9 +124,21 @@ class DRGS_OT_show_sidebar(DrgsOperator, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context) -> set[str]:
         context.space_data.show_region_ui = True
-        region = next(region for region in context.area.regions if region.type == "UI")
-        with contextlib.suppress(TypeError):  # a sidebar that was never open has no tabs yet
-            region.active_panel_category = "DR-GS"
+        area, tries = context.area.as_pointer(), iter(range(TRIES))
+
+        def turn() -> float | None:
+            found = (a for w in bpy.context.window_manager.windows for a in w.screen.areas if a.as_pointer() == area)
+            region = next((r for a in found for r in a.regions if r.type == "UI"), None)
+            if region is None:
+                return None
+            try:
+                region.active_panel_category = "DR-GS"
+            except (AttributeError, TypeError):  # a sidebar has tabs once it was drawn
+                return None if next(tries, None) is None else PAUSE
+            region.tag_redraw()
+            return None
+
+        bpy.app.timers.register(turn, first_interval=0.0)
         return {"FINISHED"}
 
 
