@@ -73,7 +73,7 @@ class _MaterialNumbers:
         options=set(),
     )
     youngs_modulus: FloatProperty(
-        name="Young's Modulus (Pa)",
+        name="Young's Modulus",
         description="Stiffness, pascals. A hundred times as stiff takes ten times as long",
         min=1.0,
         soft_min=1e3,
@@ -142,7 +142,7 @@ class _MaterialNumbers:
         precision=4,
     )
     compression: FloatProperty(
-        name="Critical Compression",
+        name="Crush Limit",
         description="Compression, as a share of the length, beyond which snow is crushed for good",
         min=1e-5,
         max=1.0,
@@ -150,7 +150,7 @@ class _MaterialNumbers:
         precision=4,
     )
     stretch: FloatProperty(
-        name="Critical Stretch",
+        name="Break Limit",
         description="Stretch, as a share of the length, beyond which snow breaks",
         min=1e-5,
         max=1.0,

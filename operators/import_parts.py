@@ -34,11 +34,19 @@ UP_ITEMS = (
 )
 
 
+#: Files that are dropped, and those that the browser shows besides.
+DROPPED = tuple(e for e in extensions("surfels", "mesh") if e not in GENERAL)
+SHOWN = (".drgs", *DROPPED, ".exr", ".hdr")
+FILES = "surfels", "mesh", "environment", "out"
+OPTIONS = "up", "scale", "pose"
+SWITCHES = "use_mesh", "use_remove_light", "use_environment"
+
+
 class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
     """Make a .drgs asset from surfels or splats and their mesh, or from a textured mesh alone, and load it"""
 
     bl_idname = "drgs.import_parts"
-    bl_label = "Make Asset"
+    bl_label = "Import Object"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
     surfels: StringProperty(
@@ -93,19 +101,42 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
     filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE", "HIDDEN"})
     directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", "HIDDEN"})
     files: CollectionProperty(type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
+    filter_glob: StringProperty(default=";".join(f"*{e}" for e in SHOWN), options={"HIDDEN"})
+    browse: BoolProperty(
+        description="Choose files in the file browser, .drgs as well, in place of the dialog",
+        options={"SKIP_SAVE", "HIDDEN"},
+    )
 
     _frames: tuple[int, ...] = ()
     _target = Path()
 
+    @classmethod
+    def description(cls, context: bpy.types.Context, given: bpy.types.OperatorProperties) -> str:
+        return "Load .drgs assets, splats or textured meshes; of the last two an asset is made" if given.browse else ""
+
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if self.browse:
+            context.window_manager.fileselect_add(self)
+            return {"RUNNING_MODAL"}
         try:
             self._assign_dropped_files()
         except UsageError as error:
             return self.fail(error)
-        return context.window_manager.invoke_props_dialog(self, width=420)
+        return context.window_manager.invoke_props_dialog(self, width=420, title="Make Asset", confirm_text="Make Asset")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        split = self.layout.column()
+        split.use_property_split = True
+        for name in (*(() if self.browse else FILES), *OPTIONS):
+            split.prop(self, name)
+        for name in SWITCHES:
+            self.layout.prop(self, name)
 
     def run(self, context: bpy.types.Context) -> set[str]:
+        finished = self.browse and self._import_chosen(context)
         self._assign_dropped_files()
+        if finished and not self.surfels and not self.mesh:
+            return {"FINISHED"}
         arguments = self._arguments()
         name = Path(self.surfels or self.mesh).name
         status = f"Making {self._target.name}"
@@ -117,6 +148,20 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
             stem = self._target.stem
             sequences.play(objects, list(self._frames), stem.rstrip("#_-. ") or stem)
         return {"FINISHED"}
+
+    def _import_chosen(self, context: bpy.types.Context) -> bool:
+        """Import the .drgs files among those chosen, and leave the others; whether there were any."""
+        names = [f.name for f in self.files]
+        if not any(names):
+            raise UsageError("Import", "no file is chosen", "Choose one, or several that belong together")
+        ready = [Path(self.directory) / name for name in names if name.lower().endswith(".drgs")]
+        if ready:
+            import_assets(context, ready, self.use_environment)
+            self.filepath = ""
+            for index in reversed(range(len(names))):
+                if names[index].lower().endswith(".drgs"):
+                    self.files.remove(index)
+        return bool(ready)
 
     def _assign_dropped_files(self) -> None:
         """Files that were dropped, each where it belongs; what was dropped before does not stay."""
@@ -194,7 +239,7 @@ class DRGS_FH_parts(DropTarget, bpy.types.FileHandler):
     bl_idname = "DRGS_FH_parts"
     bl_label = "Captured object (DR-GS)"
     bl_import_operator = "drgs.import_parts"
-    bl_file_extensions = ";".join(e for e in extensions("surfels", "mesh") if e not in GENERAL)
+    bl_file_extensions = ";".join(DROPPED)
 
 
 CLASSES = (DRGS_OT_import_parts, DRGS_FH_parts)

@@ -12,7 +12,7 @@ from bpy.props import BoolProperty, EnumProperty, IntProperty
 from ..addon import assets, messages
 from ..addon.export import export_baked
 from ..addon.export.camera import NO_CAMERA
-from ..drgs_blender.core.errors import UsageError
+from ..drgs_blender.core.errors import UsageError, first_of
 from ..drgs_blender.core.file_types import Held
 from ..drgs_blender.core.frame import Frame
 from ..drgs_blender.core.frame_sequences import frame_path
@@ -52,6 +52,8 @@ class SceneFrames(CommandOperator):
         """
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
+        if kind != "environment":
+            self._tell_differences(context)
         template = str(self.work_folder / f"{NUMBER}{SUFFIX}")
         numbers = self._write_all(context, template, kind, frames)
         arguments = ["convert", template, str(target), "--as", kind, f"--frames={','.join(map(str, numbers))}"]
@@ -61,6 +63,15 @@ class SceneFrames(CommandOperator):
         if kind in ("splats", "sequence"):
             arguments += ["--colour", self.colour, "--samples", str(self.samples)]
         return arguments
+
+    def _tell_differences(self, context: bpy.types.Context) -> None:
+        """Name objects that are seen in renders alone, and in viewports alone: what is written follows viewports."""
+        among = context.selected_objects if self.use_selection else context.scene.objects
+        objects = [obj for obj in among if assets.is_drgs(obj)]
+        for text, in_viewports in (("left out, though renders show", False), ("written, though renders do not show", True)):
+            names = [o.name for o in objects if o.visible_get() == in_viewports and o.hide_render == in_viewports]
+            if names:
+                self.warn(f"{first_of(names)}: {text} it; exports have what viewports show")
 
     def _write_all(
         self, context: bpy.types.Context, template: str, kind: Held, frames: Iterable[int] | None

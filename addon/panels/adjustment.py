@@ -33,7 +33,8 @@ class _Adjustments:
             column.prop(settings, name)
         for channel in ("roughness", "metallic"):
             column = layout.column(align=True)
-            for part in ("gain", "offset", "low", "high"):
+            column.prop(settings, f"{channel}_gain", text=f"{channel.title()} ×")
+            for part in ("offset", "low", "high"):
                 column.prop(settings, f"{channel}_{part}")
         column = layout.column(align=True)
         for name in ("emission", "opacity"):

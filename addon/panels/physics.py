@@ -163,7 +163,7 @@ class DRGS_PT_physics_forces(_Part, bpy.types.Panel):
         _draw_group(column, physics, "pin_group", context.object)
         column.prop(physics, "gravity")
         column.prop(physics, "fields")
-        column.prop(physics, "field_collection")
+        column.prop(physics, "field_collection", text="Collection")
         column.prop(physics, "wind")
         drag = column.column()
         drag.active = any(physics.wind)

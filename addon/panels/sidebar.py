@@ -49,6 +49,7 @@ class DRGS_PT_object(_SidebarPanel, bpy.types.Panel):
 
 class DRGS_PT_engine(_SidebarPanel, bpy.types.Panel):
     bl_label = "Engine"
+    bl_order = 1
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - read by Blender
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -69,6 +70,7 @@ class DRGS_PT_engine(_SidebarPanel, bpy.types.Panel):
 
 class DRGS_PT_messages(_SidebarPanel, bpy.types.Panel):
     bl_label = "Messages"
+    bl_order = 2
     bl_ui_units_x = POPOVER // 20
 
     def draw(self, context: bpy.types.Context) -> None:

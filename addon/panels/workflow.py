@@ -26,7 +26,7 @@ def _running(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
 
 def _import(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     row = layout.row(align=True)
-    row.operator("import_scene.drgs", text="Import", icon="IMPORT")
+    row.operator("drgs.import_parts", text="Import", icon="IMPORT").browse = True
     row.operator("drgs.import_parts", text="Make Asset", icon="FILE_NEW")
     if workflow.target(context) is not None:
         row.operator("drgs.mark_assets", text="", icon="ASSET_MANAGER")

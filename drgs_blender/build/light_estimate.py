@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from ..core.asset.model import Array, Asset, Environment, Mesh
-from ..core.errors import UsageError
+from ..core.errors import AssetError
 from ..core.frame import RenderSettings, World
 from ..formats.latlong import directions
 from ..render.lights.environment import EnvironmentLight
@@ -66,7 +66,7 @@ def estimate_light(asset: Asset, progress: Progress | None = None, seed: int = 0
 
     Raises
     ------
-    UsageError
+    AssetError
         Too few surfels show a colour.
     """
     rng = np.random.default_rng(seed)
@@ -89,7 +89,7 @@ def estimate_light(asset: Asset, progress: Progress | None = None, seed: int = 0
 def _check_enough(asset: Asset, count: int, what: str) -> None:
     if count < _FEWEST:
         problem = f"has {count} surfels that are {what}, too few to estimate the light of"
-        raise UsageError(subject_of(asset), problem, "Give the environment of the capture with --env")
+        raise AssetError(subject_of(asset), problem, "Give the environment of the capture with --env")
 
 
 def _chosen(asset: Asset, rng: np.random.Generator) -> Array:

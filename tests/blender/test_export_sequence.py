@@ -105,6 +105,24 @@ def test_surfels_follow_the_mesh(walker, scene, tmp_path):
     np.testing.assert_allclose(surfels.albedo[:, 2], 0.4, atol=1e-3)
 
 
+def test_what_viewports_and_renders_show_differently_is_named(walker, scene, tmp_path):
+    """The file has what viewports show."""
+    messages = part("addon.messages")
+    for hidden, text in (("hide_render", "written, though renders do not"), ("hide_viewport", "left out, though renders")):
+        messages.clear()
+        setattr(walker, hidden, True)
+        if hidden == "hide_viewport":
+            with pytest.raises(RuntimeError, match="no object of the scene"):
+                export(tmp_path / "walk.usdc", "USD sequence")
+        else:
+            export(tmp_path / "walk.usdc", "USD sequence")
+        setattr(walker, hidden, False)
+        assert any(f"{walker.name}: {text} show it" in m.text for m in messages.history)
+    messages.clear()
+    export(tmp_path / "walk.usdc", "USD sequence")
+    assert not any("renders" in m.text for m in messages.history)
+
+
 @pytest.mark.slow
 def test_simulated_matter_moves_as_it_was_baked(body, scene, tmp_path):
     assert bpy.ops.drgs.bake_physics() == {"FINISHED"}

@@ -197,6 +197,23 @@ def test_colour_is_estimated_without_an_environment(scene, tmp_path):
     assert any("the light is estimated" in m.text for m in part("addon.messages").history)
 
 
+def test_the_browser_of_import_takes_all_kinds_of_files(scene, tmp_path):
+    """Assets as they are, and one that is made of the rest."""
+    write_ball(tmp_path / "ball.drgs")
+    few_splats(tmp_path / "toy.ply")
+    files = [{"name": name} for name in ("ball.drgs", "toy.ply")]
+    chosen = {"browse": True, "directory": str(tmp_path), "up": "y"}
+    assert bpy.ops.drgs.import_parts(files=files, **chosen) == {"FINISHED"}
+    assert bpy.ops.drgs.import_parts(files=files[:1], **chosen) == {"FINISHED"}
+    made = sorted(o.name for o in scene.objects if o.type == "MESH")
+    assert made == ["ball", "ball.001", "toy"] and sorted(tmp_path.glob("*.drgs")) == [
+        tmp_path / "ball.drgs",
+        tmp_path / "toy.drgs",
+    ]
+    with pytest.raises(RuntimeError, match="no file is chosen"):
+        bpy.ops.drgs.import_parts(files=[{"name": ""}], **chosen)
+
+
 def test_a_mesh_is_not_taken_for_a_damaged_asset(scene, tmp_path):
     (tmp_path / "chair.glb").write_bytes(b"glTF" + bytes(60))
     with pytest.raises(RuntimeError, match=r"chair\.glb: is no \.drgs file but a mesh.*drgs make.*Object > Convert"):

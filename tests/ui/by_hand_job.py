@@ -67,7 +67,7 @@ def start() -> Iterator[float]:
 
 def bring_in() -> Iterator[float]:
     """Import with the file browser."""
-    yield from press("import_scene.drgs")
+    yield from press("browse=True")
     yield from hands.until(lambda: hands.there("FILE_BROWSER"), "the file browser", 30)
     yield 1.0
     yield from photograph("hand-2-browser")

@@ -15,7 +15,7 @@ from drgs_blender.cli.main import main
 from drgs_blender.core.asset import Asset, Environment, Mesh, Surfels
 from drgs_blender.core.asset.container import read_asset
 from drgs_blender.core.color import linear_to_srgb, srgb_to_linear
-from drgs_blender.core.errors import UsageError
+from drgs_blender.core.errors import AssetError, UsageError
 from drgs_blender.core.frame import RenderSettings, World
 from drgs_blender.deform.binding import bind
 from drgs_blender.formats.exr import write_exr_environment
@@ -165,7 +165,7 @@ def test_surfels_that_no_light_reaches_are_no_estimate(
     vertices, k = np.concatenate([m.vertices, box]), n + len(box)
     asset.mesh = Mesh(vertices, faces, np.full((k, 3), 0.4), np.full(k, 0.5), np.zeros(k))
     asset.environment = None
-    with pytest.raises(UsageError, match=r"0 surfels that are .* reached by light from outside.*--env"):
+    with pytest.raises(AssetError, match=r"0 surfels that are .* reached by light from outside.*--env"):
         remove_light(asset)
 
 
@@ -240,7 +240,7 @@ def test_what_is_lacking_is_said(capture: tuple[Asset, np.ndarray, np.ndarray]) 
     black.surfels.sh = np.full_like(asset.surfels.sh, -0.5 / SH_C0)
     black.environment = None
     black.provenance["surfels"] = "night.ply"
-    with pytest.raises(UsageError, match=r"night\.ply.*0 surfels that are neither black nor clipped.*--env"):
+    with pytest.raises(AssetError, match=r"night\.ply.*0 surfels that are neither black nor clipped.*--env"):
         remove_light(black)
     with pytest.raises(UsageError, match="needs a mesh"):
         remove_light(Asset(asset.surfels, Mesh.empty()))
