@@ -22,7 +22,7 @@ import window
 
 FILES = ROOT / "examples/cat/egyptian_cat.glb", ROOT / "examples/playbot/playbot.ply"
 #: Most clicks and keys, and seconds to the first pixels.
-GOALS = 8, 30.0
+GOALS = 8, 30
 
 
 def measure(file: Path) -> list[object]:
@@ -44,15 +44,16 @@ def main() -> None:
     for file in FILES:
         row = measure(file)
         kept = store_row(OUT / "first_picture.json", f"{row[0]} {row[1]}", row)
-    rows = [[*row[:-1], *GOALS] for _, row in sorted(kept.items())]
-    columns = ("Blender", "File", "Clicks and keys", "Object, s", "First pixels, s", "All samples, s", "File to pixels, s",
-               "Goal, clicks", "Goal, s")  # fmt: skip
+    rows = [row[:-1] for _, row in sorted(kept.items())]
+    columns = ("Blender", "File", "Clicks and keys", "Object, s", "First pixels, s", "All samples, s",
+               "File to pixels, s")  # fmt: skip
     write_section(
         "first-picture",
         "The first picture by clicks",
-        f"From the start of Blender with the installed extension: {row[-1]}. Seconds are those of Blender and the engine: "
-        "from the choice of the file to the object, whose asset is made meanwhile, and from *Show Rendered* to the first "
-        "pixels and to all samples of the viewport in a window of 1280 x 800, drawn without a graphics card.\n\n"
+        f"From the start of Blender with the installed extension: {row[-1]}. Goals: {GOALS[0]} clicks and keys, "
+        f"{GOALS[1]} s. Seconds are those of Blender and the engine: from the choice of the file to the object, whose "
+        "asset is made meanwhile, and from *Show Rendered* to the first pixels and to all samples of the viewport in a "
+        "window of 1280 x 800, drawn without a graphics card.\n\n"
         + table(columns, rows),
     )
 

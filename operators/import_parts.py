@@ -122,7 +122,8 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
             self._assign_dropped_files()
         except UsageError as error:
             return self.fail(error)
-        return context.window_manager.invoke_props_dialog(self, width=420, title="Make Asset", confirm_text="Make Asset")
+        title = "Make Asset"
+        return context.window_manager.invoke_props_dialog(self, width=420, title=title, confirm_text=title)
 
     def draw(self, context: bpy.types.Context) -> None:
         split = self.layout.column()

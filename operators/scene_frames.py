@@ -68,10 +68,11 @@ class SceneFrames(CommandOperator):
         """Name objects that are seen in renders alone, and in viewports alone: what is written follows viewports."""
         among = context.selected_objects if self.use_selection else context.scene.objects
         objects = [obj for obj in among if assets.is_drgs(obj)]
-        for text, in_viewports in (("left out, though renders show", False), ("written, though renders do not show", True)):
+        for in_viewports in (False, True):
+            text = "written, though renders do not show it" if in_viewports else "left out, though renders show it"
             names = [o.name for o in objects if o.visible_get() == in_viewports and o.hide_render == in_viewports]
             if names:
-                self.warn(f"{first_of(names)}: {text} it; exports have what viewports show")
+                self.warn(f"{first_of(names)}: {text}; exports have what viewports show")
 
     def _write_all(
         self, context: bpy.types.Context, template: str, kind: Held, frames: Iterable[int] | None

@@ -7,8 +7,8 @@ With it goes ``dist/index.json``: the folder, on any web server, is a repository
 
 Without a platform the zip has no packages: *Set Up Engine* fetches them. With one there is a zip for each Python that
 Blender has had (`engine_wheels.SERIES`), which brings them as wheels; the index then has these alone, since the zip
-without packages is for the same systems, and Blender takes any that fits. Pure standard library; the archives are the same
-bytes for the same sources.
+without packages is for the same systems, and Blender takes any that fits. Pure standard library; the archives are the
+same bytes for the same sources.
 """
 
 from __future__ import annotations
