@@ -53,8 +53,7 @@ def main() -> None:
         f"From the start of Blender with the installed extension: {row[-1]}. Goals: {GOALS[0]} clicks and keys, "
         f"{GOALS[1]} s. Seconds are those of Blender and the engine: from the choice of the file to the object, whose "
         "asset is made meanwhile, and from *Show Rendered* to the first pixels and to all samples of the viewport in a "
-        "window of 1280 x 800, drawn without a graphics card.\n\n"
-        + table(columns, rows),
+        "window of 1280 x 800, drawn without a graphics card.\n\n" + table(columns, rows),
     )
 
 

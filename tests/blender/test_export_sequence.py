@@ -108,7 +108,7 @@ def test_surfels_follow_the_mesh(walker, scene, tmp_path):
 def test_what_viewports_and_renders_show_differently_is_named(walker, scene, tmp_path):
     """The file has what viewports show."""
     messages = part("addon.messages")
-    texts = {"hide_render": "written, though renders do not show it", "hide_viewport": "left out, though renders show it"}
+    texts = {"hide_render": "written, though renders do not", "hide_viewport": "left out, though renders"}
     for hidden, text in texts.items():
         messages.clear()
         setattr(walker, hidden, True)
@@ -118,7 +118,7 @@ def test_what_viewports_and_renders_show_differently_is_named(walker, scene, tmp
         else:
             export(tmp_path / "walk.usdc", "USD sequence")
         setattr(walker, hidden, False)
-        assert any(f"{walker.name}: {text};" in m.text for m in messages.history)
+        assert any(f"{walker.name}: {text} show it;" in m.text for m in messages.history)
     messages.clear()
     export(tmp_path / "walk.usdc", "USD sequence")
     assert not any("renders" in m.text for m in messages.history)
