@@ -31,7 +31,7 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
 
     bl_idname = "drgs.bake_light"
     bl_label = "Bake Light"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+    bl_options = {"UNDO"}  # noqa: RUF012 - read by Blender
 
     target: EnumProperty(
         name="Bake To",

@@ -21,7 +21,7 @@ class DRGS_OT_convert(CommandOperator, bpy.types.Operator):
 
     bl_idname = "drgs.convert"
     bl_label = "Convert to DR-GS"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+    bl_options = {"UNDO"}  # noqa: RUF012 - read by Blender
 
     out: StringProperty(
         name="Save As",

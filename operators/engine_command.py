@@ -26,7 +26,10 @@ _REPORT_EVERY = 10.0
 
 
 class CommandOperator(DrgsOperator):
-    """Base of operators that give `start` the arguments of ``drgs`` and go on in `done` when it has done its work."""
+    """Base of operators that give `start` the arguments of ``drgs`` and go on in `done` when it has done its work.
+
+    They lack REGISTER: to adjust or repeat an operator that goes on beside the window ends Blender (seen in 5.2).
+    """
 
     _process: subprocess.Popen[bytes] | None = None
     _log: Path | None = None

@@ -46,7 +46,7 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
 
     bl_idname = "drgs.export"
     bl_label = "Export DR-GS"
-    bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
+    bl_options = {"UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
 
     filepath: StringProperty(
         description="The file to write; its ending chooses the format",

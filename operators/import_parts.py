@@ -47,7 +47,7 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
 
     bl_idname = "drgs.import_parts"
     bl_label = "Import Object"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+    bl_options = {"UNDO"}  # noqa: RUF012 - read by Blender
 
     surfels: StringProperty(
         name="Splats or Surfels",
@@ -134,10 +134,13 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
             self.layout.prop(self, name)
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        finished = self.browse and self._import_chosen(context)
-        self._assign_dropped_files()
-        if finished and not self.surfels and not self.mesh:
-            return {"FINISHED"}
+        if self.browse:
+            others = self._import_assets(context)
+            if not others:
+                return {"FINISHED"}
+            self._assign(others)
+        else:
+            self._assign_dropped_files()
         arguments = self._arguments()
         name = Path(self.surfels or self.mesh).name
         status = f"Making {self._target.name}"
@@ -150,33 +153,33 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
             sequences.play(objects, list(self._frames), stem.rstrip("#_-. ") or stem)
         return {"FINISHED"}
 
-    def _import_chosen(self, context: bpy.types.Context) -> bool:
-        """Import the .drgs files among those chosen, and leave the others; whether there were any."""
-        names = [f.name for f in self.files]
-        if not any(names):
+    def _import_assets(self, context: bpy.types.Context) -> list[Path]:
+        """Import the .drgs files among those chosen; the others."""
+        paths = [Path(self.directory) / f.name for f in self.files if f.name]
+        if not paths:
             raise UsageError("Import", "no file is chosen", "Choose one, or several that belong together")
-        ready = [Path(self.directory) / name for name in names if name.lower().endswith(".drgs")]
+        ready = [path for path in paths if path.suffix.lower() == ".drgs"]
         if ready:
             import_assets(context, ready, self.use_environment)
-            self.filepath = ""
-            for index in reversed(range(len(names))):
-                if names[index].lower().endswith(".drgs"):
-                    self.files.remove(index)
-        return bool(ready)
+        return [path for path in paths if path not in ready]
 
     def _assign_dropped_files(self) -> None:
         """Files that were dropped, each where it belongs; what was dropped before does not stay."""
         paths = [Path(self.directory) / f.name for f in self.files if f.name]
         paths = paths or ([Path(self.filepath)] if self.filepath else [])
         if paths:
-            self.surfels = self.mesh = self.environment = ""
+            self._assign(paths)
+        self.filepath = ""
+        self.files.clear()
+
+    def _assign(self, paths: list[Path]) -> None:
+        """Each file where it belongs."""
+        self.surfels = self.mesh = self.environment = ""
         kinds: dict[str, list[Path]] = {}
         for path in paths:
             kinds.setdefault(kind_of(path), []).append(path)
         for kind, found in kinds.items():
             setattr(self, kind, template_of(found)[0] if len(found) > 1 else str(found[0]))
-        self.filepath = ""
-        self.files.clear()
 
     def _files(self) -> list[Path]:
         """The assets to write."""

@@ -180,7 +180,7 @@ class DRGS_OT_bake_physics(_JobOperator, bpy.types.Operator):
         "Simulate all frames of the selected objects with the engine, one object after another, the active one last. "
         "Frames that are baked with these settings stay, others are replaced. Esc cancels, and the next bake goes on"
     )
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+    bl_options = {"UNDO"}  # noqa: RUF012 - read by Blender
 
     @classmethod
     def objects(cls, context: bpy.types.Context) -> list[bpy.types.Object]:
@@ -207,6 +207,7 @@ class DRGS_OT_show_particles(_JobOperator, bpy.types.Operator):
 
     bl_idname = "drgs.show_particles"
     bl_label = "Show Particles"
+    bl_options = set()  # noqa: RUF012 - read by Blender
 
     def begin(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> bake_job.Job:
         return bake_job.Preview(obj, scene)

@@ -25,7 +25,7 @@ class DRGS_OT_play_point_cache(CommandOperator, selection.ObjectMode, bpy.types.
 
     bl_idname = "drgs.play_point_cache"
     bl_label = "Play Point Cache"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+    bl_options = {"UNDO"}  # noqa: RUF012 - read by Blender
 
     filepath: StringProperty(
         description="The point cache", subtype="FILE_PATH", options={"SKIP_SAVE", *blend_paths.RELATIVE}

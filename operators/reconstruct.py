@@ -22,7 +22,7 @@ class DRGS_OT_reconstruct(ReconstructFields, CommandOperator, bpy.types.Operator
 
     bl_idname = "drgs.reconstruct"
     bl_label = "Reconstruct from Photographs"
-    bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
+    bl_options = {"UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
 
     shows_progress = False  # the step Import does
 

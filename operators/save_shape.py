@@ -64,7 +64,7 @@ class DRGS_OT_save_shape(ReshapeOperator, bpy.types.Operator):
 
     bl_idname = "drgs.save_shape"
     bl_label = "Save Edited Shape"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+    bl_options = {"UNDO"}  # noqa: RUF012 - read by Blender
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return self.choose_file(context, f"{bpy.path.clean_name(selection.selected(context)[-1].name)} shape")

@@ -15,7 +15,7 @@ class DRGS_OT_splats(SceneFrames, bpy.types.Operator):
 
     bl_idname = "drgs.splats"
     bl_label = "DR-GS to Splats"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+    bl_options = {"UNDO"}  # noqa: RUF012 - read by Blender
 
     _splats: Path
 

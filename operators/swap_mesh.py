@@ -26,7 +26,7 @@ class DRGS_OT_swap_mesh(ReshapeOperator, bpy.types.Operator):
 
     bl_idname = "drgs.swap_mesh"
     bl_label = "Swap Mesh"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+    bl_options = {"UNDO"}  # noqa: RUF012 - read by Blender
 
     use_original: BoolProperty(name="Keep Original", description="Leave the old object visible", default=False)
 

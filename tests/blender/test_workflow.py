@@ -243,6 +243,13 @@ def test_dropped_splats_become_an_object(scene, tmp_path):
     assert bpy.context.active_object.name == "toy"
 
 
+def test_what_goes_on_beside_the_window_cannot_be_adjusted_or_repeated():
+    """Blender runs it anew with an operator that it frees meanwhile, and crashes."""
+    classes = [c for m in part("operators").MODULES for c in m.CLASSES if hasattr(c, "modal")]
+    assert len(classes) > 5
+    assert not [c.bl_idname for c in classes if "REGISTER" in getattr(c, "bl_options", {"REGISTER"})]
+
+
 def test_every_operator_that_changes_the_scene_can_be_undone():
     engine = {"drgs.engine_test", "drgs.engine_stop", "drgs.engine_setup", "drgs.engine_setup_cancel"}
     engine |= {"drgs.engine_choose", "drgs.clear_messages", "drgs.render_preset_add"}
