@@ -207,7 +207,7 @@ class DRGS_OT_show_particles(_JobOperator, bpy.types.Operator):
 
     bl_idname = "drgs.show_particles"
     bl_label = "Show Particles"
-    bl_options = set()  # noqa: RUF012 - read by Blender
+    bl_options: set[str] = set()  # noqa: RUF012 - read by Blender
 
     def begin(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> bake_job.Job:
         return bake_job.Preview(obj, scene)
