@@ -10,10 +10,14 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ..addon import assets, blend_paths, splat_attributes
-from ..drgs_blender.core.errors import UsageError
+from ..drgs_blender.core.errors import UsageError, first_of
 from .bind_rig import armature_over, bind_to_rig, rest_pose
 from .engine_command import CommandOperator
 from .import_asset import import_assets
+
+
+#: What can be converted.
+KINDS = "MESH", "POINTCLOUD"
 
 
 class DRGS_OT_convert(CommandOperator, bpy.types.Operator):
@@ -55,6 +59,11 @@ class DRGS_OT_convert(CommandOperator, bpy.types.Operator):
             raise UsageError(subject, "is a DR-GS object already", "Choose another")
         if not self.out and not bpy.data.filepath:
             raise UsageError(subject, "has no place for its asset", "Save the .blend, or name the asset's file")
+        others = sorted(
+            o.name for o in context.selected_objects if o is not obj and o.type in KINDS and not assets.is_drgs(o)
+        )
+        if others:
+            self.warn(f'Only the active object, "{obj.name}", is converted, not {first_of(others)}: convert each')
         named = self.out or f"//{bpy.path.clean_name(obj.name)}"
         target = Path(bpy.path.abspath(named)).absolute().with_suffix(".drgs")
         self._target = target = assets.chosen(target, bool(self.out))
@@ -70,7 +79,8 @@ class DRGS_OT_convert(CommandOperator, bpy.types.Operator):
         if original is None:
             raise UsageError(f'Object "{self._name}"', "is gone", "Undo what removed it")
         (made,) = import_assets(context, [self._target])
-        made.matrix_world = original.matrix_world
+        with rest_pose(context, armature_over(original)):  # which moves what is parented to a bone
+            made.matrix_world = original.matrix_world
         if original.type == "MESH" and len(original.data.polygons):
             self._take_rig(context, made, original)
         if not self.use_original:
@@ -82,7 +92,7 @@ class DRGS_OT_convert(CommandOperator, bpy.types.Operator):
         """Write what the object is, and return the arguments that make an asset of it."""
         subject = f'Object "{obj.name}"'
         data = obj.evaluated_get(context.evaluated_depsgraph_get()).data
-        if obj.type in ("MESH", "POINTCLOUD") and splat_attributes.is_splats(data):
+        if obj.type in KINDS and splat_attributes.is_splats(data):
             try:
                 columns = splat_attributes.read_splats(data)
             except TypeError as error:
@@ -111,7 +121,8 @@ class DRGS_OT_convert(CommandOperator, bpy.types.Operator):
         if armature_over(original) is not None or original.data.shape_keys:
             bind_to_rig(context, made, [original])
         animation = original.animation_data
-        if made.parent is not None and made.parent is not original.parent:  # the armature, by which it is moved now
+        same = made.parent is original.parent and original.parent_type == "OBJECT"
+        if made.parent is not None and not same:  # the armature, by which it is moved now
             if animation is not None or original.constraints:
                 self.warn(f'"{made.name}" moves with "{made.parent.name}" alone: the animation and constraints of '
                           f'"{original.name}" itself are not taken over')  # fmt: skip

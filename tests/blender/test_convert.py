@@ -276,6 +276,26 @@ def test_a_rigged_mesh_keeps_its_rig_whatever_its_pose(scene, tmp_path):
         np.testing.assert_allclose(np.ptp(world_points(made), axis=0), np.ptp(world_points(arm), axis=0), atol=0.01)
 
 
+def test_a_part_that_a_bone_carries_is_converted_in_any_pose(scene, tmp_path):
+    """As importers of glTF make robots; of several selected meshes the active one is taken, and the others are named."""
+    arm, _, _, bone = rigged_arm(scene)
+    hand = mesh_object("Hand", *sphere(8, 12))
+    hand.parent, hand.parent_type, hand.parent_bone = arm.parent, "BONE", "Upper"
+    hand.scale = (0.2, 0.3, 0.4)
+    bpy.context.view_layer.update()
+    select(hand)
+    arm.select_set(True)
+    assert bpy.ops.drgs.convert(out=str(tmp_path / "hand.drgs"), use_original=True) == {"FINISHED"}
+    assert any('"Hand", is converted, not Arm' in m.text for m in part("addon.messages").history)
+    made = bpy.context.active_object
+    for angle in (1.2, -0.7):
+        bone.rotation_euler[0] = angle
+        bpy.context.view_layer.update()
+        wanted, found = world_points(hand), world_points(made)
+        np.testing.assert_allclose(found.mean(axis=0), wanted.mean(axis=0), atol=0.02)
+        np.testing.assert_allclose(np.ptp(found, axis=0), np.ptp(wanted, axis=0), atol=0.02)
+
+
 def test_a_moving_mesh_goes_on_moving(scene, tmp_path):
     """Its action, its parent and its constraints are those of the object that is made of it."""
     obj = mesh_object("Ball", *sphere(8, 12))
