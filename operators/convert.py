@@ -15,7 +15,6 @@ from .bind_rig import armature_over, bind_to_rig, rest_pose
 from .engine_command import CommandOperator
 from .import_asset import import_assets
 
-
 #: What can be converted.
 KINDS = "MESH", "POINTCLOUD"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 
 import bpy
@@ -15,8 +16,23 @@ POPOVER = 400
 def wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
     """A text in as many lines as the region needs."""
     column = layout.column(align=True)
-    for i, line in enumerate(textwrap.wrap(text, _letters(context), break_on_hyphens=False)):
+    letters = _letters(context)
+    for i, line in enumerate(textwrap.wrap(broken_paths(text, letters), letters, break_on_hyphens=False)):
         column.label(text=line, icon="BLANK1" if i and icon != "NONE" else icon)
+
+
+def broken_paths(text: str, letters: int) -> str:
+    """The text with spaces after folders, where a path is longer than a line."""
+    words = []
+    for word in text.split():
+        line = ""
+        for part in re.findall(r"[^/\\]*[/\\]|[^/\\]+", word):
+            if line and len(line) + len(part) > letters:
+                words.append(line)
+                line = ""
+            line += part
+        words.append(line)
+    return " ".join(words)
 
 
 def _letters(context: bpy.types.Context) -> int:

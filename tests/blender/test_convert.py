@@ -277,7 +277,7 @@ def test_a_rigged_mesh_keeps_its_rig_whatever_its_pose(scene, tmp_path):
 
 
 def test_a_part_that_a_bone_carries_is_converted_in_any_pose(scene, tmp_path):
-    """As importers of glTF make robots; of several selected meshes the active one is taken, and the others are named."""
+    """As importers of glTF make robots. Of several selected meshes the active one is taken; the others are named."""
     arm, _, _, bone = rigged_arm(scene)
     hand = mesh_object("Hand", *sphere(8, 12))
     hand.parent, hand.parent_type, hand.parent_bone = arm.parent, "BONE", "Upper"

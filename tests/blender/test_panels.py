@@ -276,6 +276,17 @@ def test_a_command_that_runs_is_shown_with_its_progress_and_ends_by_a_click(ball
         bpy.ops.drgs.cancel_command(index=0)
 
 
+def test_long_paths_break_after_folders():
+    broken_paths = part("addon.panels.text_layout").broken_paths
+    path, windows = "/home/artist/captures/statue/statue.drgs:", "C:\\Users\\artist\\captures\\statue.ply"
+    for whole in (path, windows):
+        lines = broken_paths(whole, 16).split()
+        assert "".join(lines) == whole and max(map(len, lines)) <= 16
+        assert all(line[-1] in "/\\" for line in lines[:-1])
+    assert broken_paths("toy/a.ply is absent", 40) == "toy/a.ply is absent"
+    assert broken_paths("n" * 40, 16) == "n" * 40
+
+
 def test_the_header_says_where_the_sidebar_is_until_it_is_known(ball):
     """Nobody has to hunt for the tab; the first operator that succeeds ends it."""
     preferences = bpy.context.preferences.addons[PACKAGE].preferences
