@@ -13,11 +13,12 @@ import numpy as np
 
 from ...drgs_blender.core.asset import MATERIAL_CHANNELS, Asset
 from ...drgs_blender.core.asset.part import Part, has_surfels, part_of, whole_of
+from ...drgs_blender.core.errors import first_of
 from ...drgs_blender.core.frame import Adjustment, ObjectState
 from ...drgs_blender.core.materials import ShaderAOV
 from ...drgs_blender.core.passes import Pass
 from .. import assets, cache_playback, mesh_arrays, point_caches, surfel_points
-from ..viewport_material import is_viewport_material
+from ..viewport_material import is_viewport_material, painted_images
 from .aov_nodes import aov_values
 from .export_cache import ExportCache, uid
 from .holdouts import Holdouts
@@ -110,6 +111,11 @@ class DrgsObjects:
             )
         )
         _check_shown(obj, material, shape, self._warn)
+        if images := painted_images(obj.original):
+            self._warn(
+                f'"{obj.name}": {first_of(images)} as painted is not rendered, but the asset\'s own. Paint vertices '
+                "(sidebar > DR-GS > Object), or the images before the asset is made"
+            )
         self.keys.append(item.key)
 
 

@@ -62,6 +62,21 @@ def read(path):
     return part("drgs_blender.core.asset.container").read_asset(path).mesh.textures
 
 
+def test_painted_images_are_told(ball, export):
+    """Until they are as imported again; before they are saved, and after."""
+    told = lambda: [w for w in export()[1] if "as painted" in w]  # noqa: E731
+    image = next(i for i in bpy.data.images if i.packed_file)
+    assert not told()
+    before = image.packed_file.data
+    image.pixels[0] = 0.5 * image.pixels[0] + 0.25
+    assert len(told()) == 1 and image.name in told()[0]
+    image.pack()
+    assert not image.is_dirty and len(told()) == 1
+    image.pack(data=before, data_len=len(before))
+    image.reload()
+    assert not told()
+
+
 def test_an_import_has_uvs_materials_and_packed_images_once(ball, tmp_path):
     textures, mesh = textured_ball().mesh.textures, ball.data
     found = np.empty(6 * len(mesh.polygons), np.float32)
