@@ -27,6 +27,7 @@ GOALS = 8, 30
 
 def measure(file: Path) -> list[object]:
     """Blender, file, clicks and seconds, and what was clicked."""
+    load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as name:
         copy = shutil.copy(file, name)
         found = window.run("first_picture_job.py", Path(name), DRGS_WINDOW_FILE=str(copy)).result
@@ -34,7 +35,8 @@ def measure(file: Path) -> list[object]:
         raise SystemExit(found["error"])
     seconds = found["seconds"]
     shown = [seconds["object"], seconds["first pixels"], seconds["all samples"]]
-    return [found["blender"], file.name, len(found["done"]), *shown, shown[0] + shown[1], ", ".join(found["done"])]
+    clicks = found["done"]
+    return [found["blender"], file.name, len(clicks), *shown, shown[0] + shown[1], load, ", ".join(clicks)]
 
 
 def main() -> None:
@@ -46,14 +48,15 @@ def main() -> None:
         kept = store_row(OUT / "first_picture.json", f"{row[0]} {row[1]}", row)
     rows = [row[:-1] for _, row in sorted(kept.items())]
     columns = ("Blender", "File", "Clicks and keys", "Object, s", "First pixels, s", "All samples, s",
-               "File to pixels, s")  # fmt: skip
+               "File to pixels, s", "Load")  # fmt: skip
     write_section(
         "first-picture",
         "The first picture by clicks",
         f"From the start of Blender with the installed extension: {row[-1]}. Goals: {GOALS[0]} clicks and keys, "
         f"{GOALS[1]} s. Seconds are those of Blender and the engine: from the choice of the file to the object, whose "
         "asset is made meanwhile, and from *Show Rendered* to the first pixels and to all samples of the viewport in a "
-        "window of 1280 x 800, drawn without a graphics card.\n\n" + table(columns, rows),
+        "window of 1280 x 800, drawn without a graphics card. Load: the machine's, by other programs, before each.\n\n"
+        + table(columns, rows),
     )
 
 
