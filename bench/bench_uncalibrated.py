@@ -1,17 +1,18 @@
 """Photographs without cameras and masks against the same with true ones, judged under a light that was not there.
 
 python bench/bench_uncalibrated.py --scene NAME --world SKY.hdr --relit OTHER.hdr [--object MESH.glb] [--pictures 36]
-    [--size 560] [--samples 64]
+    [--size 560] [--samples 64] [--only "true cameras, found masks"]
 
 Cycles photographs an object among others on a table (`capture_scene.py --clutter`), and the object alone under the
-other sky. The photographs become an asset twice: with the true cameras and masks, and as `drgs capture --masks auto`
-finds them. Rows are kept, so that scenes may be measured one by one.
+other sky. The photographs become an asset with the true cameras and masks, with those that `drgs capture --masks auto`
+finds, and with either of each. Rows are kept, so that scenes may be measured one by one.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -37,6 +38,13 @@ COLUMNS = (
     "Scene", "Cameras and masks", "Pictures", "Masks: IoU", "Relit, foreground: raw / scaled", "Relit: SSIM / FLIP",
     "Processor s", "s",
 )  # fmt: skip
+#: How a row is made: its cameras and its masks.
+WAYS = {
+    "true": ("true", "true"),
+    "true cameras, found masks": ("true", "found"),
+    "found cameras, true masks": ("found", "true"),
+    "from the photographs alone": ("found", "found"),
+}
 Array = np.ndarray
 
 
@@ -67,42 +75,65 @@ def photographed(folder: Path, options: argparse.Namespace) -> None:
     subprocess.run([*command, *map(str, words)], check=True, cwd=ROOT)
 
 
-def with_truth(folder: Path) -> Made:
-    """From photographs whose true cameras and masks are known."""
-    capture = folder / "true"
-    capture.mkdir(exist_ok=True)
+def cameras_of(folder: Path, which: str) -> tuple[dict, dict[str, dict]]:
+    """What a transforms.json says of all, and of each picture, of "true" or "found" cameras."""
+    if which == "found":
+        data = json.loads((folder / "made" / "transforms.json").read_text())
+        return data, {Path(frame["file_path"]).name: frame for frame in data.pop("frames")}
     truth = json.loads((folder / "truth.json").read_text())
-    frames = []
-    for name, matrix in truth["frames"].items():
-        true_mask = folder / "truth" / f"{Path(name).stem}.png"
-        with Image.open(folder / "images" / name) as picture, Image.open(true_mask) as mask:
-            width, height = picture.size
-            picture.putalpha(mask.getchannel("A"))
-            picture.save(capture / f"{Path(name).stem}.png")
-        frames.append({"file_path": f"{Path(name).stem}.png", "transform_matrix": matrix})
-    lens = {"fl_x": truth["focal"], "cx": width / 2, "cy": height / 2, "w": width, "h": height}
-    data = lens | {"applied_transform": np.eye(4)[:3].tolist(), "frames": frames}
+    known = {"orientation_override": "none", "fl_x": truth["focal"]}  # the world as it is
+    return known, {name: {"transform_matrix": matrix} for name, matrix in truth["frames"].items()}
+
+
+def composed(folder: Path, cameras: str, masks: str) -> Path:
+    """A capture of the photographs with cameras and masks that are "true", or "found" by `drgs capture`."""
+    capture, made = folder / f"{cameras}-cameras-{masks}-masks", folder / "made"
+    capture.mkdir(exist_ok=True)
+    data, known = cameras_of(folder, cameras)
+    data["frames"] = []
+    for name, camera in known.items():
+        mask_file = (folder / "truth" if masks == "true" else made / "masks") / f"{Path(name).stem}.png"
+        if mask_file.is_file():
+            with Image.open(folder / "images" / name) as picture, Image.open(mask_file) as mask:
+                width, height = picture.size
+                picture.putalpha(mask.getchannel("A") if "A" in mask.getbands() else mask.convert("L"))
+                picture.save(capture / mask_file.name)
+            lens = {"w": width, "h": height, "cx": width / 2, "cy": height / 2}
+            data["frames"].append(lens | camera | {"file_path": mask_file.name})
+            data["frames"][-1].pop("mask_path", None)
+    if cameras == "found":
+        shutil.copy(made / data["ply_file_path"], capture)
     (capture / "transforms.json").write_text(json.dumps(data))
-    asset = folder / "true.drgs"
-    spent, wall = run("reconstruct", capture, "--out", asset, "--up", "z")  # the world as it is
-    return Made(asset, np.eye(4), f"{len(frames)} of {len(frames)}", "true", spent, wall)
+    return capture
 
 
-def without(folder: Path) -> Made:
-    """From the photographs alone."""
-    capture, asset = folder / "made", folder / "made.drgs"
-    first = run("capture", folder / "images", "--out", capture, "--masks", "auto")
-    second = run("reconstruct", capture, "--out", asset)
-    report, truth = json.loads((capture / "capture.json").read_text()), true_cameras(folder / "truth.json")
-    found = {Path(camera["file"]).stem: np.array(camera["matrix"]) for camera in report["cameras"]}
-    ours, theirs = (np.stack([one[name][:3, 3] for name in sorted(found)]) for one in (found, truth))
-    scale, rotation, shift = similarity(ours, theirs)
-    placed = np.eye(4)
-    placed[:3, :3], placed[:3, 3] = scale * rotation, shift
-    masks = [overlap(path, folder / "truth" / path.name) for path in sorted((capture / "masks").glob("*.png"))]
-    known = f"{np.mean(masks):.3f}" if masks else "none"
-    spent, wall = (a + b for a, b in zip(first, second, strict=True))
-    return Made(asset, placed, f"{len(found)} of {len(truth)}", known, spent, wall)
+def asset_of(folder: Path, cameras: str, masks: str) -> Made:
+    """From photographs with "true" cameras and masks, or "found" ones."""
+    made = folder / "made"
+    if "found" in (cameras, masks) and not (made / "cost.json").exists():
+        cost = run("capture", folder / "images", "--out", made, "--masks", "auto")
+        (made / "cost.json").write_text(json.dumps(cost))
+    alone = cameras == masks == "found"
+    capture = made if alone else composed(folder, cameras, masks)
+    asset = folder / f"{capture.name}.drgs"
+    spent, wall = run("reconstruct", capture, "--out", asset)
+    if alone:
+        first = json.loads((made / "cost.json").read_text())
+        spent, wall = spent + first[0], wall + first[1]
+    placed, truth = np.eye(4), true_cameras(folder / "truth.json")
+    if cameras == "found":
+        found = {
+            Path(name).stem: np.array(one["transform_matrix"]) for name, one in cameras_of(folder, "found")[1].items()
+        }
+        ours, theirs = (np.stack([one[name][:3, 3] for name in sorted(found)]) for one in (found, truth))
+        scale, rotation, shift = similarity(ours, theirs)
+        placed[:3, :3], placed[:3, 3] = scale * rotation, shift
+    count = len(cameras_of(folder, cameras)[1])
+    fit = "true"
+    if masks == "found":
+        scores = [overlap(path, folder / "truth" / path.name) for path in sorted((made / "masks").glob("*.png"))]
+        fit = f"{np.mean(scores):.3f}" if scores else "none"
+    return Made(asset, placed, f"{count} of {len(truth)}", fit, spent, wall)
 
 
 def relit(made: Made, folder: Path, sky: Path, samples: int) -> list[str]:
@@ -138,12 +169,13 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=560)
     parser.add_argument("--spp", type=int, default=32)
     parser.add_argument("--samples", type=int, default=64)
+    parser.add_argument("--only", choices=list(WAYS), nargs="+", default=list(WAYS))
     options = parser.parse_args()
     folder = FOLDER / options.scene.replace(" ", "-")
     folder.mkdir(parents=True, exist_ok=True)
     photographed(folder, options)
-    for label, make in (("true", with_truth), ("from the photographs alone", without)):
-        made = make(folder)
+    for label in options.only:
+        made = asset_of(folder, *WAYS[label])
         cells = [made.pictures, made.masks, *relit(made, folder, options.relit, options.samples)]
         rows = store_row(
             FOLDER / "rows.json", f"{options.scene}|{label}", [*cells, *(f"{x:.0f}" for x in (made.spent, made.wall))]
@@ -153,7 +185,8 @@ def main() -> None:
         "An object among boxes on a table of noise, photographed by Cycles under one sky, and relit under another, "
         f"where Cycles' pictures of it alone judge; {options.size} pixels across. Default settings of `drgs capture "
         "--masks auto` and `drgs reconstruct`. PSNR of the foreground in dB, scaled by one factor a channel; SSIM and "
-        "FLIP of the scaled frames on white.\n\n"
+        "FLIP of the scaled frames on white. Seconds: of both commands where both cameras and masks are found, else of "
+        "`drgs reconstruct`.\n\n"
     )
     write_section(
         "uncalibrated", "Without cameras and masks, relit",

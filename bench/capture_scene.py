@@ -6,8 +6,9 @@ Cycles renders an object, the cat of the examples unless another is named, from 
 `FOLDER/images` has the pictures without cameras or masks; `FOLDER/truth.json` the true cameras: camera to world,
 Blender's axes, metres; `FOLDER/truth` the true masks, the object's coverage. With `--sheet`, the picture of a marker
 sheet on A4 lies under the object; with `--camouflage` the object has the table's picture; with `--clutter` other
-things stand around it. With `--relit` the object alone is rendered under another sky, from cameras of its own, into
-`FOLDER/relit`: a capture with masks, whose `transforms.json` has true cameras.
+things stand around it. With `--turntable` it turns before one camera, while table and sky stand still, and the true
+cameras are as it sees them. With `--relit` the object alone is rendered under another sky, from cameras of its own,
+into `FOLDER/relit`: a capture with masks, whose `transforms.json` has true cameras.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ sys.path.insert(0, str(ROOT / "bench"))
 from cycles_job import add_world, reset  # noqa: E402
 
 #: Metres.
-HEIGHT, TABLE, DISTANCE = 0.16, 1.2, 0.55
+HEIGHT, TABLE, DISTANCE, NEAR = 0.16, 1.2, 0.55, 0.4
 A4 = (0.210, 0.297)
 GROUND = ("table", "sheet")
 #: Things around the object: distance and side, metres, and colour.
@@ -90,8 +91,8 @@ def is_subject(obj: bpy.types.Object) -> bool:
     return obj.name not in GROUND and not obj.name.startswith("clutter")
 
 
-def stand(path: Path) -> list[bpy.types.Object]:
-    """Import the object, `HEIGHT` high, its feet at the origin; its meshes."""
+def stand(path: Path, turned: bpy.types.Object) -> list[bpy.types.Object]:
+    """Import the object, `HEIGHT` high, its feet at the origin, to turn with `turned`; its meshes."""
     if path.suffix.lower() == ".obj":
         bpy.ops.wm.obj_import(filepath=str(path))
     else:
@@ -109,6 +110,7 @@ def stand(path: Path) -> list[bpy.types.Object]:
     foot = Vector((*((low + high) / 2)[:2], low[2]))
     for obj in (obj for obj in bpy.data.objects if obj.parent is None and is_subject(obj)):
         obj.matrix_world = Matrix.Scale(scale, 4) @ Matrix.Translation(-foot) @ obj.matrix_world
+        obj.parent = turned
     return meshes
 
 
@@ -145,6 +147,14 @@ def cameras(count: int, seed: int, elevations: tuple[float, float]) -> list[Matr
     return found
 
 
+def turns(count: int, elevation: float) -> list[Matrix]:
+    """Cameras around the object as one that stands still sees it turn."""
+    height = np.array([math.cos(elevation), 0.0, math.sin(elevation)])
+    look = (Vector((0.0, 0.0, 0.45 * HEIGHT)) - Vector(NEAR * height)).to_track_quat("-Z", "Y").to_matrix().to_4x4()
+    still = Matrix.Translation(NEAR * height) @ look
+    return [Matrix.Rotation(2 * math.pi * k / count, 4, "Z") @ still for k in range(count)]
+
+
 def show_alone(scene: bpy.types.Scene) -> None:
     """Of all, leave the object, which nothing stands before, on a transparent film."""
     for obj in bpy.data.objects:
@@ -154,12 +164,17 @@ def show_alone(scene: bpy.types.Scene) -> None:
     scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
 
 
-def render_all(scene: bpy.types.Scene, places: dict[str, Matrix], folder: Path) -> None:
-    """A picture from each camera: what is not there yet."""
+def render_all(
+    scene: bpy.types.Scene, places: dict[str, Matrix], folder: Path, turned: bpy.types.Object | None = None
+) -> None:
+    """What is not there yet of pictures from each camera, or from the first, with the object `turned` to look alike."""
     folder.mkdir(parents=True, exist_ok=True)
+    first = next(iter(places.values()))
     for name, matrix in places.items():
         if not (folder / name).exists():
             scene.camera.matrix_world = matrix
+            if turned is not None:
+                scene.camera.matrix_world, turned.matrix_world = first, first @ matrix.inverted()
             scene.render.filepath = str(folder / name)
             bpy.ops.render.render(write_still=True)
 
@@ -193,6 +208,7 @@ def main() -> None:
     parser.add_argument("--denoise", action="store_true")
     parser.add_argument("--sheet", type=Path)
     parser.add_argument("--clutter", action="store_true", help="other things stand around the object")
+    parser.add_argument("--turntable", action="store_true", help="the object turns before a camera that stands still")
     parser.add_argument("--world", type=Path, required=True)
     parser.add_argument("--relit", type=Path, help="another sky, under which the object alone is rendered")
     args = parser.parse_args()
@@ -203,7 +219,9 @@ def main() -> None:
         plane("sheet", *A4, 0.0, bpy.data.images.load(str(args.sheet.resolve())))
     if args.clutter:
         clutter()
-    meshes = stand(args.object.resolve())
+    turned = bpy.data.objects.new("turntable", None)
+    scene.collection.objects.link(turned)
+    meshes = stand(args.object.resolve(), turned)
     if args.camouflage:
         cover(meshes, table, whole=True)
     elif args.texture:
@@ -221,12 +239,14 @@ def main() -> None:
     camera.data.lens, camera.data.sensor_width, camera.data.clip_start = 40.0, 36.0, 0.01
     scene.collection.objects.link(camera)
     scene.camera = camera
-    places = {f"photo_{k:03d}.jpg": matrix for k, matrix in enumerate(cameras(args.pictures, 5, args.elevations))}
+    views = turns(args.pictures, args.elevations[0]) if args.turntable else cameras(args.pictures, 5, args.elevations)
+    places = {f"photo_{k:03d}.jpg": matrix for k, matrix in enumerate(views)}
     focal = args.size * camera.data.lens / camera.data.sensor_width
     args.folder.mkdir(parents=True, exist_ok=True)
     truth = {"focal": focal, "frames": {name: [list(row) for row in matrix] for name, matrix in places.items()}}
     (args.folder / "truth.json").write_text(json.dumps(truth))
-    render_all(scene, places, args.folder / "images")
+    render_all(scene, places, args.folder / "images", turned if args.turntable else None)
+    turned.matrix_world = Matrix()
     show_alone(scene)
     scene.cycles.max_bounces, scene.cycles.use_denoising = 0, False
     render_all(scene, {f"{Path(name).stem}.png": matrix for name, matrix in places.items()}, args.folder / "truth")

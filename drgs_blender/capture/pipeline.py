@@ -165,7 +165,8 @@ def _make(source: Path, folder: Path, work: Path, film: Path | None, given: list
             left_out[by_file[photo.file].path.name] = found.unsound.get(photo.file, "not registered")
     made = Made(folder, len(found.matrices), len(given), left_out, found.method, 0.0, alignment)
     made.error = sum(found.errors.values()) / len(found.errors)
-    mode = mask_stage.mode_on_ground(settings.masks, ready.masks, alignment.ground_from, str(source))
+    mode, of_masks = mask_stage.mode_on_ground(settings.masks, ready.masks, alignment.ground_from)
+    _tell_guesses(alignment, source, of_masks)
     masked = mask_stage.make_or_check(
         mode, found, by_file, ready.folder, work / "object_masks", folder / mask_stage.CONTACT_SHEET,
         ready.masks, str(source), _part(tell, 0.85, 0.96), cancelled,
@@ -257,7 +258,6 @@ def _cameras(ready: Prepared, photos: list[Photo], ups: dict[str, gravity.Vector
             )
     if alignment is None:
         alignment = align_to_ground(found, settings.distance, gravity.measured_up(found, ups, str(source)))
-        _tell_guesses(alignment, source)
     return found, alignment
 
 
@@ -320,8 +320,8 @@ def _by_features(ready: Prepared, photos: list[Photo], ordered: bool, subject: s
     return best
 
 
-def _tell_guesses(alignment: Alignment, source: Path) -> None:
-    """Warn of what is assumed of the world, and say what would tell it."""
+def _tell_guesses(alignment: Alignment, source: Path, of_masks: str = "") -> None:
+    """Warn of what is assumed of the world and what masks suffer by it, and say what would tell it."""
     guessed = alignment.guessed
     if "scale" in guessed:
         logger.warning(
@@ -331,9 +331,9 @@ def _tell_guesses(alignment: Alignment, source: Path) -> None:
     if "ground" in guessed:
         logger.warning(
             "%s: no level plane is found under the object: %s (%s) guessed. Lay a marker sheet (drgs markers) or "
-            "something with texture under it, or turn and move the object where it is used",
+            "something with texture under it, or turn and move the object where it is used%s",
             source, "up and the height of the ground are" if "up" in guessed else "the height of the ground is",
-            "; ".join(why for name, why in guessed.items() if name != "scale"),
+            "; ".join(why for name, why in guessed.items() if name != "scale"), f". {of_masks}" if of_masks else "",
         )  # fmt: skip
 
 

@@ -193,10 +193,11 @@ def run(args: argparse.Namespace) -> int:
     if reading.normals != NONE:
         load_model(reading.normals)
     steps = Steps(args, "reconstructing")
-    source = args.capture if calibrated else _find_cameras(args, steps, reading, masks)
+    source, told = (args.capture, False) if calibrated else _find_cameras(args, steps, reading, masks)
     capture = read_capture(
-        source, reading.resolution, reading.test_every, reading.axes, reading.up, turntable=reading.turntable
-    )
+        source, reading.resolution, reading.test_every, reading.axes, reading.up, turntable=reading.turntable,
+        tell_guesses=not told,
+    )  # fmt: skip
     if calibrated:  # else `drgs capture` has looked at them
         tell_unused(reading, args.capture, calibrated)
         tell_of_views(capture)
@@ -294,8 +295,8 @@ def resolved_settings(config: Path | None, options: dict[str, Any], sets: list[s
     return settings, reading
 
 
-def _find_cameras(args: argparse.Namespace, steps: Steps, reading: Reading, masks: str) -> Path:
-    """A capture with cameras, made of photographs without, beside the output."""
+def _find_cameras(args: argparse.Namespace, steps: Steps, reading: Reading, masks: str) -> tuple[Path, bool]:
+    """A capture with cameras, made of photographs without, beside the output; whether its guesses have been told."""
     from ..capture.pipeline import make_capture
 
     folder = args.out.with_name(f"{args.out.stem}.capture")
@@ -314,7 +315,7 @@ def _find_cameras(args: argparse.Namespace, steps: Steps, reading: Reading, mask
         note(line)
     if lines_wanted(args):
         print(f"DRGS_CAPTURE {folder}", flush=True)  # for programs that read the lines
-    return folder
+    return folder, not made.kept
 
 
 def _masks_after_cameras(reading: Reading, masks: str) -> bool:

@@ -209,6 +209,8 @@ def test_what_is_guessed_is_told_then_and_again_by_reconstruct(tmp_path, caplog)
     folder = written_capture(tmp_path, alignment)
     assert json.loads((folder / "capture.json").read_text())["guessed"] == alignment.guessed
     caplog.clear()
+    read_capture(folder, 64, tell_guesses=False)
+    assert not caplog.messages
     read_capture(folder, 64)
     (told,) = [text for text in caplog.messages if "without knowing" in text]
     assert "up (how the cameras were held)" in told and "ground (lowest points)" in told and "scale" in told
@@ -235,11 +237,16 @@ def test_what_is_known_is_not_doubted(tmp_path, caplog):
 
 
 def test_masks_are_not_made_on_a_ground_that_only_cameras_guess(tmp_path, caplog):
-    assert stage.mode_on_ground("auto", None, PLANE, "set") == "auto" and not caplog.messages
-    assert stage.mode_on_ground("auto", tmp_path, GUESSED, "set") == "auto" and not caplog.messages  # given ones
-    assert stage.mode_on_ground("given", None, GUESSED, "set") == "given" and not caplog.messages
-    assert stage.mode_on_ground("auto", None, LOWEST, "set") == "auto" and "lack the object's foot" in caplog.text
-    assert stage.mode_on_ground("auto", None, GUESSED, "set") == "none" and "no masks are made" in caplog.text
+    assert stage.mode_on_ground("auto", None, PLANE) == ("auto", "")
+    assert stage.mode_on_ground("auto", tmp_path, GUESSED) == ("auto", "")  # given ones
+    assert stage.mode_on_ground("given", None, GUESSED) == ("given", "")
+    mode, said = stage.mode_on_ground("auto", None, LOWEST)
+    assert mode == "auto" and "lack its foot" in said
+    mode, said = stage.mode_on_ground("auto", None, GUESSED)
+    assert mode == "none" and "No masks are made" in said
+    pipeline._tell_guesses(align_to_ground(registration(ring(20), np.zeros((0, 3))), 0.5), tmp_path, said)
+    (told,) = caplog.messages  # the ground and what masks suffer by it, once
+    assert "no level plane is found" in told and said in told
 
 
 def test_deep_tiff_with_alpha_is_read_back(tmp_path):

@@ -23,10 +23,11 @@ from .making import make_masks
 from .mask_view import MaskView
 from .segmentation_model import SegmentationModel, load_model, masks_by_model
 from .settling import REMEDY, resized, whole
-from .stage import GROUND_IS_GUESSED, MODEL_UNUSED, MODES, NO_GROUND, ONLY_SOME, check_given
+from .stage import ABOVE_LOWEST, MODEL_UNUSED, MODES, ONLY_SOME, check_given
 
 logger = logging.getLogger(__name__)
 
+_NO_PLANE = "the plane on which the object stands is not known"
 #: Masks that are checked against each other: no fewer, and of more evenly chosen ones.
 _FEWEST, _CHECKED = 6, 120
 #: Voxels of their hull, along its longest side: enough to find masks that cut the object.
@@ -81,10 +82,11 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
     found = Registration(matrices, {}, {}, {}, points, np.zeros((len(points), 3), np.uint8), "")
     ground = _to_ground(found, capture.source)
     if ground is None:
-        logger.warning(NO_GROUND, subject, REMEDY)
+        logger.warning("%s: %s (no sparse points on it, nor a marker sheet): no masks are made. %s",
+                       subject, _NO_PLANE, REMEDY)  # fmt: skip
         return
     if ground == LOWEST:
-        logger.warning(GROUND_IS_GUESSED, subject, sheet.name)
+        logger.warning("%s: %s. %s", subject, _NO_PLANE, ABOVE_LOWEST.format(sheet.name))
     views = [_mask_view(view, found.matrices[view.name]) for view in capture.training]
     made, _ = make_masks(cv2, views, found.points, sheet, subject, tell, cancelled)
     if made is None:

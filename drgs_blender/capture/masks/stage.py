@@ -33,13 +33,9 @@ logger = logging.getLogger(__name__)
 #: a segmentation model, by which they are made.
 MODES = ("given", "auto", "none")
 CONTACT_SHEET = "masks.png"
-NO_GROUND = (
-    "%s: the plane on which the object stands is not known (no sparse points on it, nor a marker sheet): no masks are "
-    "made. %s"
-)
-GROUND_IS_GUESSED = (
-    "%s: masks are made above the lowest points, as the plane on which the object stands is not found: they may hold "
-    "parts of it, or lack the object's foot. Look at %s"
+ABOVE_LOWEST = (
+    "Masks are made above the lowest points: they may hold parts of what the object stands on, or lack its foot. Look "
+    "at {}"
 )
 ONLY_SOME = "%s: %d of %d pictures have masks: no others are made. Draw all, or remove these"
 MODEL_UNUSED = "%s: has masks, or a background of one colour: %s is not used. Remove the masks to use it"
@@ -66,8 +62,8 @@ def check_mode(mode: str) -> None:
         load_model(mode)
 
 
-def mode_on_ground(mode: str, given: Path | None, ground: str, subject: str) -> str:
-    """`mode`, or "none" where masks would be made on a ground that is nothing but the cameras' guess; warns of guesses.
+def mode_on_ground(mode: str, given: Path | None, ground: str) -> tuple[str, str]:
+    """`mode`, or "none" where masks would be made on a ground that is nothing but the cameras' guess; what to tell.
 
     Parameters
     ----------
@@ -77,17 +73,18 @@ def mode_on_ground(mode: str, given: Path | None, ground: str, subject: str) -> 
         Folder of given masks.
     ground : str
         What the ground rests on, `Alignment.ground_from`.
-    subject : str
-        For messages.
+
+    Returns
+    -------
+    mode : str
+    said : str
+        What a guessed ground means for masks that are made; empty: nothing.
     """
     if mode != "auto" or given is not None:
-        return mode
+        return mode, ""
     if ground == GUESSED:
-        logger.warning(NO_GROUND, subject, REMEDY)
-        return "none"
-    if ground == LOWEST:
-        logger.warning(GROUND_IS_GUESSED, subject, CONTACT_SHEET)
-    return mode
+        return "none", f"No masks are made. {REMEDY}"
+    return mode, ABOVE_LOWEST.format(CONTACT_SHEET) if ground == LOWEST else ""
 
 
 def make_or_check(mode: str, found: Registration, by_file: dict[str, Picture], copies: Path, work: Path, sheet: Path,

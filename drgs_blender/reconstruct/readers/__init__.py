@@ -65,6 +65,7 @@ def read_capture(
     up: str | None = None,
     light: str | None = None,
     turntable: str = "auto",
+    tell_guesses: bool = True,
 ) -> Capture:
     """Read calibrated photographs of one object.
 
@@ -87,6 +88,8 @@ def read_capture(
     turntable : {"auto", "yes", "no"}
         Whether the object was turned and the light stood still with the camera; "auto": where the surroundings of the
         object are the same in all pictures, with a warning.
+    tell_guesses : bool
+        Warn of what `drgs capture` guessed of the world; not where it has just said so.
 
     Returns
     -------
@@ -109,7 +112,8 @@ def read_capture(
     layout, turn = read_layout(path, axes, up, light)
     photographs = layout.photographs
     _check_memory(layout, resolution, path)
-    _tell_guesses(layout, path, up)
+    if tell_guesses:
+        _tell_guesses(layout, path, up)
     known: dict[Lens, tuple[Lens, np.ndarray]] = {}
     gains = find_gains(photographs, str(path))
     developed = [(p, load_photograph(p, layout, resolution, known, g)) for p, g in zip(photographs, gains, strict=True)]
