@@ -73,8 +73,8 @@ def main() -> None:
     args = parser.parse_args()
     report, truth = json.loads((args.capture / "capture.json").read_text()), true_cameras(args.truth)
     row = camera_figures(report, truth)
-    count = len(report["cameras"])
-    print(f"{count} of {len(truth)} pictures, {report['method']}, reprojection error {report['error']:.2f} px")
+    count, of = len(report["cameras"]), len(report["cameras"]) + len(report["left_out"])
+    print(f"{count} of {of} pictures, {report['method']}, reprojection error {report['error']:.2f} px")
     print(f"place: median {row['place']:.2%}, largest {row['largest place']:.2%} of the cameras' distance")
     print(f"direction: median {row['direction']:.3f}, largest {row['largest direction']:.3f} degrees")
     print(f"scale {row['scale']:.4f} ({report['scale']}), ground {row['ground']:.4f} m off")
@@ -94,14 +94,15 @@ def main() -> None:
             print("masks: none")
     if args.scene:
         cells = [
-            f"{count} of {len(truth)}", f"{row['place']:.2%} / {row['largest place']:.2%}",
+            f"{count} of {of}", f"{row['place']:.2%} / {row['largest place']:.2%}",
             f"{row['direction']:.3f}° / {row['largest direction']:.2f}°",
             "guessed" if "up" in report["guessed"] else f"{row['up']:.2f}°", *figures,
         ]  # fmt: skip
         rows = store_row(OUT / "capture.json", args.scene, cells)
         write_section(
             "capture", "Photographs without cameras",
-            "Scenes on tables of noise are those of `bench/capture_scene.py`, rendered by Cycles. Cameras after a "
+            "Scenes on tables of noise are those of `bench/capture_scene.py`, rendered by Cycles; on a turntable the "
+            "object turns before one camera, table and sky stand still, and nothing is given. Cameras after a "
             "similarity, places in parts of their distance from their centre. A number of masks: made of the "
             "photographs alone (`--masks auto`); IoU is the intersection over union with the object's true coverage. "
             "The true cameras of the real head are COLMAP's as its photographers published them.\n\n"

@@ -1,7 +1,7 @@
 """Photographs without cameras and masks against the same with true ones, judged under a light that was not there.
 
 python bench/bench_uncalibrated.py --scene NAME --world SKY.hdr --relit OTHER.hdr [--object MESH.glb] [--pictures 36]
-    [--size 560] [--samples 64] [--only "true cameras, found masks"]
+    [--size 560] [--samples 64] [--steps 1000 800] [--only "true cameras, found masks"]
 
 Cycles photographs an object among others on a table (`capture_scene.py --clutter`), and the object alone under the
 other sky. The photographs become an asset with the true cameras and masks, with those that `drgs capture --masks auto`
@@ -88,26 +88,27 @@ def cameras_of(folder: Path, which: str) -> tuple[dict, dict[str, dict]]:
 def composed(folder: Path, cameras: str, masks: str) -> Path:
     """A capture of the photographs with cameras and masks that are "true", or "found" by `drgs capture`."""
     capture, made = folder / f"{cameras}-cameras-{masks}-masks", folder / "made"
-    capture.mkdir(exist_ok=True)
+    (capture / "masks").mkdir(parents=True, exist_ok=True)
     data, known = cameras_of(folder, cameras)
     data["frames"] = []
     for name, camera in known.items():
         mask_file = (folder / "truth" if masks == "true" else made / "masks") / f"{Path(name).stem}.png"
         if mask_file.is_file():
-            with Image.open(folder / "images" / name) as picture, Image.open(mask_file) as mask:
+            shutil.copy(folder / "images" / name, capture)
+            with Image.open(capture / name) as picture, Image.open(mask_file) as mask:
                 width, height = picture.size
-                picture.putalpha(mask.getchannel("A") if "A" in mask.getbands() else mask.convert("L"))
-                picture.save(capture / mask_file.name)
+                coverage = mask.getchannel("A") if "A" in mask.getbands() else mask
+                coverage.save(capture / "masks" / mask_file.name)
             lens = {"w": width, "h": height, "cx": width / 2, "cy": height / 2}
-            data["frames"].append(lens | camera | {"file_path": mask_file.name})
-            data["frames"][-1].pop("mask_path", None)
+            files = {"file_path": name, "mask_path": f"masks/{mask_file.name}"}
+            data["frames"].append(lens | camera | files)
     if cameras == "found":
         shutil.copy(made / data["ply_file_path"], capture)
     (capture / "transforms.json").write_text(json.dumps(data))
     return capture
 
 
-def asset_of(folder: Path, cameras: str, masks: str) -> Made:
+def asset_of(folder: Path, cameras: str, masks: str, steps: list[int] | None) -> Made:
     """From photographs with "true" cameras and masks, or "found" ones."""
     made = folder / "made"
     if "found" in (cameras, masks) and not (made / "cost.json").exists():
@@ -116,7 +117,9 @@ def asset_of(folder: Path, cameras: str, masks: str) -> Made:
     alone = cameras == masks == "found"
     capture = made if alone else composed(folder, cameras, masks)
     asset = folder / f"{capture.name}.drgs"
-    spent, wall = run("reconstruct", capture, "--out", asset)
+    names = ("schedule.iterations", "decoupling.iterations")
+    bound = [word for name, count in zip(names, steps or ()) for word in ("--set", f"{name}={count}")]
+    spent, wall = run("reconstruct", capture, "--out", asset, *bound)
     if alone:
         first = json.loads((made / "cost.json").read_text())
         spent, wall = spent + first[0], wall + first[1]
@@ -169,24 +172,26 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=560)
     parser.add_argument("--spp", type=int, default=32)
     parser.add_argument("--samples", type=int, default=64)
+    parser.add_argument("--steps", type=int, nargs=2, help="of surfels, of materials and light; else the default ones")
     parser.add_argument("--only", choices=list(WAYS), nargs="+", default=list(WAYS))
     options = parser.parse_args()
     folder = FOLDER / options.scene.replace(" ", "-")
     folder.mkdir(parents=True, exist_ok=True)
     photographed(folder, options)
+    scene = options.scene + (", {} and {} steps".format(*options.steps) if options.steps else "")
     for label in options.only:
-        made = asset_of(folder, *WAYS[label])
+        made = asset_of(folder, *WAYS[label], options.steps)
         cells = [made.pictures, made.masks, *relit(made, folder, options.relit, options.samples)]
         rows = store_row(
-            FOLDER / "rows.json", f"{options.scene}|{label}", [*cells, *(f"{x:.0f}" for x in (made.spent, made.wall))]
+            FOLDER / "rows.json", f"{scene}|{label}", [*cells, *(f"{x:.0f}" for x in (made.spent, made.wall))]
         )
-        print(options.scene, label, *cells, flush=True)
+        print(scene, label, *cells, flush=True)
     body = (
         "An object among boxes on a table of noise, photographed by Cycles under one sky, and relit under another, "
         f"where Cycles' pictures of it alone judge; {options.size} pixels across. Default settings of `drgs capture "
-        "--masks auto` and `drgs reconstruct`. PSNR of the foreground in dB, scaled by one factor a channel; SSIM and "
-        "FLIP of the scaled frames on white. Seconds: of both commands where both cameras and masks are found, else of "
-        "`drgs reconstruct`.\n\n"
+        "--masks auto` and `drgs reconstruct`, but for steps that are named. PSNR of the foreground in dB, scaled by "
+        "one factor a channel; SSIM and FLIP of the scaled frames on white. Seconds: of both commands where both "
+        "cameras and masks are found, else of `drgs reconstruct`.\n\n"
     )
     write_section(
         "uncalibrated", "Without cameras and masks, relit",

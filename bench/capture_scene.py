@@ -108,7 +108,7 @@ def stand(path: Path, turned: bpy.types.Object) -> list[bpy.types.Object]:
     low, high = vertices.min(0), vertices.max(0)
     scale = HEIGHT / (high[2] - low[2])
     foot = Vector((*((low + high) / 2)[:2], low[2]))
-    for obj in (obj for obj in bpy.data.objects if obj.parent is None and is_subject(obj)):
+    for obj in [obj for obj in bpy.data.objects if obj.parent is None and is_subject(obj) and obj != turned]:
         obj.matrix_world = Matrix.Scale(scale, 4) @ Matrix.Translation(-foot) @ obj.matrix_world
         obj.parent = turned
     return meshes
