@@ -53,11 +53,14 @@ class Effort:
     steps : int
     surfels : int
         At most, after those that learning begins with.
+    finest : int
+        As `size`, of photographs that show as much.
     """
 
     size: int
     steps: int
     surfels: int
+    finest: int = 0
 
 
 def learn_scene(cv2: Any, views: Sequence[MaskView], box: ObjectBox, effort: Effort,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from .settling import REMEDY, settle
 logger = logging.getLogger(__name__)
 
 #: First roughly, to find the box around the object; then that.
-EFFORTS = (Effort(160, 300, 16000), Effort(256, 900, 20000))
+EFFORTS = (Effort(160, 300, 16000), Effort(256, 900, 30000, 384))
 #: Pixels of the longer side of masks, of the part around the object.
 PART = 640
 #: Surfels that an object has at least; views that show it (three make a hull, which a fourth is held against).
@@ -173,6 +173,8 @@ def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
             raise NoMasks(f"{len(windows)} photographs show the object, masks need {_FEWEST_VIEWS}")
         parts = [views[k].cropped(window, PART) for k, window in windows.items()]
         told = lambda phase, part, step=step: tell(phase, 0.2 + 0.7 * (step + part) / len(EFFORTS))  # noqa: E731
+        shown = np.median([max(right - left, bottom - top) for left, top, right, bottom in windows.values()])
+        effort = replace(effort, size=int(np.clip(shown, effort.size, max(effort.finest, effort.size))))
         scene = learn_scene(cv2, parts, box, effort, object_surfels, told, cancelled)
         cut = cut_object(scene, box)
         if cut.surfels.sum() < _FEWEST_SURFELS:
