@@ -101,6 +101,12 @@ def run(tmp_path, mode, found, pictures, given=None, cancelled=lambda: False):
     )  # fmt: skip
 
 
+def test_masks_are_learned_as_finely_as_photographs_show_the_object_within_bounds():
+    fine = Effort(64, 150, 5000, 96)
+    assert [fine.fitting(shown).size for shown in (10, 64, 80.4, 96, 4000)] == [64, 64, 80, 96, 96]
+    assert Effort(64, 150, 5000).fitting(4000) == Effort(64, 150, 5000)
+
+
 def test_rays_and_projection_are_inverse():
     view, _ = photograph(3, 12)
     places = view.centre + 0.8 * view.rays().reshape(-1, 3)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +61,10 @@ class Effort:
     steps: int
     surfels: int
     finest: int = 0
+
+    def fitting(self, shown: float) -> Effort:
+        """The same for windows of so many pixels as photographed."""
+        return replace(self, size=max(self.size, round(min(shown, self.finest))))
 
 
 def learn_scene(cv2: Any, views: Sequence[MaskView], box: ObjectBox, effort: Effort,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -174,8 +174,7 @@ def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
         parts = [views[k].cropped(window, PART) for k, window in windows.items()]
         told = lambda phase, part, step=step: tell(phase, 0.2 + 0.7 * (step + part) / len(EFFORTS))  # noqa: E731
         shown = np.median([max(right - left, bottom - top) for left, top, right, bottom in windows.values()])
-        effort = replace(effort, size=int(np.clip(shown, effort.size, max(effort.finest, effort.size))))
-        scene = learn_scene(cv2, parts, box, effort, object_surfels, told, cancelled)
+        scene = learn_scene(cv2, parts, box, effort.fitting(float(shown)), object_surfels, told, cancelled)
         cut = cut_object(scene, box)
         if cut.surfels.sum() < _FEWEST_SURFELS:
             raise NoMasks("no object is found on the ground")
