@@ -102,7 +102,8 @@ def run(tmp_path, mode, found, pictures, given=None, cancelled=lambda: False):
 
 
 def test_masks_are_learned_as_finely_as_photographs_show_the_object_within_bounds():
-    from drgs_blender.capture.masks.learned_scene import Effort  # with torch
+    pytest.importorskip("torch")
+    from drgs_blender.capture.masks.learned_scene import Effort
 
     fine = Effort(64, 150, 5000, 96)
     assert [fine.fitting(shown).size for shown in (10, 64, 80.4, 96, 4000)] == [64, 64, 80, 96, 96]
