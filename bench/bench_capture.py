@@ -1,6 +1,6 @@
 """Cameras and masks that `drgs capture` made against true ones.
 
-    .venv/bin/python bench/bench_capture.py CAPTURE TRUTH.json [--masks FOLDER] [--scene NAME]
+    .venv/bin/python bench/bench_capture.py CAPTURE TRUTH.json [--masks FOLDER] [--turned] [--scene NAME]
 
 CAPTURE is a folder of `drgs capture`; TRUTH.json the `truth.json` of `capture_scene.py`, or a transforms.json, whose
 cameras are compared after a similarity. FOLDER has the true masks, named as the pictures, `.png`. With a NAME the
@@ -69,6 +69,7 @@ def main() -> None:
     parser.add_argument("capture", type=Path)
     parser.add_argument("truth", type=Path)
     parser.add_argument("--masks", type=Path, help="folder of true masks")
+    parser.add_argument("--turned", action="store_true", help="up is not Z in the truth's world")
     parser.add_argument("--scene", help="name of the row in docs/benchmarks.md")
     args = parser.parse_args()
     report, truth = json.loads((args.capture / "capture.json").read_text()), true_cameras(args.truth)
@@ -96,7 +97,7 @@ def main() -> None:
         cells = [
             f"{count} of {of}", f"{row['place']:.2%} / {row['largest place']:.2%}",
             f"{row['direction']:.3f}° / {row['largest direction']:.2f}°",
-            "guessed" if "up" in report["guessed"] else f"{row['up']:.2f}°", *figures,
+            "guessed" if "up" in report["guessed"] else "not known" if args.turned else f"{row['up']:.2f}°", *figures,
         ]  # fmt: skip
         rows = store_row(OUT / "capture.json", args.scene, cells)
         write_section(
