@@ -11,7 +11,7 @@ from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringPr
 
 from ..drgs_blender.core.frame import Adjustment
 from . import mesh_arrays
-from .property_limits import Limited
+from .property_limits import Limited, tag_changed
 
 Array = np.ndarray
 
@@ -28,11 +28,6 @@ def _masks(settings: DrgsAdjustmentSettings, context: bpy.types.Context, typed: 
     """Names that the mask may have."""
     obj = settings.id_data
     return mesh_arrays.mask_names(obj, typed) if obj.type == "MESH" else []
-
-
-def tag_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
-    """Update callback: tag the object, so that viewports and exports see changes made by scripts, too."""
-    settings.id_data.update_tag(refresh={"OBJECT"})
 
 
 def _number(label: str, about: str, **limits: float) -> FloatProperty:

@@ -131,6 +131,44 @@ class Playback:
             return 0
 
 
+class Played:
+    """What a Mesh Cache modifier plays of a cache.
+
+    Parameters
+    ----------
+    path : the PC2 file
+    header : of the cache
+
+    Attributes
+    ----------
+    last : the last frame that is in the file
+
+    Raises
+    ------
+    AssetError
+        The file is damaged, or of another cache.
+    OSError
+        It cannot be read.
+    """
+
+    def __init__(self, path: Path, header: Header) -> None:
+        self.path, self._header = path, header
+        with open(path, "rb") as file:
+            head = file.read(PC2.size)
+        if len(head) < PC2.size or not head.startswith(MAGIC) or PC2.unpack(head)[2] != header.vertices:
+            raise AssetError(str(path), "is not what its cache is played by", "Bake again")
+        self.last = header.first + PC2.unpack(head)[5] - 1
+
+    def vertices(self, frame: int) -> Array:
+        """(n, 3) float32 vertices as they are played in a frame, object space."""
+        count = self._header.vertices
+        at = PC2.size + (frame - self._header.first) * count * 12
+        found = np.fromfile(self.path, "<f4", 3 * count, offset=at)
+        if len(found) < 3 * count:
+            raise AssetError(str(self.path), f"ends before frame {frame}", "Bake again")
+        return found.reshape(count, 3)
+
+
 def modifier_of(obj: bpy.types.Object) -> bpy.types.Modifier | None:
     """The modifier that plays the cache of an object."""
     return point_caches.find(obj, MODIFIER)
@@ -147,7 +185,7 @@ def check(obj: bpy.types.Object, warn: Callable[[str], None], *, final: bool) ->
     modifier = modifier_of(obj)
     if modifier is None or not (modifier.show_render if final else modifier.show_viewport):
         return
-    path = _path_of(obj, modifier)
+    path = path_of(obj, modifier)
     if not path.exists():
         raise AssetError(
             f'Object "{obj.name}"',
@@ -160,7 +198,8 @@ def check(obj: bpy.types.Object, warn: Callable[[str], None], *, final: bool) ->
         warn(f'"{obj.name}": {path.parent / HEADER} does not exist; its tears and grains are not shown. Bake again')
 
 
-def _path_of(obj: bpy.types.Object, modifier: bpy.types.Modifier) -> Path:
+def path_of(obj: bpy.types.Object, modifier: bpy.types.Modifier) -> Path:
+    """The file that a modifier plays."""
     return Path(bpy.path.abspath(modifier.filepath, library=obj.library))
 
 
@@ -170,7 +209,7 @@ def fracture_state(obj: bpy.types.Object) -> dict[str, Any]:
     if modifier is None:
         return {}
     with suppress(DrgsError):  # a damaged cache plays all the same; the next bake says it
-        header = ParticleCache(_path_of(obj, modifier).parent).header()
+        header = ParticleCache(path_of(obj, modifier).parent).header()
         if header is not None:
             return {"tear": header.tear * physics.tear, "grain": header.grain * physics.grain}
     return {}

@@ -18,6 +18,7 @@ from bpy.props import (
 
 from ..drgs_blender.core.sim_materials import MATERIALS
 from . import blend_paths
+from .property_limits import tag_changed
 
 #: Numbers of every material, and those that some models have besides.
 BASIC = ("youngs_modulus", "poisson", "density")
@@ -229,12 +230,25 @@ class DrgsPhysicsSettings(_MaterialNumbers, bpy.types.PropertyGroup):
         name="Open Tears",
         description="Leave out faces that span a gap where the material has come apart, with their splats",
         default=True,
+        update=tag_changed,
         options=set(),
     )
     grain: BoolProperty(
         name="Granular Splats",
         description="Sand: where it flows, splats are drawn as grains instead of a stretched skin",
         default=True,
+        update=tag_changed,
+        options=set(),
+    )
+    driven_by: EnumProperty(
+        name="Driven By",
+        description="What carries the splats of the simulated object",
+        items=(
+            ("automatic", "Automatic", "Splats on the mesh follow its surface, all others the particles around them"),
+            ("surface", "Surface", "All follow the faces of the mesh, which the particles move"),
+            ("particles", "Particles", "All follow the particles around them; where the material flows, the surface"),
+        ),
+        update=tag_changed,
         options=set(),
     )
     resolution: IntProperty(

@@ -11,10 +11,10 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, Po
 from ..drgs_blender.core.frame import RenderSettings
 from ..drgs_blender.core.passes import PASSES, Pass
 from . import blend_paths, mesh_display
-from .adjustment_settings import DrgsAdjustmentSettings, tag_changed
+from .adjustment_settings import DrgsAdjustmentSettings
 from .level_of_detail import LevelOfDetail
 from .physics_settings import DrgsPhysicsSettings
-from .property_limits import Limited
+from .property_limits import Limited, tag_changed
 from .submit import DrgsSubmitSettings
 
 _DENOISERS = {

@@ -1,4 +1,4 @@
-"""Settings clamped to their limits: files of other versions, and scripts, may hold any value."""
+"""Settings clamped to their limits, as old files and scripts may hold any value; changes are told to Blender."""
 
 from __future__ import annotations
 
@@ -43,3 +43,8 @@ def _limited(value: float, default: float, prop: bpy.types.Property) -> float:
     if value != value:
         return default
     return value if prop.hard_min <= value <= prop.hard_max else min(max(value, prop.hard_min), prop.hard_max)
+
+
+def tag_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+    """Update callback: tag the object, so that viewports and exports see changes made by scripts, too."""
+    settings.id_data.update_tag(refresh={"OBJECT"})

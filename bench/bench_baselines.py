@@ -24,7 +24,7 @@ from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.frame import Camera, RenderSettings, Visibility, World
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.engine.session import Session
-from drgs_blender.evaluate.compare import Renderer, compare
+from drgs_blender.evaluate.compare import Posed, Renderer, compare
 from drgs_blender.evaluate.truth import read_truth
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling
 from drgs_blender.reconstruct.optim.schedule import Schedule
@@ -83,9 +83,9 @@ def renderer(session: Session, key: str, method: Method, samples: int) -> Render
     baked = Baked(asset) if method.picture == "baked" else None
     lights: dict[bytes, Prefiltered] = {}
 
-    def draw(camera: Camera, light: World, vertices: Array | None) -> dict[str, Array]:
+    def draw(camera: Camera, light: World, pose: Posed | None) -> dict[str, Array]:
         radiance = np.asarray(light.environment)
-        passes = lit(camera, light, vertices)
+        passes, vertices = lit(camera, light, pose), None if pose is None else pose.vertices
         if method.picture == "albedo":
             passes["Combined"] = np.concatenate([passes["Albedo"] * passes["Coverage"], passes["Coverage"]], axis=2)
         elif baked is not None:

@@ -27,7 +27,7 @@ from drgs_blender.core.color import linear_to_srgb
 from drgs_blender.core.file_types import TURNTABLE
 from drgs_blender.core.frame import Camera, RenderSettings, World
 from drgs_blender.engine.session import Session
-from drgs_blender.evaluate.compare import compare
+from drgs_blender.evaluate.compare import Posed, compare
 from drgs_blender.evaluate.metrics import mean_psnr, straight
 from drgs_blender.reconstruct import held_out, pipeline
 from drgs_blender.reconstruct.capture.capture import Capture
@@ -79,8 +79,8 @@ def relit(capture: Capture, path: Path, samples: int) -> tuple[list[Array], floa
     key = session.load_asset(path)
     lit = session_renderer(session, key, RenderSettings(samples=samples, bounces=3, camera_sees="surfels"))
 
-    def keep(camera: Camera, light: World, vertices: Array | None) -> dict[str, Array]:
-        passes = lit(camera, light, vertices)
+    def keep(camera: Camera, light: World, pose: Posed | None) -> dict[str, Array]:
+        passes = lit(camera, light, pose)
         linear, alpha = straight(passes)
         encoded = np.clip(linear_to_srgb(np.clip(linear, 0, 1)), 0, 1)
         shown.append(encoded * alpha[..., None] + background_of(capture) * (1 - alpha[..., None]))

@@ -25,6 +25,7 @@ from .holdouts import Holdouts
 from .instances import Key, Visible, terminator_offset
 from .materials import finite
 from .meshes import check_normals
+from .particles import particles_of
 from .surface_nodes import SurfaceWalker
 from .topology_check import Fit, check_modifiers, check_topology
 
@@ -85,7 +86,7 @@ class DrgsObjects:
         cache_playback.check(obj, self._warn, final=self._depsgraph.mode == "RENDER")
         appearance = (
             obj.drgs.show_captured, obj.drgs.adjustment.values(), *cache_playback.fracture_state(obj).items(),
-            surfel_points.state_of(obj),
+            obj.drgs.physics.driven_by, surfel_points.state_of(obj),
         )  # fmt: skip
         shape = self._cache.get(
             ("object", uid(obj), obj.name, obj.data.as_pointer(), obj.mode, str(assets.file_of(obj)), appearance),
@@ -159,8 +160,9 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     with _readable(obj, depsgraph) as mesh:
         point_caches.check(obj, asset.mesh, warn, final=depsgraph.mode == "RENDER")
         fit = _without_removed(check_topology(obj, mesh, asset.mesh, warn), obj, asset, depsgraph)
+        vertices = mesh_arrays.read_vertices(mesh)
         arrays: dict[str, Any] = {
-            "vertices": fit.of_part(mesh_arrays.read_vertices(mesh)),
+            "vertices": fit.of_part(vertices),
             "corner_normals": _corner_normals(obj, mesh, fit, warn),
             **{c: None if captured else _edited(obj, mesh, asset, c, fit, warn) for c in MATERIAL_CHANNELS},
         }
@@ -168,6 +170,7 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
             if array is not None:
                 array.flags.writeable = False  # so that the engine's client need not copy it
         appearance = cache_playback.fracture_state(obj)
+        appearance["particles"] = particles_of(obj, depsgraph, vertices, warn)
         adjustment = None if captured else _adjustment(obj, mesh, fit, warn)
         return ObjectState(
             name=obj.name, asset=key_of(path), part=fit.part, adjustment=adjustment, **arrays, **appearance

@@ -83,6 +83,7 @@ class DRGS_PT_physics(_Physics, bpy.types.Panel):
         _draw_material(column, physics)
         column.prop(physics, "solver")
         column.prop(physics, "resolution")
+        column.prop(physics, "driven_by")
         column.prop(physics, "tear")
         if MATERIALS[physics.material].grain:
             column.prop(physics, "grain")

@@ -26,7 +26,7 @@ from .progress import WORK_SECONDS, FractionBar
 if TYPE_CHECKING:
     from ..core.asset.model import Asset
     from ..engine.session import Session
-    from ..evaluate.compare import Renderer
+    from ..evaluate.compare import Posed, Renderer
     from ..evaluate.scenes import Plan
 
 logger = logging.getLogger(__name__)
@@ -81,6 +81,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "has several lights (TensoIR); may be given several times",
     )
     evaluate_protocol.add_arguments(parser)
+    parser.add_argument(
+        "--driven-by", choices=("automatic", "surface", "particles"), default="automatic",
+        help="what carries the surfels where the true object is posed: the asset's faces; points of the true surface; "
+        "or these only what does not lie on the mesh (default)",
+    )  # fmt: skip
     scenes = parser.add_argument_group("scenes with known truth")
     scenes.add_argument("--make-scenes", type=Path, metavar="OUT", help="render them; goes on where it was stopped")
     scenes.add_argument("--small", action="store_true", help="one object, small and few views, in a minute")
@@ -189,7 +194,7 @@ def score(args: argparse.Namespace) -> int:
             session.asset(key),
             capture,
             truth,
-            session_renderer(session, key, settings),
+            session_renderer(session, key, settings, driven_by=args.driven_by),
             lpips,
             lambda part, name: bar(name, part),
             writer(args.pictures) if args.pictures is not None else None,
@@ -219,12 +224,17 @@ def left_out_by(asset: Asset) -> int | None:
 
 
 def session_renderer(
-    session: Session, key: str, settings: RenderSettings, visibility: Visibility | None = None
-) -> Renderer:
+    session: Session, key: str, settings: RenderSettings, visibility: Visibility | None = None,
+    driven_by: str = "automatic",
+) -> Renderer:  # fmt: skip
     """Renders the loaded asset `key` for `evaluate.compare`, with `settings` on a transparent film."""
 
-    def render(camera: Camera, light: World, vertices: np.ndarray | None) -> dict[str, np.ndarray]:
-        state = ObjectState(Path(key).stem, key, vertices=vertices, visibility=visibility or Visibility())
+    def render(camera: Camera, light: World, pose: Posed | None) -> dict[str, np.ndarray]:
+        state = ObjectState(Path(key).stem, key, visibility=visibility or Visibility())
+        if pose is not None:
+            state.vertices = pose.vertices
+            if driven_by != "surface":
+                state.particles = replace(pose.particles, all=driven_by == "particles")
         return compared_passes(session, state, camera, light, settings)
 
     return render

@@ -22,7 +22,7 @@ import numpy as np
 from ..core import cryptomatte
 from ..core.asset import Asset
 from ..core.errors import UsageError
-from ..core.frame import Camera, Frame, ObjectState, RenderSettings, World
+from ..core.frame import Camera, Frame, ObjectState, Particles, RenderSettings, World
 from ..core.frame_sequences import frame_path
 from ..core.loading import many_imports
 from ..core.particle_cache import ParticleCache
@@ -88,6 +88,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_vertex_order(parser)
     parser.add_argument(
+        "--driven-by", choices=("automatic", "surface", "particles"), default="automatic",
+        help="what carries the surfels of CACHE: the mesh's faces; the particles; or these only what does not lie on "
+        "the mesh (default)",
+    )  # fmt: skip
+    parser.add_argument(
         "--frames", metavar="RANGE", help="of CACHE or V: 12, 1-24, 1-24x2; default: all that are there"
     )
     sampling.add_arguments(parser, defaults=True)
@@ -133,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
     state = ObjectState(args.asset.stem, key, tear=tear, grain=grain, captured_colours=args.captured)
     warned = False
     for number, give_pose in poses:
-        vertices = give_pose()
+        vertices, particles = give_pose()
         if vertices is not None and args.vertices:
             vertices = in_asset_order(args, session.asset(key).mesh, vertices)
         shape = session.asset(key).mesh.vertices if vertices is None else vertices
@@ -149,7 +154,7 @@ def run(args: argparse.Namespace) -> int:
         frame = Frame(
             noise_index=number,
             camera=camera,
-            objects=[replace(state, vertices=vertices)],
+            objects=[replace(state, vertices=vertices, particles=particles)],
             world=world,
             settings=settings,
             passes=args.passes,
@@ -207,38 +212,60 @@ def size_around(position: np.ndarray, vertices: np.ndarray) -> str | None:
     return " x ".join(f"{side:.2g}" for side in high - low) if inside else None
 
 
-def _poses(
-    args: argparse.Namespace,
-) -> tuple[Sequence[tuple[int, Callable[[], np.ndarray | None]]], tuple[float, float]]:
+#: Vertices of the mesh and what carries its surfels; None: they are at rest, or follow the mesh.
+_Pose = tuple[np.ndarray | None, Particles | None]
+
+
+def _poses(args: argparse.Namespace) -> tuple[Sequence[tuple[int, Callable[[], _Pose]]], tuple[float, float]]:
     """Number of each picture with what gives its pose, and `tear` and `grain` of the object."""
+    if args.cache is None and args.driven_by == "particles":
+        raise UsageError("--driven-by particles", "needs the particles of a simulation", "Give them with --cache")
     if is_point_cache(args.vertices) and args.orbit is None:
         poses = read_poses(args.vertices, parse_frames(args.frames) if args.frames else None)
         check_template(str(args.out), [frame for frame, _ in poses])
-        return poses, (0.0, 0.0)
+        return [(frame, partial(_by_mesh, read)) for frame, read in poses], (0.0, 0.0)
     if args.orbit is not None:
         if args.cache is not None or args.vertices is not None or args.frames:
             raise UsageError("--orbit", "is of an asset at rest", "Leave --cache, --vertices and --frames out")
         check_template(str(args.out), list(range(1, args.orbit + 1)))
-        return [(number, lambda: None) for number in range(1, args.orbit + 1)], (0.0, 0.0)
+        return [(number, lambda: (None, None)) for number in range(1, args.orbit + 1)], (0.0, 0.0)
     if args.cache is None:
         if args.frames:
             problem = "are those of a cache"
             raise UsageError("--frames", problem, "Give one with --cache, or a .pc2 or .mdd with --vertices")
         vertices = read_vertices(args.vertices) if args.vertices else None
-        return [(1, lambda: vertices)], (0.0, 0.0)
+        return [(1, lambda: (vertices, None))], (0.0, 0.0)
     cache = ParticleCache(args.cache)
     header = cache.header()
     if header is None:
         raise UsageError(f"--cache {args.cache}", "is not the cache of a simulation", "Make one with `drgs simulate`")
+    if args.driven_by == "particles" and not header.keeps_shape:
+        problem = f"does not work with {args.cache}: its matter flows, so no particle knows how it deforms"
+        raise UsageError("--driven-by particles", problem, "Leave it out: surfels follow the mesh")
     frames = parse_frames(args.frames) if args.frames else cache.frames()
     if missing := sorted(set(frames) - set(cache.frames())):
         cache.read(missing[0])  # says which are there
     check_template(str(args.out), frames)
-    return [(frame, partial(_pose, cache, frame)) for frame in frames], (header.tear, header.grain)
+    driven = args.driven_by if header.keeps_shape else "surface"
+    if driven == "surface":
+        give = [(frame, partial(_by_mesh, partial(_vertices, cache, frame))) for frame in frames]
+    else:
+        rest = np.array(cache.rest().points)
+        give = [(frame, partial(_simulated, cache, frame, rest, driven == "particles")) for frame in frames]
+    return give, (header.tear, header.grain)
 
 
-def _pose(cache: ParticleCache, frame: int) -> np.ndarray:
+def _by_mesh(read: Callable[[], np.ndarray]) -> _Pose:
+    return read(), None
+
+
+def _vertices(cache: ParticleCache, frame: int) -> np.ndarray:
     return cache.read(frame).vertices
+
+
+def _simulated(cache: ParticleCache, frame: int, rest: np.ndarray, whole: bool) -> _Pose:
+    particles, vertices = cache.driving(frame, rest)
+    return vertices, replace(particles, all=whole)
 
 
 def read_environment(args: argparse.Namespace, asset: Asset) -> np.ndarray:

@@ -133,6 +133,29 @@ class Adjustment:
 
 
 @dataclass(slots=True)
+class Particles:
+    """Particles that carry an object's surfels, **object space**: those of a simulation, or any points that deform.
+
+    Attributes
+    ----------
+    rest : (s, 3) float32 array
+        Metres, where they were when the surfels were as in the asset.
+    points : (s, 3) float32 array
+        Metres, now.
+    gradients : (s, 3, 3) float32 array
+        Deformation gradient of each since rest.
+    all : bool
+        Whether they carry all surfels; else only those that do not lie on the mesh, which moves with the particles, or
+        that it smears.
+    """
+
+    rest: Array
+    points: Array
+    gradients: Array
+    all: bool = False
+
+
+@dataclass(slots=True)
 class ObjectState:
     """One DR-GS object in one frame.
 
@@ -179,6 +202,8 @@ class ObjectState:
         Blender's Shadow Terminator Geometry Offset, in [0, 1]; 0: off.
     part : Part, optional
         What an edited mesh has left of the asset; all arrays are then of its vertices and faces. None: all of it.
+    particles : Particles, optional
+        What carries the surfels; None: their faces do. Rays meet the mesh as ``vertices`` have it.
     """
 
     name: str
@@ -204,6 +229,7 @@ class ObjectState:
     specular: Array | None = None
     coat: Array | None = None
     part: Part | None = None
+    particles: Particles | None = None
 
 
 @dataclass(slots=True)

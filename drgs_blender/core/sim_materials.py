@@ -18,6 +18,8 @@ Array = np.ndarray
 
 #: Constitutive models, as compiled code numbers them.
 ELASTIC, COROTATED, PLASTIC, SAND, SNOW, FLUID = range(6)
+#: Of matter that flows: neighbours do not stay neighbours.
+LOOSE = ("sand", "fluid")
 MODELS = {
     "elastic": ELASTIC,
     "corotated": COROTATED,
@@ -83,7 +85,7 @@ class Material:
     @property
     def keeps_shape(self) -> bool:
         """Whether neighbours stay neighbours, so that a surface can follow the deformation of what is near it."""
-        return self.model not in ("sand", "fluid")
+        return self.model not in LOOSE
 
     @property
     def gap(self) -> float:

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from ..compute.jit import inlined, njit
 from ..compute.simd import LANES, aligned, fold, lanes, load, quads, repeat, spread
-from ..compute.threads import ELEMENTS, over_range
+from ..compute.threads import ELEMENTS, checkpoint, over_range
 from ..core.errors import UsageError
 from ..geometry.occupancy import Volume, crosses_gap
 
@@ -32,6 +32,8 @@ log = logging.getLogger(__name__)
 #: Neighbours of a point, and how far beyond them are looked at to replace those across a gap.
 NEIGHBOURS = 16
 _CANDIDATES = 3
+#: Points whose neighbours are found at once.
+_ROWS = 1 << 17
 #: Width of the weights: the distance to the last neighbour over this.
 _WIDTH = 1.5
 #: r = RIDGE * sigma^2
@@ -57,7 +59,7 @@ class Weights:
     separated : int
         Number of points that had neighbours across a gap, which are not used.
     stranded : int
-        Number of points all of whose neighbours were across a gap; the nearest carries them.
+        Number of points all of whose neighbours were across a gap, which carry them all the same.
     """
 
     source: Array
@@ -103,34 +105,49 @@ def bind_points(
     sources = np.ascontiguousarray(sources, np.float64)
     if not len(sources):
         raise UsageError("sources", "are none: nothing can carry the points along", "Fill the mesh, or choose a mesh")
-    wanted = min(neighbours, len(sources))
-    many = min(_CANDIDATES * wanted, len(sources)) if space is not None or parts is not None else wanted
-    distance, index = cKDTree(sources).query(points, k=many, workers=-1)
-    distance, index = distance.reshape(len(points), many), index.reshape(len(points), many)
-    usable = np.ones(index.shape, bool)
-    if parts is not None:
-        own = np.asarray(parts)[index[:, 0]]
-        if point_parts is not None:
-            own = np.where(np.asarray(point_parts) >= 0, point_parts, own)
-        usable &= np.asarray(parts)[index] == own[:, None]
-    if space is not None:
-        usable &= ~crosses_gap(space, points, sources, index)
-    stranded = ~usable.any(axis=1)
-    usable[stranded, 0] = True
-    separated = int(np.count_nonzero(~usable[:, :wanted].all(axis=1)))
-    if stranded.any():
-        log.info("%d points lie beyond a gap from all particles near them", np.count_nonzero(stranded))
+    tree, n, count = cKDTree(sources), len(points), min(neighbours, len(sources))
+    parts, point_parts = (None if p is None else np.asarray(p) for p in (parts, point_parts))
+    found = Weights(
+        np.empty((n, count), np.int32), np.empty((n, count, 4), np.float32), np.empty((n, 3), np.float32),
+        np.zeros(n, np.float32),
+    )  # fmt: skip
+    for first in range(0, n, _ROWS):  # bounds memory
+        checkpoint()
+        rows = slice(first, first + _ROWS)
+        some = points[rows]
+        own = None if point_parts is None else point_parts[rows]
+        index, distance, separated, stranded = _neighbours(tree, some, sources, count, space, parts, own)
+        found.separated, found.stranded = found.separated + separated, found.stranded + stranded
+        over_range(_weigh, len(some), some, sources, index, distance, found.weight[rows], found.reach[rows])
+        found.offset[rows] = some - sources[index[:, 0]]
+        # What is of no use must not be taken for one that moved apart.
+        found.source[rows] = np.where(distance < 0.0, index[:, :1], index)
+    if found.stranded:
+        log.info("%d points lie beyond a gap from all particles near them", found.stranded)
+    return found
 
+
+def _neighbours(
+    tree: cKDTree, points: Array, sources: Array, count: int, space: Volume | None, parts: Array | None,
+    own: Array | None,
+) -> tuple[Array, Array, int, int]:  # fmt: skip
+    """`count` neighbours of each point, their distances (-1: of no use); how many are separated, and stranded."""
+    many = min(_CANDIDATES * count, len(sources)) if space is not None or parts is not None else count
+    distance, index = (a.reshape(len(points), many) for a in tree.query(points, k=many, workers=-1))
+    same = np.ones(index.shape, bool)
+    if parts is not None:
+        nearest = parts[index[:, 0]]
+        same = parts[index] == (nearest if own is None else np.where(own >= 0, own, nearest))[:, None]
+        same[~same.any(axis=1), 0] = True
+    usable = same if space is None else same & ~crosses_gap(space, points, sources, index)
+    stranded = ~usable.any(axis=1)
+    usable[stranded] = same[stranded]
+    separated = ~usable[:, :count].all(axis=1)
     # The nearest usable ones first; what is left over has no weight.
-    order = np.argsort(~usable, axis=1, kind="stable")[:, :wanted]
+    order = np.argsort(~usable, axis=1, kind="stable")[:, :count]
     index = np.take_along_axis(index, order, 1)
     distance = np.where(np.take_along_axis(usable, order, 1), np.take_along_axis(distance, order, 1), -1.0)
-    weight = np.empty((*index.shape, 4), np.float32)
-    reach = np.zeros(len(points), np.float32)
-    over_range(_weigh, len(points), points, sources, index, distance, weight, reach)
-    offset = (points - sources[index[:, 0]]).astype(np.float32)
-    index = np.where(distance < 0.0, index[:, :1], index)  # of no use, and not to be taken for one that moved apart
-    return Weights(index.astype(np.int32), weight, offset, reach, separated, int(stranded.sum()))
+    return index, distance, int(separated.sum()), int(stranded.sum())
 
 
 @inlined

@@ -145,6 +145,7 @@ class MeshDriven:
         matrix_world: Array | None = None,
         object_index: int = 0,
         torn: Array | None = None,
+        placed: bool = True,
     ) -> PosedSurfels:
         """Surfels of one frame.
 
@@ -166,6 +167,8 @@ class MeshDriven:
             Index into Frame.objects, copied to every surfel.
         torn : (m,) bool array, optional
             Faces that are not there: their surfels are transparent, and they bend no smooth normals.
+        placed : bool
+            False: centres, tangents and normals are left to be written by the caller.
 
         Returns
         -------
@@ -173,23 +176,27 @@ class MeshDriven:
             Always finite. A collapsed face yields flat or vanishing tangents and a finite normal.
         """
         posing = self.posing(vertices_world, corner_normals_world, materials, matrix_world, torn)
+        n = len(self.surfels)
+        opacity = posing.opacity.copy()
+        centre, tangent_u, tangent_v, normal = (np.empty((n, 3), np.float32) for _ in range(4))
+        posed = Posed(centre, tangent_u, tangent_v, normal, opacity)
+        if placed:
+            self._place(posing, posed)
+        self.hidden_count = int(np.count_nonzero(opacity != posing.opacity))
+        if self.hidden_count:
+            log.debug("%d surfels hang on vertices that are not finite; they are hidden", self.hidden_count)
+        owner = np.full(n, object_index, np.int32)
+        return PosedSurfels(*posed, **posing.channels, object_index=owner)
+
+    def _place(self, posing: Posing, posed: Posed) -> None:
         by_corner, normals = posing.normals is not None, posing.normals
         if normals is None:
             normals = np.empty_like(posing.vertices)
             self.normals.into(posing.vertices, posing.smooth_faces, normals)
             if posing.sign < 0:
                 normals = -normals
-        n = len(self.surfels)
-        opacity = posing.opacity.copy()
-        centre, tangent_u, tangent_v, normal = (np.empty((n, 3), np.float32) for _ in range(4))
-        posed = Posed(centre, tangent_u, tangent_v, normal, opacity)
         mesh = PosedMesh(plain(posing.vertices), plain(self.mesh.faces), plain(normals))
         pose(mesh, by_corner, posing.linear, posing.sign, self.rest, posed)
-        self.hidden_count = int(np.count_nonzero(opacity != posing.opacity))
-        if self.hidden_count:
-            log.debug("%d surfels hang on vertices that are not finite; they are hidden", self.hidden_count)
-        owner = np.full(n, object_index, np.int32)
-        return PosedSurfels(*posed, **posing.channels, object_index=owner)
 
     def posing(
         self, vertices_world: Array, corner_normals_world: Array | None, materials: Mapping[str, Array | None] | None,

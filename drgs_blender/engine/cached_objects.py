@@ -29,6 +29,7 @@ class CachedObject:
     One that is shown in captured colours is `captured` for the camera, and for rays `glowing`. One with materials of
     its own, or with `channels` that rays meet, has a `mesh` with `images` and the optional channels `shown`; `met` is
     what stands for the object in the scene. Of a thin one light meets `sheet`. Its surfels may have `emission` (n, 3).
+    Of the surfels, `lost` are left out as the particles that carry them are not finite.
     It has `levels` of fewer surfels by their number; of these each has the `detail` by which they grow.
     """
 
@@ -38,6 +39,7 @@ class CachedObject:
     met: TraceObject
     posed: PosedSurfels | None = None
     hidden_count: int = 0
+    lost: int = 0
     faults: list[str] = field(default_factory=list)
     mode: tuple[bool, bool, bool, bool] = (False, False, False, False)
     captured: CapturedObject | None = None

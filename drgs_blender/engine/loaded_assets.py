@@ -18,7 +18,7 @@ from .captured_objects import Glow, glow_of
 _AT_FIRST = 1 << 17
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, weakref_slot=True)
 class LoadedAsset:
     """An asset and the state of the file it is mapped from.
 
@@ -34,6 +34,8 @@ class LoadedAsset:
         What of the file could not be used.
     levels : dict of int to LoadedAsset
         Its most needed surfels by their number, see `first`.
+    larger : LoadedAsset, optional
+        The level whose first surfels these are.
     """
 
     asset: Asset
@@ -43,7 +45,13 @@ class LoadedAsset:
     textured: TexturedAsset | None = None
     faults: list[str] = field(default_factory=list)
     levels: dict[int, LoadedAsset] = field(default_factory=dict)
+    larger: LoadedAsset | None = None
     _detail: Detail | None = None
+
+    def forget(self) -> None:
+        """Give back what was made of the asset, which no object of the frame has."""
+        self.driven = self.glow = self.textured = None
+        self.levels.clear()
 
     @property
     def detail(self) -> Detail:
@@ -59,12 +67,14 @@ class LoadedAsset:
             if count > largest:
                 self.levels.clear()
                 largest = min(max(count, _AT_FIRST), len(self.asset.surfels))
-                self.levels[largest] = LoadedAsset(with_surfels(self.asset, self.detail.order[:largest]), self.stamp)
+                order = self.detail.order[:largest]
+                self.levels[largest] = LoadedAsset(with_surfels(self.asset, order), self.stamp)
             if count < largest:
                 whole = self.levels[largest]
                 if whole.driven is None and whole.asset.binding is not None and len(whole.asset.mesh.faces):
                     whole.driven = MeshDriven(whole.asset.mesh, whole.asset.surfels, whole.asset.binding)
-                few = LoadedAsset(with_surfels(whole.asset, slice(count)), self.stamp)
+                some = slice(count)
+                few = LoadedAsset(with_surfels(whole.asset, some), self.stamp, larger=whole)
                 few.driven = None if whole.driven is None else whole.driven.first(count)
                 self.levels[count] = few
         return self.levels[count]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +18,6 @@ from ..core.errors import AssetError, UsageError
 from ..core.frame import Frame, MeshState, MotionStep, ObjectState, World
 from ..core.materials import Image
 from ..core.memory import give_back
-from ..core.passes import COLOURS
 from ..deform.gpu.mesh_driven import Deformer
 from ..deform.mesh_driven import MeshDriven
 from ..ipc.change_detection import reuse_equal
@@ -30,12 +29,12 @@ from ..render.lights.light_groups import group, groups_of
 from ..render.lights.light_links import link
 from ..render.lights.light_sampler import Lights
 from ..render.lights.mesh_lights import Emitters
-from ..render.scene.see_through import MOST
 from ..render.scene.trace_scene import TraceScene
 from ..render.surfels.captured import CapturedObject
 from ..render.surfels.surfel_bvh import SurfelBVH
 from .cached_objects import CachedObject, begun, emission_of
 from .captured_objects import captured_faults, captured_object, shows_captured
+from .carrier_cache import CarrierCache
 from .level_of_detail import Budget, counts, grown, reduced
 from .loaded_assets import LoadedAsset
 from .optional_channels import channel_faults, may_need, surfel_emission
@@ -45,9 +44,6 @@ from .surfel_sheets import meets_sheets, sheet_mesh
 from .surfel_trees import SurfelTree
 
 Array = np.ndarray
-
-#: Passes that are black without light.
-_LIT = frozenset({"Combined", *COLOURS})
 
 
 class SceneCache:
@@ -79,11 +75,14 @@ class SceneCache:
         Objects of the last frame that the camera sees in captured colours.
     emission : (n, 3) float32 array, optional
         Radiance of the surfels that the camera sees; see ``PreparedScene.emission``.
+    captured_faults : list of str
+        What objects of the last frame lack to be shown as they should, in words for the user.
     """
 
     def __init__(self) -> None:
         self._assets: dict[str, LoadedAsset] = {}
         self._parts = PartCache()
+        self._carriers = CarrierCache()
         self.objects: list[CachedObject] = []
         self.meshes: list[MeshState] = []
         self.images: list[Image] = []
@@ -99,7 +98,7 @@ class SceneCache:
         self.lights = Lights([])
         self.captured: tuple[CapturedObject, ...] = ()
         self.emission: Array | None = None
-        self._captured_faults: list[str] = []
+        self.captured_faults: list[str] = []
         self._emitters = Emitters()
         self._deformer: Deformer | None = None
 
@@ -167,6 +166,7 @@ class SceneCache:
         objects: list[CachedObject] = []
         faults: list[str] = []
         self._parts.begin()
+        self._carriers.begin(frame.objects)
         for index, state in enumerate(frame.objects):
             loaded = self._assets.get(state.asset)
             if loaded is None:
@@ -189,7 +189,8 @@ class SceneCache:
                 item = begun(kept, loaded, mode, index)
                 if known is not None and known.loaded is loaded and known.state is kept and known.mode[:2] == mode[:2]:
                     # Only how the camera sees it is another: its surfels stand where they stood.
-                    item.posed, item.hidden_count, item.emission = known.posed, known.hidden_count, known.emission
+                    item.posed, item.hidden_count, item.lost = known.posed, known.hidden_count, known.lost
+                    item.emission = known.emission
             if item.sheeted:
                 with interruptible(check):
                     self._place_surfels(item, index, frame, backend)
@@ -214,12 +215,11 @@ class SceneCache:
             if self.scene.layout is not layout:
                 give_back()
             self._current = True
-        self.objects, self.meshes, self.images, self._captured_faults = objects, meshes, images, faults
+        self.objects, self.meshes, self.images, self.captured_faults = objects, meshes, images, faults
         used = {state.asset for state in frame.objects}
         for key, loaded in self._assets.items():
             if key not in used:
-                loaded.driven = loaded.glow = loaded.textured = None
-                loaded.levels.clear()
+                loaded.forget()
         along_rays = seen and bool(frame.camera.panorama)
         self.tree = self.seen_tree = tree = None  # an update that fails half way leaves nothing to be taken for current
         if not (met or along_rays):
@@ -251,7 +251,10 @@ class SceneCache:
             return
         driven = loaded.surfels_of(item.state)
         if item.posed is None:
-            posed, item.hidden_count = posed_surfels(item.state, index, driven, item.traced, self._poser(backend))
+            carrier = self._carriers.carrier(loaded, item.state)
+            given = item.state, index, driven, item.traced, self._poser(backend), carrier
+            posed, item.hidden_count = posed_surfels(*given)
+            item.lost = 0 if carrier is None else carrier.hidden_count
             item.posed = posed if item.detail is None else grown(posed, item.detail)
         if item.mode[1]:
             item.captured = item.captured or captured_object(item.state, loaded.asset, item.posed)
@@ -301,62 +304,6 @@ class SceneCache:
         others = [part for item in self.objects for part in (item.glowing, item.sheet, item.mesh) if part is not None]
         vertices, instances = self.scene.at(moved, [*step.meshes, *[None] * len(others)])
         return SceneState(vertices, instances, camera_parameters(step.camera, frame.settings, frame.noise_index))
-
-    def warnings(self, passes: Collection[str] = ()) -> list[str]:
-        """Warnings about meshes and light of the last frame, of which `passes` were made."""
-        found = []
-        if not self.objects and not self.meshes:
-            found.append("the frame has no DR-GS object; the picture shows the world alone")
-        hidden_counts = [item.hidden_count for item in self.objects] + [0] * len(self.meshes)
-        for hidden, fault in zip(hidden_counts, self.scene.faults):  # behind these are those that glow, once more
-            if fault.bad_vertices:
-                surfels = f" and {hidden} surfels" if hidden else ""
-                found.append(
-                    f"{fault.name}: {fault.bad_vertices} vertices are not finite or too far away; "
-                    f"{fault.bad_faces} faces{surfels} are left out"
-                )
-            if fault.empty_faces:
-                found.append(f"{fault.name}: {fault.empty_faces} faces have no area; light passes through them")
-            if fault.bad_instances:
-                found.append(
-                    f"{fault.name}: {fault.bad_instances} instances are flat, not finite or too far away; left out"
-                )
-        for name in dict.fromkeys(self._name(index) for index in sorted(self.scene.cut)):
-            found.append(
-                f"{name}: rays pass {MOST} see-through surfaces up to it, and end there; what is behind is not seen. "
-                "Use fewer layers"
-            )
-        for item in self.objects:
-            found += item.faults
-        found += self._captured_faults
-        found += self.scene.mesh_materials.warnings
-        found += self.lights.warnings
-        if not _LIT.isdisjoint(passes) and self._is_unlit():
-            found.append(
-                "nothing lights the scene: it has no lamp that shines, its World gives no light and no material emits "
-                "any. Add a lamp, or give the World a colour or an environment image that is not black"
-            )
-        bad = sum(light.bad_texels for light in (self.environment, self.background) if light is not None)
-        if bad:
-            found.append(
-                f"world: {bad} pixels of the environment are negative, infinite or no "
-                f"number, and "
-                "give no light; where that shows, repair the image"
-            )
-        return found
-
-    def _is_unlit(self) -> bool:
-        """Whether the camera sees something to which nothing gives light."""
-        assert self.environment is not None
-        lit = not self.environment.black or self.lights.count or self.scene.emissive_meshes
-        if lit or self.captured or self.emission is not None:
-            return False
-        seen = [*(item.state.visibility for item in self.objects), *(mesh.visibility for mesh in self.meshes)]
-        return any(own.camera and not own.holdout for own in seen)
-
-    def _name(self, index: int) -> str:
-        """Of an object as the trace scene numbers them."""
-        return self.scene.faults[int(self.scene.source[index])].name
 
     def environment_of(self, world: World) -> EnvironmentLight:
         """The light of `world`, made again only when something about it changed; a rotation costs nothing."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from ..core.material_adjustments import adjusted
 from ..deform.fracture import torn_faces
 from ..deform.granular import grainy
 from ..deform.mesh_driven import MeshDriven
+from ..deform.particle_driven import ParticleDriven
 from ..deform.rigid import pose_by_matrix
 from ..render.scene.texture_lookup import BRIGHTEST
 from ..render.scene.trace_scene import TraceObject
@@ -199,6 +201,7 @@ def posed_surfels(
     driven: MeshDriven | Surfels,
     traced: TraceObject,
     pose: Callable[..., PosedSurfels] = MeshDriven.pose,
+    carrier: ParticleDriven | None = None,
 ) -> tuple[PosedSurfels, int]:
     """The object's surfels in this frame, and how many are hidden because their vertices are not finite.
 
@@ -211,25 +214,56 @@ def posed_surfels(
     traced : TraceObject
     pose : callable
         `MeshDriven.pose`, or another that does the same elsewhere.
+    carrier : ParticleDriven, optional
+        Binding to the particles that carry them.
     """
     matrix = np.asarray(state.matrix_world, np.float64)
     if isinstance(driven, Surfels):
-        return _adjusted_surfels(state, pose_by_matrix(driven, matrix, index), driven), 0
-    normals = traced.corner_normals
+        posed = pose_by_matrix(driven, matrix, index)
+    elif carrier is None:
+        pose = pose if state.grain <= 0 else MeshDriven.pose  # grains are made here
+        posed = _posed_by_mesh(state, index, driven, traced, pose, traced.torn)
+    else:
+        way = MeshDriven.pose if carrier.on_mesh is not None else partial(MeshDriven.pose, placed=False)
+        posed = _posed_by_mesh(state, index, driven, traced, way, traced.torn)
+    if carrier is not None:
+        own = driven.opacity if isinstance(driven, Surfels) else driven.surfels.opacity
+        _carry(state, posed, carrier, matrix, own)  # which knows of tears by itself
+    if state.grain > 0 and isinstance(driven, MeshDriven):
+        larger = abs(float(np.linalg.det(matrix[:3, :3]))) ** (1 / 3)
+        posed = grainy(posed, larger * driven.surfels.scale, state.grain)
+    return _adjusted_surfels(state, posed, driven), driven.hidden_count if isinstance(driven, MeshDriven) else 0
+
+
+def _posed_by_mesh(
+    state: ObjectState, index: int, driven: MeshDriven, traced: TraceObject, pose: Callable[..., PosedSurfels],
+    torn: Array | None,
+) -> PosedSurfels:  # fmt: skip
+    """Surfels as `pose` has them, with the materials of this frame."""
+    matrix, mesh, normals = np.asarray(state.matrix_world, np.float64), driven.mesh, traced.corner_normals
     if normals is not None and np.linalg.det(matrix[:3, :3]) < 0:
         normals = np.ascontiguousarray(normals[:, _MIRRORED])  # back to the order of the asset's corners
-    mesh = driven.mesh
     materials = {
         name: material(state, name, getattr(mesh, name), "a mesh") if _has(state, name) else None
         for name in BASE_CHANNELS
     }
-    pose = pose if state.grain <= 0 else MeshDriven.pose  # grains are made here
     given = driven, traced.vertices, normals, materials
-    posed = pose(*given, matrix_world=matrix, object_index=index, torn=traced.torn)
-    if state.grain > 0:
-        larger = abs(float(np.linalg.det(matrix[:3, :3]))) ** (1 / 3)
-        posed = grainy(posed, larger * driven.surfels.scale, state.grain)
-    return _adjusted_surfels(state, posed, driven), driven.hidden_count
+    return pose(*given, matrix_world=matrix, object_index=index, torn=torn)
+
+
+def _carry(state: ObjectState, posed: PosedSurfels, carrier: ParticleDriven, matrix: Array, opacity: Array) -> None:
+    """Put surfels where the object's particles take them; AssetError where these are others than at rest."""
+    particles = state.particles
+    assert particles is not None
+    wanted = (carrier.count, 3), (carrier.count, 3, 3)
+    if (particles.points.shape, particles.gradients.shape) != wanted:
+        raise AssetError(
+            f"object {state.name}",
+            f"its particles are {len(particles.points)} with {len(particles.gradients)} deformation gradients, and "
+            f"were {carrier.count} at rest",
+            "Bake it again, or set Driven By to Surface",
+        )
+    carrier.pose(posed, particles.points, particles.gradients, matrix, opacity)
 
 
 def join(parts: list[PosedSurfels]) -> PosedSurfels:

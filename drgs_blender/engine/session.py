@@ -34,6 +34,7 @@ from .level_of_detail import Budget, check_most, is_detailed, too_many
 from .optional_channels import surfel_emission
 from .progressive_view import Pace, Rough, View
 from .scene_cache import SceneCache
+from .scene_warnings import scene_warnings
 
 logger = logging.getLogger(__name__)
 
@@ -338,7 +339,7 @@ class Session:
         lights = self._scene_cache.lights
         linked = lights.linked is not None or lights.grouped is not None
         device = self._backends.warnings(settings, linked, needs_paths(self._scene_cache.scene, settings))
-        found = self._scene_cache.warnings(frame.passes) + device
+        found = scene_warnings(self._scene_cache, frame.passes) + device
         return found + _ignored_lobes(settings, self._scene_cache.meshes) + ([trouble] if trouble else [])
 
     def _statistics(self, frame: Frame, prepared: PreparedScene, timer: _StageTimer) -> dict[str, float]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..core.asset import Asset
 from ..core.errors import UsageError, first_of
-from ..core.frame import Camera, World
+from ..core.frame import Camera, Particles, World
 from ..deform.gmls import bind_points, carry
 from ..deform.sources import MeshSource
 from ..reconstruct.capture.capture import Capture, View
@@ -22,9 +22,25 @@ from .truth import Truth, TruthSet
 Array = np.ndarray
 logger = logging.getLogger(__name__)
 
-#: (camera, light, vertices of the asset's mesh or None at rest) -> pass name -> (h, w, c):
-#: the passes `COMPARED_PASSES`, on a transparent film.
-Renderer = Callable[[Camera, World, Array | None], dict[str, Array]]
+
+class Posed(NamedTuple):
+    """An asset that moves with its true object.
+
+    Attributes
+    ----------
+    vertices : (n, 3) float32 array
+        Of its mesh, object space.
+    particles : Particles
+        Points of the true surface around it.
+    """
+
+    vertices: Array
+    particles: Particles
+
+
+#: (camera, light, pose of the asset or None at rest) -> pass name -> (h, w, c): the passes `COMPARED_PASSES`, on a
+#: transparent film.
+Renderer = Callable[[Camera, World, Posed | None], dict[str, Array]]
 COMPARED_PASSES = ("Combined", "Depth", "Normal", "Albedo", "Roughness", "Metallic", "Coverage")
 #: A perceptual distance of two encoded pictures.
 Distance = Callable[[Array, Array], float]
@@ -85,13 +101,13 @@ def compare(
     total = len(novel) + (sum(len(item.views) for item in truth.sets) if truth else 0)
     done = 0
 
-    def render(view: View, radiance: Array, vertices: Array | None, name: str) -> dict[str, Array]:
+    def render(view: View, radiance: Array, pose: Posed | None, name: str) -> dict[str, Array]:
         nonlocal done
         if progress is not None:
             progress(done / total, name)
         done += 1
         turn = np.eye(3) if view.turn is None else view.turn
-        return renderer(view.camera, World(radiance, turn), vertices)
+        return renderer(view.camera, World(radiance, turn), pose)
 
     report: dict[str, Any] = {"novel": None, "lights": [], "materials": None, "geometry": None, "posed_geometry": None}
     if novel:
@@ -101,9 +117,9 @@ def compare(
         pictures = [render(view, radiance, None, "views left out") for view in novel]
         report["novel"] = _novel(novel, pictures, capture.background, distances, show)
     if truth is not None:
-        vertices = posed_vertices(asset, truth) if any(item.posed for item in truth.sets) else None
+        moved = posed_as(asset, truth) if any(item.posed for item in truth.sets) else None
         for item in truth.sets:
-            pose = vertices if item.posed else None
+            pose = moved if item.posed else None
             pictures = [render(view, item.radiance, pose, item.name) for view in item.views]
             entry = _relit(item, pictures, distances, show)
             entry["training_light"] = item.light == truth.training_light
@@ -171,17 +187,17 @@ def surface_points(vertices: Array, faces: Array, spacing: float) -> tuple[Array
     return corners, shares
 
 
-def posed_vertices(asset: Asset, truth: Truth) -> Array:
-    """(n, 3) float32 vertices of the asset's mesh, carried along by the true mesh around them."""
+def posed_as(asset: Asset, truth: Truth) -> Posed:
+    """The asset carried along by the true mesh around it: its vertices, and what can carry its surfels."""
     assert truth.rest is not None and truth.posed is not None and truth.faces is not None
     source = MeshSource(truth.rest, truth.faces)
     corners, shares = surface_points(truth.rest, truth.faces, _SPACING * float(np.ptp(truth.rest, axis=0).max()))
-    at = lambda values: np.einsum("nk,nk...->n...", shares, values[corners])  # noqa: E731
-    weights = bind_points(asset.mesh.vertices, at(truth.rest))
-    points, _, turned = carry(weights, at(truth.posed), at(source.gradients(truth.posed)))
+    at = lambda values: np.einsum("nk,nk...->n...", shares, values[corners]).astype(np.float32)  # noqa: E731
+    particles = Particles(at(truth.rest), at(truth.posed), at(source.gradients(truth.posed)))
+    points, _, turned = carry(bind_points(asset.mesh.vertices, particles.rest), particles.points, particles.gradients)
     if turned:
         logger.info("%d vertices are carried by their nearest neighbour alone", turned)
-    return points.astype(np.float32)
+    return Posed(points.astype(np.float32), particles)
 
 
 def _white(view: View, background: tuple[float, float, float] | None) -> tuple[Array, Array]:

@@ -5,11 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from ..compute.jit import njit
 from ..compute.threads import ELEMENTS, over_range
 
 Array = np.ndarray
+
+#: Neighbours of which the farthest gives the spacing: on a grid the first six are one step away, and the nearest is not
+#: nearer than this share of it.
+_AROUND, _REGULAR = 6, 0.9
+#: Points whose neighbours are looked at.
+_PROBES = 4096
+#: Side of the cells that points in no order fill, in spacings.
+_CELL = 1.5
+#: Cells at most.
+_MOST = 1 << 26
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +45,47 @@ class Volume:
     def centres(self) -> Array:
         """(n, 3) float64 centres of the filled cells, in the order of ``part[part >= 0]``."""
         return self.origin + (np.argwhere(self.part >= 0) + 0.5) * self.spacing
+
+
+def spacings(points: Array) -> tuple[float, float]:
+    """Metres from one of (n, 3) points to the nearest other and to the `_AROUND`th, in the median; 0 for one alone."""
+    if len(points) < 2:
+        return 0.0, 0.0
+    points = np.asarray(points, np.float64)
+    probes = points[:: max(len(points) // _PROBES, 1)]
+    neighbours = min(_AROUND + 1, len(points))
+    distance = cKDTree(points).query(probes, k=neighbours, workers=-1)[0]
+    return float(np.median(distance[:, 1])), float(np.median(distance[:, -1]))
+
+
+def volume_of(points: Array) -> Volume | None:
+    """The space that points fill.
+
+    Parameters
+    ----------
+    points : (n, 3) float array
+        Metres.
+
+    Returns
+    -------
+    Volume or None
+        Cells that have a point: of the spacing of points on a grid, wider among others, so that next to none between
+        neighbours is left out. None where all points are in one place.
+    """
+    points = np.asarray(points, np.float64)
+    nearest, around = spacings(points)
+    if around <= 0:
+        return None
+    side = around if nearest > _REGULAR * around else _CELL * around
+    with np.errstate(over="ignore"):
+        cells = np.ceil(np.ptp(points, axis=0) / side) + 3
+    side *= max(1.0, float(np.prod(cells / _MOST ** (1 / 3))) ** (1 / 3) * 1.01)
+    origin = points.min(axis=0) - 1.5 * side
+    size = np.ceil((points.max(axis=0) - origin) / side).astype(np.int64) + 2
+    filled = np.zeros(size, bool)
+    filled[tuple(((points - origin) / side).astype(np.int64).T)] = True
+    part = ndimage.label(filled, np.ones((3, 3, 3)))[0].astype(np.int32) - 1
+    return Volume(origin, side, part)
 
 
 @njit

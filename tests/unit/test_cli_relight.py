@@ -79,6 +79,37 @@ def test_strength_is_a_factor(relight):
     np.testing.assert_allclose(twice, 2 * once, rtol=1e-5)
 
 
+def test_surfels_follow_what_they_are_told_to(relight, folder, tmp_path, capsys):
+    """Particles that move while the mesh stays take the surfels along only where they are asked to, or lead them."""
+    mesh = read_asset(folder / "lit.drgs").mesh
+    axis = np.linspace(-1.4, 1.4, 8)
+    rest = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3).astype(np.float32)
+    still = np.tile(np.eye(3, dtype=np.float16), (len(rest), 1, 1))
+
+    def bake(name, model):
+        cache = ParticleCache(tmp_path / name)
+        frame = ParticleFrame(rest, still, mesh.vertices)
+        settings = {"material": {"model": model}, "regions": []}
+        cache.create(Header("digest", len(rest), len(mesh.vertices), 1, 24.0, settings), frame)
+        cache.write(1, ParticleFrame(rest + np.float32([0.5, 0, 0]), still, mesh.vertices))
+        return str(cache.folder)
+
+    def column(*options):
+        """Where in the picture the ball is."""
+        alpha = relight("--transparent", "--frames", "1", *options)[0]["Combined"][..., 3]
+        return (alpha.sum(axis=0) @ np.arange(40)) / alpha.sum()
+
+    jelly, sand = bake("jelly", "elastic"), bake("sand", "sand")
+    by_surface = column("--cache", jelly, "--driven-by", "surface")
+    assert column("--cache", jelly, "--driven-by", "particles") > by_surface + 3
+    assert column("--cache", jelly) == by_surface, "surfels that lie on the mesh follow it"
+    assert column("--cache", sand) == by_surface
+    out = ["relight", str(folder / "lit.drgs"), "--out", str(tmp_path / "x.exr"), "--driven-by", "particles"]
+    for options, told in (((), "Give them with --cache"), (("--cache", sand), "its matter flows")):
+        assert main([*out, *options]) == 64
+        assert told in capsys.readouterr().err
+
+
 def test_rotation_is_that_of_a_mapping_node(relight):
     """Mapping turns the looked-up vector: with Rotation Z of 90 degrees, -Y looks up +X, where the light is."""
     front, back, right, left = (

@@ -13,7 +13,7 @@ from drgs_blender.deform.attach import attach
 from drgs_blender.deform.fracture import torn_faces
 from drgs_blender.deform.gmls import bind_points, carry
 from drgs_blender.deform.mesh_driven import MeshDriven
-from drgs_blender.deform.source_driven import SourceDriven
+from drgs_blender.deform.particle_driven import Frames, ParticleDriven
 from drgs_blender.deform.sources import MeshSource, PointSource
 from drgs_blender.simulation.contact import Plane
 from drgs_blender.simulation.fill import fill
@@ -205,13 +205,15 @@ def test_surfels_and_mesh_follow_particles_exactly_under_affine_motion():
     vertices, faces = box_mesh((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3))
     asset = asset_of(vertices, faces)
     filling = fill(vertices, faces, 0.05)
-    driven = SourceDriven(asset, filling.points, space=filling.space, parts=filling.part)
+    rest = MeshDriven(asset.mesh, asset.surfels, asset.binding).pose(asset.mesh.vertices)
+    driven = ParticleDriven(Frames.of(rest), filling.points)
+    weights = bind_points(asset.mesh.vertices, filling.points, space=filling.space, parts=filling.part)
     linear = Rotation.from_rotvec([0.3, 0.8, -0.2]).as_matrix() @ np.array([[1.5, 0.4, 0], [0, 0.8, 0], [0.1, 0, 1.1]])
     x = filling.points @ linear.T + [1, 2, 3]
     gradients = np.tile(linear, (len(x), 1, 1))
-    rest = MeshDriven(asset.mesh, asset.surfels, asset.binding).pose(asset.mesh.vertices)
-    posed = driven.pose(x, gradients)
-    assert np.abs(driven.vertices(x, gradients) - (asset.mesh.vertices @ linear.T + [1, 2, 3])).max() < 2e-6
+    posed = MeshDriven(asset.mesh, asset.surfels, asset.binding).pose(asset.mesh.vertices)
+    driven.pose(posed, x, gradients)
+    assert np.abs(carry(weights, x, gradients)[0] - (asset.mesh.vertices @ linear.T + [1, 2, 3])).max() < 2e-6
     assert np.abs(posed.centre - (rest.centre @ linear.T + [1, 2, 3])).max() < 2e-6
     assert np.abs(posed.tangent_u - rest.tangent_u @ linear.T).max() < 1e-6
     normal = rest.normal @ np.linalg.inv(linear)
@@ -244,7 +246,7 @@ def test_any_deformed_object_drives(kind):
     now = rest @ linear.T + [1, 0, 2]
     gradients = source.gradients(now)
     assert np.abs(gradients - linear).max() < 1e-3
-    moved = SourceDriven(asset, rest).vertices(now, gradients)
+    moved = carry(bind_points(asset.mesh.vertices, rest), now, gradients)[0]
     assert np.abs(moved - (asset.mesh.vertices @ linear.T + [1, 0, 2])).max() < 1e-3
 
 

@@ -23,7 +23,7 @@ from drgs_blender.core.asset import Asset, Environment, Mesh
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.color import srgb_to_linear
 from drgs_blender.core.errors import EXIT_USAGE, AssetError, DeviceError, EngineError, UsageError
-from drgs_blender.evaluate.compare import compare, posed_vertices, table
+from drgs_blender.evaluate.compare import compare, posed_as, table
 from drgs_blender.evaluate.scenes import SMALL, Plan, cameras, make_scenes
 from drgs_blender.evaluate.subjects import OBJECTS, make_subject
 from drgs_blender.evaluate.truth import Truth, read_relit, read_truth, true_asset
@@ -153,7 +153,7 @@ def test_the_pose_is_carried_to_another_mesh_of_the_same_shape(scenes):
     wanted = (truth.posed[corners] * share).sum(axis=1)
     numbers = np.zeros(len(inner), np.float32)
     mesh = Mesh(inner, np.zeros((1, 3), np.int32), np.zeros((500, 3), np.float32), numbers, numbers)
-    found = posed_vertices(Asset(attach_nothing(), mesh, None), truth)
+    found = posed_as(Asset(attach_nothing(), mesh, None), truth).vertices
     error = np.linalg.norm(found - wanted, axis=1)
     assert np.median(error) < 2e-3 and np.quantile(error, 0.95) < 0.02
     assert len(used) > 1000
@@ -168,7 +168,7 @@ def test_flat_sides_carry_what_lies_on_them():
     points = np.einsum("nk,nkc->nc", random, rest[faces[np.arange(200) % 2]])
     wanted = np.einsum("nk,nkc->nc", random, posed[faces[np.arange(200) % 2]])
     mesh = plain_mesh(points.astype(np.float32), np.arange(198, dtype=np.int32).reshape(-1, 3))
-    found = posed_vertices(Asset(attach_nothing(), mesh, None), Truth([], "sun", rest, posed, faces))
+    found = posed_as(Asset(attach_nothing(), mesh, None), Truth([], "sun", rest, posed, faces)).vertices
     assert np.linalg.norm(found - wanted, axis=1).mean() < 0.005
 
 

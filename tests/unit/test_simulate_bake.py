@@ -77,6 +77,29 @@ def test_frames_can_be_read_in_any_order(whole):
     assert size < 30 * header.points + 12 * header.vertices + 1000
 
 
+def test_between_frames_all_moves_straight(whole):
+    cache = ParticleCache(whole)
+    rest, before, after = cache.rest(), cache.read(3), cache.read(4)
+    particles, vertices = cache.driving(3.25)
+    for found, name in ((particles.points, "points"), (particles.gradients, "gradients"), (vertices, "vertices")):
+        a, b = (np.asarray(getattr(frame, name), np.float32) for frame in (before, after))
+        np.testing.assert_allclose(found, 0.75 * a + 0.25 * b, atol=1e-6)
+    np.testing.assert_array_equal(particles.rest, rest.points)
+    for outside, edge in ((-7.5, 1), (99.0, 6)):
+        np.testing.assert_array_equal(cache.driving(outside)[0].points, cache.read(edge).points)
+
+
+def test_what_flows_keeps_no_shape(whole):
+    header = ParticleCache(whole).header()
+    assert header.keeps_shape
+    sand = job_of(material="sand", last=2).settings
+    regions = job_of(regions=[{"group": "left", "material": "water"}], last=2).settings
+    for settings in (sand, regions):
+        kept = json.loads(json.dumps(particle_cache.asdict(settings)))
+        assert not particle_cache.Header("", 1, 1, 1, 24.0, kept).keeps_shape
+    assert not particle_cache.Header("", 1, 1, 1, 24.0).keeps_shape, "it is not known"
+
+
 def test_a_bake_goes_on_with_the_same_bits(tmp_path, whole):
     cache = ParticleCache(tmp_path)
     assert bake(job_of(last=3), cache) == 2

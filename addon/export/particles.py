@@ -1,0 +1,153 @@
+"""Particles of a simulation that carry an object's splats in this frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import bpy
+import numpy as np
+
+from ...drgs_blender.core.errors import AssetError, DrgsError
+from ...drgs_blender.core.frame import Particles
+from ...drgs_blender.core.particle_cache import Header, ParticleCache, ParticleFrame
+from .. import cache_playback
+
+Array = np.ndarray
+Warn = Callable[[str], None]
+
+#: How far vertices may be from where the simulation has them, in parts of the object's size.
+_CLOSE = 1e-4
+#: Vertices by which a map is found; all are looked at to see whether it fits.
+_PROBES = 4096
+#: A mesh is flat where it is thinner than this part of its size.
+_FLAT = 1e-6
+#: Particles at rest by folder and digest of their cache, and how many caches are known at most.
+_rests: dict[tuple[str, str], Array] = {}
+_MOST = 16
+
+
+def particles_of(
+    obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, vertices: Array, warn: Warn
+) -> Particles | None:
+    """What carries the splats of an evaluated object besides the faces of its mesh; None: they alone do.
+
+    Parameters
+    ----------
+    obj : bpy.types.Object
+    depsgraph : bpy.types.Depsgraph
+    vertices : (n, 3) float32 array
+        Of its evaluated mesh, in the mesh's order, object space.
+    warn : callable
+        Told why particles that were asked for, or are there, carry nothing.
+    """
+    modifier, wanted = cache_playback.modifier_of(obj), obj.drgs.physics.driven_by
+    if wanted == "surface" or modifier is None or not len(vertices):
+        return None
+    if not (modifier.show_render if depsgraph.mode == "RENDER" else modifier.show_viewport):
+        return None
+    path = cache_playback.path_of(obj, modifier)
+    cache = ParticleCache(path.parent)
+    try:
+        header = cache.header()
+        if header is None:
+            return None  # told by `cache_playback.check`
+        if not header.keeps_shape:
+            if wanted == "particles":
+                warn(f'"{obj.name}": its material flows, so no particle knows how it deforms; splats follow the mesh')
+            return None
+        played = cache_playback.Played(path, header)
+        frame = _frame_of(modifier, header, depsgraph.scene_eval)
+        particles, shown = cache.driving(frame, _rest_of(cache, header), last=played.last, place=_placing(played))
+    except (DrgsError, OSError) as error:
+        warn(f'"{obj.name}": splats follow the mesh, as particles cannot be read: {error}')
+        return None
+    moved = _moved(particles, _affine(shown, vertices))
+    if moved is None:
+        warn(
+            f'"{obj.name}": its mesh is not as the simulation has it in this frame (modifiers after '
+            f'"{modifier.name}", or edits), so splats follow the mesh; Driven By: Surface says so for good'
+        )
+        return None
+    return replace(moved, all=wanted == "particles")
+
+
+def _frame_of(modifier: bpy.types.Modifier, header: Header, scene: bpy.types.Scene) -> float:
+    """The frame of the cache that a Mesh Cache modifier shows, as Blender's MOD_meshcache.cc finds it."""
+    if modifier.play_mode == "CUSTOM":
+        index = modifier.eval_frame
+    else:
+        index = scene.frame_current_final * modifier.frame_scale - modifier.frame_start
+    return header.first + (round(index) if modifier.interpolation == "NONE" else index)
+
+
+def _rest_of(cache: ParticleCache, header: Header) -> Array:
+    """Particles of a cache at rest, read once."""
+    key = str(cache.folder), header.digest
+    if key in _rests:
+        return _rests[key]
+    rest = np.array(cache.rest().points)
+    now = cache.header()
+    if now is None or now.digest != header.digest:
+        raise AssetError(str(cache.folder), "is being baked anew", "Wait for the first frames")
+    if len(_rests) >= _MOST:
+        _rests.clear()
+    _rests[key] = rest
+    return rest
+
+
+def _placing(played: cache_playback.Played) -> Callable[[int, ParticleFrame], ParticleFrame]:
+    """Brings a frame into the object space in which it is played: that of an object that moves by itself turns."""
+
+    def place(number: int, frame: ParticleFrame) -> ParticleFrame:
+        vertices = played.vertices(number)
+        if np.array_equal(vertices, frame.vertices):
+            return frame
+        moved = _moved(
+            Particles(frame.points, frame.points, frame.gradients.astype(np.float32)), _affine(frame.vertices, vertices)
+        )
+        if moved is None:
+            raise AssetError(str(played.path), f"does not hold frame {number} of its cache", "Bake again")
+        return ParticleFrame(moved.points, moved.gradients, vertices)
+
+    return place
+
+
+def _moved(particles: Particles, affine: tuple[Array, Array] | None) -> Particles | None:
+    """Particles by an affine map; None without one."""
+    if affine is None:
+        return None
+    linear, offset = (part.astype(np.float32) for part in affine)
+    if np.array_equal(linear, np.eye(3)) and not offset.any():
+        return particles
+    rows = linear @ particles.gradients.transpose(1, 0, 2).reshape(3, -1)
+    gradients = np.ascontiguousarray(rows.reshape(3, -1, 3).transpose(1, 0, 2))
+    return replace(particles, points=particles.points @ linear.T + offset, gradients=gradients)
+
+
+def _affine(before: Array, after: Array) -> tuple[Array, Array] | None:
+    """The affine map, (3, 3) and (3,), that takes (n, 3) places to others; None where no such map does.
+
+    Of a flat mesh the side that is out stays out, at its distance; of a line nothing says how it has turned.
+    """
+    if before.shape != after.shape or not (np.isfinite(before).all() and np.isfinite(after).all()):
+        return None
+    size = float(np.ptp(before, axis=0).max())
+    if np.abs(after - before).max() <= _CLOSE * size:
+        return np.eye(3), np.zeros(3)
+    some = slice(None, None, max(len(before) // _PROBES, 1))
+    a, b = before[some].astype(np.float64), after[some].astype(np.float64)
+    middle, there = a.mean(axis=0), b.mean(axis=0)
+    _, extents, axes = np.linalg.svd(a - middle, full_matrices=False)
+    if len(extents) < 3 or extents[1] <= _FLAT * extents[0]:
+        return None
+    linear = np.linalg.lstsq(a - middle, b - there, rcond=_FLAT)[0].T
+    if extents[2] <= _FLAT * extents[0]:
+        normal = np.cross(linear @ axes[0], linear @ axes[1]) * np.linalg.det(axes)
+        length = float(np.linalg.norm(normal))
+        if length == 0.0:
+            return None
+        linear = linear + np.outer(normal / length - linear @ axes[2], axes[2])
+    offset = there - linear @ middle
+    fits = before @ linear.T.astype(np.float32) + offset.astype(np.float32)
+    return (linear, offset) if np.abs(fits - after).max() <= _CLOSE * size else None
