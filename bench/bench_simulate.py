@@ -219,10 +219,10 @@ def carrying(options: argparse.Namespace) -> str:
     frame()
     cost = np.median([clock(frame) for _ in range(9)], axis=0)
     rows = [
-        ["bind (once)", *(1e3 * np.array(bound)), "1500"],
-        ["surfels posed by particles, a frame", *(1e3 * cost), "40 of processor time"],
+        ["bind (once)", *(1e3 * np.array(bound))],
+        ["surfels posed by particles, a frame", *(1e3 * cost)],
     ]
-    return table(["step", "processor ms", "wall ms", "hold to"], rows)
+    return table(["step", "processor ms", "wall ms"], rows)
 
 
 def filling(options: argparse.Namespace) -> str:
