@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..compute.jit import inlined, njit
 from ..compute.simd import LANES, aligned, fold, lanes, load, quads, repeat, spread
@@ -101,6 +101,8 @@ def bind_points(
     UsageError
         There are no sources.
     """
+    from scipy.spatial import cKDTree  # an engine starts without
+
     points = np.ascontiguousarray(points, np.float64)
     sources = np.ascontiguousarray(sources, np.float64)
     if not len(sources):
@@ -128,7 +130,7 @@ def bind_points(
 
 
 def _neighbours(
-    tree: cKDTree, points: Array, sources: Array, count: int, space: Volume | None, parts: Array | None,
+    tree: Any, points: Array, sources: Array, count: int, space: Volume | None, parts: Array | None,
     own: Array | None,
 ) -> tuple[Array, Array, int, int]:  # fmt: skip
     """`count` neighbours of each point, their distances (-1: of no use); how many are separated, and stranded."""

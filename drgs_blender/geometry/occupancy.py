@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from ..compute.jit import njit
 from ..compute.threads import ELEMENTS, over_range
@@ -51,6 +49,8 @@ def spacings(points: Array) -> tuple[float, float]:
     """Metres from one of (n, 3) points to the nearest other and to the `_AROUND`th, in the median; 0 for one alone."""
     if len(points) < 2:
         return 0.0, 0.0
+    from scipy.spatial import cKDTree  # an engine starts without
+
     points = np.asarray(points, np.float64)
     probes = points[:: max(len(points) // _PROBES, 1)]
     neighbours = min(_AROUND + 1, len(points))
@@ -72,6 +72,8 @@ def volume_of(points: Array) -> Volume | None:
         Cells that have a point: of the spacing of points on a grid, wider among others, so that next to none between
         neighbours is left out. None where all points are in one place.
     """
+    from scipy import ndimage
+
     points = np.asarray(points, np.float64)
     nearest, around = spacings(points)
     if around <= 0:

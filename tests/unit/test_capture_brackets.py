@@ -429,7 +429,7 @@ def test_a_bracketed_set_becomes_a_capture_that_reconstruct_reads(tmp_path, monk
     assert "up: how the cameras were held (guessed); ground: what the cameras look at (guessed)" in made.lines
     assert any(line.startswith("brackets: 6 merged, of 3 exposures") for line in made.lines)
     assert (
-        "no masks are made" in caplog.text
+        "No masks are made" in caplog.text
         and "up and the height of the ground are" in caplog.text
         and "02_0.png + 02_1.png" in caplog.text
     )

@@ -31,6 +31,7 @@ from drgs_blender.core.frame import (
 )
 from drgs_blender.core.material_adjustments import edited_asset
 from drgs_blender.engine.asset_textures import TexturedAsset
+from drgs_blender.engine.scene_warnings import scene_warnings
 from drgs_blender.engine.session import Session
 from drgs_blender.formats.files import Image, MaterialFile, MeshFile
 from drgs_blender.formats.images import decode_image
@@ -94,7 +95,7 @@ def seen(tmp_path: Path):
         assert (buffer.object_index == 0).all() and len(buffer.depth) == 576
         points = buffer.points
         values = np.concatenate([points.albedo, points.roughness[:, None], points.metallic[:, None]], axis=1)
-        return values.reshape(24, 24, 5), session._scene_cache.warnings()
+        return values.reshape(24, 24, 5), scene_warnings(session._scene_cache)
 
     return look
 
