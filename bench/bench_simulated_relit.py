@@ -118,7 +118,7 @@ def main() -> None:
         "Jelly (E = 2e4 Pa) on a floor in a side wind, the true object's particles carrying what was learned from "
         f"photographs; {VIEWS} views under each of the lights that were not photographed, PSNR of the foreground in "
         "dB, scaled by one factor a channel; SSIM and FLIP of the scaled frames on white. Objects are some "
-        "1.6 m large.\n\n"
+        "1.6 m large. Streaks beside the object count in SSIM and FLIP alone.\n\n"
     )
     columns = ("Object", "Pose", "Surfels carried by", "Relit, foreground", "SSIM / FLIP")
     write_section("simulated-relit", "Simulated and relit", body + table(columns, rows))
