@@ -78,6 +78,22 @@ def test_the_object_is_not_taken_for_what_is_behind_it():
     assert abs(dark - room) < abs(dark - skin)
 
 
+def test_a_pattern_in_the_objects_moving_shadow_is_what_is_behind():
+    """Its features would hold all pictures together as those of one that did not turn."""
+    pictures, _, masks = photographs()
+    pattern = np.random.default_rng(3).uniform(40, 220, (HEIGHT // 3, WIDTH // 3, 3)).repeat(3, 0).repeat(3, 1)
+    anywhere = np.any(list(masks.values()), axis=0)
+    floor, shadow = np.zeros((2, HEIGHT, WIDTH), bool)
+    floor[105:160, 80:228], shadow[110:155, 90:220] = True, True
+    for k, (name, inside) in enumerate(masks.items()):
+        shade = np.where(shadow, 0.5 if k % 3 else 0.8, 1.0)[..., None]
+        pictures[name] = np.where((floor & ~inside)[..., None], shade * pattern, pictures[name]).astype(np.uint8)
+    found = found_in(pictures)
+    beside = shadow & ~binary_dilation(anywhere, iterations=6)
+    assert np.median([found.turned[name][beside].mean() for name in pictures]) < 0.2
+    assert min(found.turned[name][inside].mean() for name, inside in masks.items()) > 0.95
+
+
 def test_nothing_is_found_where_nothing_turned():
     assert found_in(photographs(turns=False)[0]) is None
 

@@ -37,6 +37,8 @@ _FLOOR, _NOISES = 10.0, 3.0
 #: Steps of what is behind, of 255 a pixel, at which the object is taken to begin: the larger of this and the quantile
 #: of the background around.
 _EDGE, _TEXTURE = 6.0, 0.9
+#: Part of a neighbourhood that has such steps where it is a pattern.
+_PATTERN = 0.4
 #: Parts of what turned that are smaller than this part of the largest are passers-by.
 _SMALL = 0.05
 #: Half width of notches that are filled, in parts of the longer side: highlights at the object's rim stand still, too.
@@ -270,8 +272,9 @@ def _objects(cv2: Any, stack: Array, behind: Array, turned: Array, least: float)
 def _behind(cv2: Any, order: Array, count: Array, turned: Array, enclosed: Array) -> Array:
     """(h, w, 3) float32: the background of pictures that `_sorted` has sorted, also where something `turned`.
 
-    There, the values that `_AGREED` of the pictures agree on best, where these go on from the background around; else
-    what is around. What is `enclosed` by what turned is never seen past it.
+    There, the values that `_AGREED` of the pictures agree on best, where these go on from the background around, or are
+    a pattern, as none that turns stays the same; else what is around. What is `enclosed` by what turned is never seen
+    past it, but for a pattern.
     """
     most = max(2, int(np.ceil(_AGREED * len(order))))
     widths = order[most - 1 :].astype(np.int32) - order[: 1 - most]
@@ -286,7 +289,14 @@ def _behind(cv2: Any, order: Array, count: Array, turned: Array, enclosed: Array
     slope = np.hypot(*(cv2.Sobel(smooth, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))).max(axis=-1)
     edge = max(_EDGE, float(np.quantile(slope[~turned], _TEXTURE)))
     passable = ~turned | (steady & ~enclosed & (slope < edge))
-    known = binary_propagation(~turned, mask=passable)
+    known = binary_propagation(~turned, mask=passable) | _patterned(cv2, steady & turned, slope)
     hidden = cv2.dilate((~known).astype(np.uint8), np.ones((5, 5), np.uint8)) & turned.astype(np.uint8)
     hidden |= (count == 0).astype(np.uint8)
     return cv2.inpaint(behind.round().astype(np.uint8), hidden, 4, cv2.INPAINT_TELEA).astype(np.float32)
+
+
+def _patterned(cv2: Any, steady: Array, slope: Array) -> Array:
+    """(h, w) bool: what is `steady` amid steps that are everywhere, not in lines as at an object's outline."""
+    side = 2 * round(_NOTCH * max(slope.shape) / 2) + 1
+    steps = cv2.boxFilter((steady & (slope > _EDGE)).astype(np.float32), -1, (side, side))
+    return steady & (steps > _PATTERN)
