@@ -118,17 +118,17 @@ class Playback:
         if self._matrices is not None:
             return 0  # the cache does not record whether these have changed
         try:
-            with open(self.path, "rb") as file:
-                magic, _, points, _, _, count = PC2.unpack(file.read(PC2.size))
-                if magic != MAGIC or points != header.vertices or count < 1 or header.first + count - 1 not in there:
-                    return 0
-                for index in {0, count - 1}:
-                    file.seek(PC2.size + index * points * 12)
-                    if file.read(points * 12) != self._vertices(header, index).tobytes():
-                        return 0
-                return count
-        except (FileNotFoundError, struct.error):
+            played = Played(self.path, header)
+            if played.last < header.first or played.last not in there:
+                return 0
+            ends = {frame: played.vertices(frame) for frame in (header.first, played.last)}
+        except (FileNotFoundError, AssetError):
             return 0
+        kept = all(
+            vertices.tobytes() == self._vertices(header, frame - header.first).tobytes()
+            for frame, vertices in ends.items()
+        )
+        return played.last - header.first + 1 if kept else 0
 
 
 class Played:

@@ -1,4 +1,4 @@
-"""Settings clamped to their limits, as old files and scripts may hold any value; changes are told to Blender."""
+"""Settings clamped to their limits, as old files and scripts may hold any value; changes tag the object."""
 
 from __future__ import annotations
 

@@ -72,12 +72,12 @@ def with_true_materials(asset: Asset, folder: Path) -> Path:
     return path
 
 
-def relit_truth(folder: Path, posed: bool = False) -> Truth:
-    """What is known of a scene, at rest or posed, under the lights that were not photographed."""
+def relit_truth(folder: Path, posed: bool = False, views: int | None = None) -> Truth:
+    """What is known of a scene under the lights that were not photographed: all views of each, or the first `views`."""
     truth = read_truth(folder)
     assert truth is not None
     sets = [item for item in truth.sets if item.posed == posed and item.light != truth.training_light]
-    return replace(truth, sets=sets)
+    return replace(truth, sets=[replace(item, views=item.views[:views]) for item in sets])
 
 
 def reconstruct_timed(capture: Capture, settings: Settings) -> tuple[Asset, float]:

@@ -79,8 +79,7 @@ def on_own_mesh(asset: Asset, voxels: int) -> Asset:
 
 def errors(asset: Asset) -> list[list[object]]:
     """Of each way: how far surfels are from where exact motion takes them, and how wrong their tangents are."""
-    mesh, motion_of = asset.mesh, bend(asset.mesh.vertices)
-    motion, gradient = motion_of
+    mesh, (motion, gradient) = asset.mesh, bend(asset.mesh.vertices)
     assert asset.binding is not None
     driven = MeshDriven(mesh, asset.surfels, asset.binding)
     rest = Frames.of(driven.pose(mesh.vertices))
@@ -89,12 +88,13 @@ def errors(asset: Asset) -> list[list[object]]:
     points, gradients = motion(particles).astype(np.float32), gradient(particles).astype(np.float16).astype(np.float32)
     tangents = np.stack([rest.tangent_u, rest.tangent_v], -1).astype(np.float64)
     where, image = motion(rest.centre), gradient(rest.centre.astype(np.float64)) @ tangents
-    on_mesh = on_the_mesh(mesh, asset.binding, rest.centre, particles)
+    carrier = ParticleDriven(rest, particles)
+    on_mesh = on_the_mesh(mesh, asset.binding, rest.centre, carrier.spacing)
     rows = []
     for way in WAYS:
         posed = driven.pose(motion(mesh.vertices).astype(np.float32))
         if way != "surface":
-            carrier = ParticleDriven(rest, particles, on_mesh if way == "automatic" else None)
+            carrier.on_mesh = on_mesh if way == "automatic" else None
             carrier.pose(posed, points, gradients)
         off = 100 * np.linalg.norm(posed.centre - where, axis=1) / size
         found = np.stack([posed.tangent_u, posed.tangent_v], -1)
@@ -114,8 +114,7 @@ def pictures(asset: Asset, folder: Path, samples: int) -> tuple[list[list[object
     path = FOLDER / "particle-driven.drgs"
     write_asset(path, asset)
     key = session.load_asset(path)
-    truth, capture = relit_truth(folder, posed=True), read_capture(folder)
-    truth = replace(truth, sets=[replace(item, views=item.views[:VIEWS]) for item in truth.sets])
+    truth, capture = relit_truth(folder, posed=True, views=VIEWS), read_capture(folder)
     alone = replace(capture, views=capture.training)
 
     def show(name: str, number: int, ours: Array, truth: Array) -> None:

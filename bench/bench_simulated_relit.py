@@ -20,17 +20,17 @@ from bench_asset import FOLDER, relit_truth
 from bench_evaluate import mean, similarity
 from report import OUT, ROOT, table, write_section
 
-from drgs_blender.cli.evaluate import compared_passes
+from drgs_blender.cli.evaluate import session_renderer
 from drgs_blender.cli.find_blender import find_blender
 from drgs_blender.core.asset.model import Mesh
-from drgs_blender.core.frame import Camera, ObjectState, Particles, RenderSettings, World
+from drgs_blender.core.frame import RenderSettings
 from drgs_blender.core.particle_cache import ParticleCache
 from drgs_blender.deform.gmls import bind_points, carry
 from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.compare import Posed, compare
 from drgs_blender.evaluate.scenes import Plan, make_scenes
 from drgs_blender.evaluate.truth import Truth, true_asset
-from drgs_blender.geometry.occupancy import volume_of
+from drgs_blender.geometry.occupancy import spacings, volume_of
 from drgs_blender.reconstruct.readers import read_capture
 from drgs_blender.simulation.bake import bake
 from drgs_blender.simulation.job import prepare
@@ -67,17 +67,15 @@ def rendered(name: str, frame: int, mesh: Mesh, vertices: Array, scenes: Path) -
     return relit_truth(out / name)
 
 
-def scored(session: Session, key: str, truth: Truth, folder: Path, samples: int, pose: Posed | None) -> list[dict]:
+def scored(
+    session: Session, key: str, truth: Truth, folder: Path, samples: int, pose: Posed | None, way: str = "surface"
+) -> list[dict]:
     """Rows of the asset under the truth's lights, in a pose or at rest."""
-
-    def draw(camera: Camera, light: World, _: Posed | None) -> dict[str, Array]:
-        state = ObjectState("asset", key)
-        if pose is not None:
-            state.vertices, state.particles = pose.vertices, pose.particles
-        return compared_passes(session, state, camera, light, RenderSettings(samples=samples, bounces=3))
-
+    draw = session_renderer(session, key, RenderSettings(samples=samples, bounces=3), driven_by=way)
     capture = read_capture(folder)
-    rows: list[dict] = compare(session.asset(key), replace(capture, views=capture.training), truth, draw)["lights"]
+    alone = replace(capture, views=capture.training)
+    report = compare(session.asset(key), alone, truth, lambda camera, light, _: draw(camera, light, pose))
+    rows: list[dict] = report["lights"]
     return rows
 
 
@@ -96,20 +94,16 @@ def main() -> None:
         own = session.asset(key).mesh
         cache = simulated(name, true.mesh, max(options.frames))
         rest = cache.rest().points
-        weights = bind_points(own.vertices, rest, space=volume_of(rest))
-        still = relit_truth(folder)
-        still = replace(still, sets=[replace(item, views=item.views[:VIEWS]) for item in still.sets])
-        found = scored(session, key, still, folder, options.samples, None)
+        weights = bind_points(own.vertices, rest, space=volume_of(rest, *spacings(rest)))
+        found = scored(session, key, relit_truth(folder, views=VIEWS), folder, options.samples, None)
         rows.append([name, "at rest", "-", f"{mean(found, 'scaled', 'foreground'):.2f}", similarity(found)])
         print(*rows[-1], flush=True)
         for frame in options.frames:
             particles, vertices = cache.driving(frame)
             truth = rendered(name, frame, true.mesh, vertices, options.scenes)
-            mine = carry(weights, particles.points, particles.gradients)[0]
+            pose = Posed(carry(weights, particles.points, particles.gradients)[0].astype(np.float32), particles)
             for way in WAYS:
-                carried: Particles | None = None if way == "surface" else replace(particles, all=way == "particles")
-                pose = Posed(mine.astype(np.float32), carried)  # type: ignore[arg-type]
-                found = scored(session, key, truth, folder, options.samples, pose)
+                found = scored(session, key, truth, folder, options.samples, pose, way)
                 moved = 100 * float(np.linalg.norm(vertices - true.mesh.vertices, axis=1).mean())
                 figures = f"{mean(found, 'scaled', 'foreground'):.2f}", similarity(found)
                 rows.append([name, f"frame {frame}, moved by {moved:.0f} cm in the mean", way, *figures])

@@ -89,7 +89,7 @@ def _rest_of(cache: ParticleCache, header: Header) -> Array:
     rest = np.array(cache.rest().points)
     now = cache.header()
     if now is None or now.digest != header.digest:
-        raise AssetError(str(cache.folder), "is being baked anew", "Wait for the first frames")
+        raise AssetError(str(cache.folder), "is being baked again", "Wait for the first frames")
     if len(_rests) >= _MOST:
         _rests.clear()
     _rests[key] = rest
@@ -103,9 +103,8 @@ def _placing(played: cache_playback.Played) -> Callable[[int, ParticleFrame], Pa
         vertices = played.vertices(number)
         if np.array_equal(vertices, frame.vertices):
             return frame
-        moved = _moved(
-            Particles(frame.points, frame.points, frame.gradients.astype(np.float32)), _affine(frame.vertices, vertices)
-        )
+        particles = Particles(frame.points, frame.points, frame.gradients)
+        moved = _moved(particles, _affine(frame.vertices, vertices))
         if moved is None:
             raise AssetError(str(played.path), f"does not hold frame {number} of its cache", "Bake again")
         return ParticleFrame(moved.points, moved.gradients, vertices)

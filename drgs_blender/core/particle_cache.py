@@ -230,7 +230,8 @@ class ParticleCache:
         last : int, optional
             Frames after it count as not there.
         place : callable, optional
-            Brings frames, by their number, to where they are shown before they are blended.
+            Brings frames, by their number, to where they are shown before they are blended; their gradients are
+            float32.
 
         Returns
         -------
@@ -246,7 +247,7 @@ class ParticleCache:
         there = [known for known in self.frames() if last is None or known <= last]
         at = min(max(frame, there[0]), there[-1]) if there else frame
         first = int(np.floor(at))
-        shown = [self.read(first + k) for k in range(2 if at > first else 1)]
+        shown = [_single(self.read(first + k)) for k in range(2 if at > first else 1)]
         rest = np.array(self.rest().points) if rest is None else rest
         for number, read in enumerate(shown, first):
             if len(read.points) != len(rest):
@@ -254,10 +255,10 @@ class ParticleCache:
                     str(self.path(number)), f"has {len(read.points)} particles, {len(rest)} at rest", _AGAIN
                 )
         shown = shown if place is None else [place(number, read) for number, read in enumerate(shown, first)]
-        points, gradients, vertices = (np.array(a) for a in (shown[0].points, _singles(shown[0]), shown[0].vertices))
+        points, gradients, vertices = (np.array(a) for a in (shown[0].points, shown[0].gradients, shown[0].vertices))
         if len(shown) > 1:
             part, then = np.float32(at - first), shown[1]
-            for now, later in ((points, then.points), (gradients, _singles(then)), (vertices, then.vertices)):
+            for now, later in ((points, then.points), (gradients, then.gradients), (vertices, then.vertices)):
                 now += part * (later - now)
         for array in (rest, points, gradients, vertices):
             array.flags.writeable = False  # so that the engine's client need not copy it
@@ -280,12 +281,10 @@ class ParticleCache:
             return None
 
 
-def _singles(frame: ParticleFrame) -> Array:
-    """Deformation gradients of a frame in single precision."""
-    if frame.gradients.dtype == np.float32:
-        return frame.gradients
-    single: Array = _SINGLE[np.ascontiguousarray(frame.gradients, np.float16).view(np.uint16)]
-    return single
+def _single(frame: ParticleFrame) -> ParticleFrame:
+    """A frame with gradients in single precision."""
+    gradients = _SINGLE[np.ascontiguousarray(frame.gradients, np.float16).view(np.uint16)]
+    return ParticleFrame(frame.points, gradients, frame.vertices)
 
 
 def _members_of(particles: ParticleFrame) -> dict[str, Array]:

@@ -62,6 +62,8 @@ class ParticleDriven:
     on_mesh : (n,) bool array or None
     count : int
         Particles.
+    spacing : float
+        Metres from one particle to those around it, at rest.
     weights : Weights
         Of the surfels.
     hidden_count, turned : int
@@ -76,7 +78,8 @@ class ParticleDriven:
 
     def __init__(self, rest: Frames, particles: Array, on_mesh: Array | None = None) -> None:
         self.rest, self.on_mesh, self.count = rest, on_mesh, len(particles)
-        space = volume_of(particles)
+        nearest, self.spacing = spacings(particles)
+        space = volume_of(particles, nearest, self.spacing)
         parts = None if space is None else _parts_at(space, particles)
         self.weights = bind_points(self.rest.centre, particles, space=space, parts=parts)
         self.hidden_count = self.turned = 0
@@ -125,7 +128,7 @@ class ParticleDriven:
         self.hidden_count = int(np.count_nonzero(hidden))
 
 
-def on_the_mesh(mesh: Mesh, binding: Binding, centre: Array, particles: Array) -> Array:
+def on_the_mesh(mesh: Mesh, binding: Binding, centre: Array, spacing: float) -> Array:
     """Which surfels follow the faces of the mesh at least as well as particles that move it.
 
     Not those that lie beside their face, or farther from it than it is large, and not those of faces that are coarser
@@ -139,8 +142,8 @@ def on_the_mesh(mesh: Mesh, binding: Binding, centre: Array, particles: Array) -
     binding : Binding
     centre : (n, 3) array
         Of the surfels at rest, object space.
-    particles : (s, 3) array
-        At rest, object space.
+    spacing : float
+        Metres from one particle to those around it, at rest.
 
     Returns
     -------
@@ -151,7 +154,7 @@ def on_the_mesh(mesh: Mesh, binding: Binding, centre: Array, particles: Array) -
     share = binding.barycentric.clip(0, 1).astype(np.float64)
     share /= np.maximum(share.sum(axis=1, keepdims=True), 1e-30)
     away = np.linalg.norm(centre - np.einsum("nk,nkc->nc", share, corners), axis=1)
-    found: Array = (away <= _FAR * edge) & (edge <= _COARSE * spacings(particles)[1])
+    found: Array = (away <= _FAR * edge) & (edge <= _COARSE * spacing)
     return found
 
 

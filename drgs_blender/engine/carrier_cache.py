@@ -77,6 +77,7 @@ def _bound(loaded: LoadedAsset, state: ObjectState, particles: Particles) -> Par
     driven = loaded.surfels_of(state)
     if isinstance(driven, Surfels):
         return ParticleDriven(Frames.of(pose_by_matrix(driven, np.eye(4))), rest)
-    frames = Frames.of(driven.pose(asset.mesh.vertices))
-    on_mesh = None if particles.all else on_the_mesh(asset.mesh, driven.binding, frames.centre, rest)
-    return ParticleDriven(frames, rest, on_mesh)
+    carrier = ParticleDriven(Frames.of(driven.pose(asset.mesh.vertices)), rest)
+    if not particles.all:
+        carrier.on_mesh = on_the_mesh(asset.mesh, driven.binding, carrier.rest.centre, carrier.spacing)
+    return carrier

@@ -222,10 +222,10 @@ def posed_surfels(
         posed = pose_by_matrix(driven, matrix, index)
     elif carrier is None:
         pose = pose if state.grain <= 0 else MeshDriven.pose  # grains are made here
-        posed = _posed_by_mesh(state, index, driven, traced, pose, traced.torn)
+        posed = _posed_by_mesh(state, index, driven, traced, pose)
     else:
         way = MeshDriven.pose if carrier.on_mesh is not None else partial(MeshDriven.pose, placed=False)
-        posed = _posed_by_mesh(state, index, driven, traced, way, traced.torn)
+        posed = _posed_by_mesh(state, index, driven, traced, way)
     if carrier is not None:
         own = driven.opacity if isinstance(driven, Surfels) else driven.surfels.opacity
         _carry(state, posed, carrier, matrix, own)  # which knows of tears by itself
@@ -236,9 +236,8 @@ def posed_surfels(
 
 
 def _posed_by_mesh(
-    state: ObjectState, index: int, driven: MeshDriven, traced: TraceObject, pose: Callable[..., PosedSurfels],
-    torn: Array | None,
-) -> PosedSurfels:  # fmt: skip
+    state: ObjectState, index: int, driven: MeshDriven, traced: TraceObject, pose: Callable[..., PosedSurfels]
+) -> PosedSurfels:
     """Surfels as `pose` has them, with the materials of this frame."""
     matrix, mesh, normals = np.asarray(state.matrix_world, np.float64), driven.mesh, traced.corner_normals
     if normals is not None and np.linalg.det(matrix[:3, :3]) < 0:
@@ -248,7 +247,7 @@ def _posed_by_mesh(
         for name in BASE_CHANNELS
     }
     given = driven, traced.vertices, normals, materials
-    return pose(*given, matrix_world=matrix, object_index=index, torn=torn)
+    return pose(*given, matrix_world=matrix, object_index=index, torn=traced.torn)
 
 
 def _carry(state: ObjectState, posed: PosedSurfels, carrier: ParticleDriven, matrix: Array, opacity: Array) -> None:

@@ -58,13 +58,15 @@ def spacings(points: Array) -> tuple[float, float]:
     return float(np.median(distance[:, 1])), float(np.median(distance[:, -1]))
 
 
-def volume_of(points: Array) -> Volume | None:
+def volume_of(points: Array, nearest: float, around: float) -> Volume | None:
     """The space that points fill.
 
     Parameters
     ----------
     points : (n, 3) float array
         Metres.
+    nearest, around : float
+        Their `spacings`.
 
     Returns
     -------
@@ -75,7 +77,6 @@ def volume_of(points: Array) -> Volume | None:
     from scipy import ndimage
 
     points = np.asarray(points, np.float64)
-    nearest, around = spacings(points)
     if around <= 0:
         return None
     side = around if nearest > _REGULAR * around else _CELL * around
