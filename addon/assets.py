@@ -176,6 +176,9 @@ def captured_mesh(obj: bpy.types.Object) -> Mesh:
         The file is absent, or the mesh is not the asset's any more.
     """
     own = load(file_of(obj)).mesh
+    if not len(own.vertices):
+        problem = "has surfels but no mesh, whose vertices would be changed"
+        raise AssetError(f'Object "{obj.name}"', problem, "Use Adjustments, or import it with a mesh")
     rows = mesh_arrays.source_rows(obj.data, own)
     if rows is None:
         raise AssetError(

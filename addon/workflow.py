@@ -90,7 +90,7 @@ def _bind(obj: bpy.types.Object | None) -> Step:
     if obj is None:
         return Step("bind", "Bind", False, False, "")
     if not len(obj.data.vertices):
-        return Step("bind", "Bind", True, False, "Has no mesh; it moves as a whole")
+        return Step("bind", "Bind", True, False, "Has no mesh; a proxy bends it")
     poser = poser_of(obj)
     if poser is not None:
         return Step("bind", "Bind", True, False, f"Follows {poser.name}")

@@ -120,7 +120,7 @@ def new_cage(context: bpy.types.Context, objects: list[bpy.types.Object], faces:
             ("REMESH", {"mode": "VOXEL", "voxel_size": size / VOXELS}),
         ):
             selection.add_modifier(cage, kind, kind, **values)
-        _apply(context, cage)
+        apply_modifiers(context, cage)
         count = len(mesh_arrays.loop_triangles(cage.data))
         if not count:
             raise UsageError(
@@ -128,7 +128,7 @@ def new_cage(context: bpy.types.Context, objects: list[bpy.types.Object], faces:
             )
         ratio = min(1.0, faces / count)
         selection.add_modifier(cage, "DECIMATE", "DECIMATE", ratio=ratio, use_collapse_triangulate=True)
-        _apply(context, cage)
+        apply_modifiers(context, cage)
         clean(cage.data, 1e-4 * size)
     except UsageError:
         bpy.data.meshes.remove(cage.data)
@@ -150,7 +150,7 @@ def clean(mesh: bpy.types.Mesh, distance: float) -> None:
     work.free()
 
 
-def _apply(context: bpy.types.Context, obj: bpy.types.Object) -> None:
+def apply_modifiers(context: bpy.types.Context, obj: bpy.types.Object) -> None:
     """Replace the mesh by what its modifiers make of it."""
     context.view_layer.update()
     old = obj.data

@@ -101,7 +101,7 @@ def save(obj: bpy.types.Object, path: Path, depsgraph: bpy.types.Depsgraph) -> i
     """
     source = assets.file_of(obj)
     asset = assets.load(source)
-    asset, _, painted, adjustment = appearance_of(obj.evaluated_get(depsgraph), asset, messages.Warnings())
+    asset, _, painted, adjustment, _ = appearance_of(obj.evaluated_get(depsgraph), asset, messages.Warnings())
     if not len(asset.surfels) and not len(asset.mesh.faces):
         raise UsageError(f'Object "{obj.name}"', "has nothing left of its asset", "Undo the edit, or show some of it")
     edited = edited_asset(asset, painted, adjustment)

@@ -45,7 +45,7 @@ def editable(
             raise UsageError(
                 f'Object "{obj.name}"',
                 "has surfels but no mesh that could be bent",
-                "Move it as a whole, or import it with a mesh",
+                "Choose Add Proxy Mesh (sidebar > DR-GS > Workflow > Bind), or move it as a whole",
             )
     if not found:
         raise UsageError("Selection", "holds no DR-GS object", "Select one or several")

@@ -14,10 +14,10 @@ import numpy as np
 from ...drgs_blender.core.asset import MATERIAL_CHANNELS, Asset
 from ...drgs_blender.core.asset.part import Part, has_surfels, part_of, whole_of
 from ...drgs_blender.core.errors import first_of
-from ...drgs_blender.core.frame import Adjustment, ObjectState
+from ...drgs_blender.core.frame import Adjustment, ObjectState, ProxyMesh
 from ...drgs_blender.core.materials import ShaderAOV
 from ...drgs_blender.core.passes import Pass
-from .. import assets, cache_playback, mesh_arrays, point_caches, surfel_points
+from .. import assets, cache_playback, mesh_arrays, point_caches, proxies, surfel_points
 from ..viewport_material import is_viewport_material, painted_images
 from .aov_nodes import aov_values
 from .export_cache import ExportCache, uid
@@ -46,12 +46,15 @@ class Appearance(NamedTuple):
     painted : dict of str to array
         Channels of the vertices that differ from the asset's.
     adjustment : Adjustment, optional
+    proxy : ProxyMesh, optional
+        What moves its surfels, where it has no mesh.
     """
 
     asset: Asset
     vertices: np.ndarray
     painted: dict[str, np.ndarray]
     adjustment: Adjustment | None
+    proxy: ProxyMesh | None = None
 
 
 class DrgsObjects:
@@ -82,7 +85,8 @@ class DrgsObjects:
         if not np.isfinite(item.matrix_world).all():
             self._warn(f'"{obj.name}": its transform is not finite; it is left out. Check its drivers and constraints')
             return
-        check_modifiers(obj, self._depsgraph)
+        if obj.original.data.attributes.get(proxies.REST) is None:
+            check_modifiers(obj, self._depsgraph)
         cache_playback.check(obj, self._warn, final=self._depsgraph.mode == "RENDER")
         appearance = (
             obj.drgs.show_captured, obj.drgs.adjustment.values(), *cache_playback.fracture_state(obj).items(),
@@ -158,6 +162,11 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     asset = assets.load(path)
     captured = obj.drgs.show_captured
     with _readable(obj, depsgraph) as mesh:
+        if proxies.is_proxy(mesh, asset):
+            fit = _without_removed(Fit(), obj, asset, depsgraph)
+            adjustment = None if captured else _adjustment_of_all(obj, warn)
+            given = {"part": fit.part, "adjustment": adjustment, "proxy": proxies.read(mesh)}
+            return ObjectState(name=obj.name, asset=key_of(path), **given)
         point_caches.check(obj, asset.mesh, warn, final=depsgraph.mode == "RENDER")
         fit = _without_removed(check_topology(obj, mesh, asset.mesh, warn), obj, asset, depsgraph)
         vertices = mesh_arrays.read_vertices(mesh)
@@ -217,6 +226,10 @@ def appearance_of(
         Its mesh is not the asset's any more; names the object.
     """
     with _readable(obj, depsgraph) as mesh:
+        if proxies.is_proxy(mesh, asset):
+            part = _without_removed(Fit(), obj, asset, depsgraph).part
+            own = asset if part is None else part_of(asset, part, f'Object "{obj.name}"')
+            return Appearance(own, asset.mesh.vertices, {}, _adjustment_of_all(obj, warn), proxies.read(mesh))
         fit = _without_removed(check_topology(obj, mesh, asset.mesh, warn), obj, asset, depsgraph)
         painted = {channel: _edited(obj, mesh, asset, channel, fit, warn) for channel in MATERIAL_CHANNELS}
         return Appearance(
@@ -256,6 +269,18 @@ def _adjustment(obj: bpy.types.Object, mesh: bpy.types.Mesh, fit: Fit, warn: War
             warn(f'"{obj.name}": {lost} values of the mask "{settings.mask}" are not finite; 0 is used there')
             mask = np.nan_to_num(mask, posinf=0.0, neginf=0.0)
     return settings.to_frame(mask, warn)
+
+
+def _adjustment_of_all(obj: bpy.types.Object, warn: Warn) -> Adjustment | None:
+    """The adjustments of an object whose mesh is a proxy; None where they change nothing, or go by a mask."""
+    settings = obj.drgs.adjustment
+    if not settings.values():
+        return None
+    if settings.mask:
+        warn(f'"{obj.name}": its adjustments want the mask "{settings.mask}" of a proxy, not of surfels; they are not '
+             "applied. Clear the mask")  # fmt: skip
+        return None
+    return settings.to_frame(None, warn)
 
 
 def _edited(

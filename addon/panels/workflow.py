@@ -56,7 +56,11 @@ def _made(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
 
 
 def _bind(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    if workflow.target(context) is None:
+    obj = workflow.target(context)
+    if obj is None:
+        return
+    if not len(obj.data.vertices):
+        layout.operator("drgs.add_proxy", icon="MOD_MESHDEFORM")
         return
     grid = layout.grid_flow(columns=2, align=True, even_columns=True)
     grid.operator("drgs.bind_to_rig", text="Transfer Rig", icon="OUTLINER_OB_ARMATURE")

@@ -16,9 +16,10 @@ from mathutils import Matrix, Vector
 
 from ...drgs_blender.core.asset import Asset
 from ...drgs_blender.core.errors import DrgsError
+from ...drgs_blender.core.frame import ProxyMesh
 from ...drgs_blender.core.level_of_detail import Detail
 from ...drgs_blender.core.material_adjustments import edited_asset
-from .. import assets, mesh_arrays, surfel_points
+from .. import assets, mesh_arrays, proxies, surfel_points
 from ..export.export_cache import ExportCache, uid
 from ..export.objects import appearance_of
 from ..level_of_detail import most_surfels
@@ -144,10 +145,10 @@ def set_back(window: Matrix, depth: float, distance: float) -> Matrix:
     return moved
 
 
-def _shown(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[Asset, Array] | None:
+def _shown(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[Asset, Array, ProxyMesh | None] | None:
     """`shown_asset` of an object, read once; None where it has none."""
 
-    def read() -> tuple[Asset, Array] | None:
+    def read() -> tuple[Asset, Array, ProxyMesh | None] | None:
         try:
             return shown_asset(obj, assets.load(assets.file_of(obj)), depsgraph)
         except DrgsError:  # reported when the object is rendered
@@ -164,11 +165,13 @@ def _batch(
     found = _shown(obj, depsgraph)
     if found is None:
         return None
-    shown, vertices = found
+    shown, vertices, proxy = found
     rows, growth = first_rows(shown, share)
     scale = shown.surfels.scale[rows]
     sizes = _WIDTH * np.maximum(scale.max(axis=1, initial=0), np.sqrt(scale.prod(axis=1) * growth))
     places = posed_centres(shown, vertices, rows)
+    if proxy is not None:
+        places = proxies.carried(shown.surfels.centre, proxy, rows)
     batch = draw.disc_batch(places, shown.surfels.albedo[rows], sizes.astype(np.float32))
     return batch, float(np.median(sizes)) if len(sizes) else 0.0
 
@@ -184,11 +187,12 @@ def first_rows(asset: Asset, share: float) -> tuple[Array | slice, Array | float
 
 def shown_asset(
     obj: bpy.types.Object, asset: Asset, depsgraph: bpy.types.Depsgraph | None = None
-) -> tuple[Asset, Array]:
-    """What the evaluated object has of its asset, as it is painted and adjusted, and its (n, 3) vertices."""
+) -> tuple[Asset, Array, ProxyMesh | None]:
+    """What the evaluated object has of its asset, as painted and adjusted, its (n, 3) vertices, and its proxy."""
     try:
         found = appearance_of(obj, asset, lambda text: None, depsgraph)
     except DrgsError:  # reported, as warnings are, when the object is rendered
-        return asset, asset.mesh.vertices if obj.mode == "EDIT" else mesh_arrays.read_vertices(obj.data)
+        return asset, asset.mesh.vertices if obj.mode == "EDIT" else mesh_arrays.read_vertices(obj.data), None
     captured = obj.drgs.show_captured
-    return found.asset if captured else edited_asset(found.asset, found.painted, found.adjustment), found.vertices
+    shown = found.asset if captured else edited_asset(found.asset, found.painted, found.adjustment)
+    return shown, found.vertices, found.proxy

@@ -156,6 +156,25 @@ class Particles:
 
 
 @dataclass(slots=True)
+class ProxyMesh:
+    """A mesh, or points, that carry the surfels of an asset without a mesh, **object space**.
+
+    Attributes
+    ----------
+    rest : (v, 3) float32 array
+        Metres, its vertices where they were when the surfels were as in the asset.
+    vertices : (v, 3) float32 array
+        Metres, now.
+    faces : (m, 3) int32 array
+        May be none; then points that lie in a plane do not say how space turns beside it.
+    """
+
+    rest: Array
+    vertices: Array
+    faces: Array
+
+
+@dataclass(slots=True)
 class ObjectState:
     """One DR-GS object in one frame.
 
@@ -204,6 +223,8 @@ class ObjectState:
         What an edited mesh has left of the asset; all arrays are then of its vertices and faces. None: all of it.
     particles : Particles, optional
         What carries the surfels; None: their faces do. Rays meet the mesh as ``vertices`` have it.
+    proxy : ProxyMesh, optional
+        What carries the surfels of an asset without a mesh, in place of particles.
     """
 
     name: str
@@ -230,6 +251,7 @@ class ObjectState:
     coat: Array | None = None
     part: Part | None = None
     particles: Particles | None = None
+    proxy: ProxyMesh | None = None
 
 
 @dataclass(slots=True)

@@ -39,6 +39,7 @@ from .level_of_detail import Budget, counts, grown, reduced
 from .loaded_assets import LoadedAsset
 from .optional_channels import channel_faults, may_need, surfel_emission
 from .part_cache import PartCache
+from .proxy_meshes import ProxyMeshes
 from .scene_objects import check_surface, in_asset_order, join, moved_vertices, posed_surfels
 from .surfel_sheets import meets_sheets, sheet_mesh
 from .surfel_trees import SurfelTree
@@ -82,7 +83,7 @@ class SceneCache:
     def __init__(self) -> None:
         self._assets: dict[str, LoadedAsset] = {}
         self._parts = PartCache()
-        self._carriers = CarrierCache()
+        self._carriers, self._proxies = CarrierCache(), ProxyMeshes()
         self.objects: list[CachedObject] = []
         self.meshes: list[MeshState] = []
         self.images: list[Image] = []
@@ -166,8 +167,9 @@ class SceneCache:
         objects: list[CachedObject] = []
         faults: list[str] = []
         self._parts.begin()
-        self._carriers.begin(frame.objects)
-        for index, state in enumerate(frame.objects):
+        states = self._proxies.carried(frame.objects, lambda key: getattr(self._assets.get(key), "asset", None))
+        self._carriers.begin(states)
+        for index, state in enumerate(states):
             loaded = self._assets.get(state.asset)
             if loaded is None:
                 raise AssetError(

@@ -1,0 +1,195 @@
+"""A lattice that is bent as points in it are: what a proxy mesh does to the space in and around it.
+
+The displacements u of the lattice's nodes minimise
+
+    sum_v |u(X_v) - d_v|^2 + s sum |D2 u|^2 + a sum_v |u(X_v + h N_v) - (x_v + h n_v - X_v - h N_v)|^2,
+
+u being trilinear between nodes, d_v the displacements of the points, D2 all second differences along axes and across the
+faces of cells, N and n the unit normals at rest and now. As second differences of affine maps are 0, these are followed
+exactly; between and beside the points space bends as little as it can. The last term, of little weight, says how space
+turns where all points lie in a sheet. Cells are only where points are or what they carry is, so that parts that are
+near each other, as leaves, are apart.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+
+from ..core.errors import UsageError
+from ..core.frame import Particles
+from ..geometry.normals import VertexNormals
+
+Array = np.ndarray
+
+#: Cells along the longest side, and cells at most.
+_CELLS, _MOST = 40, 6_000
+#: s and a; sums over points are those of the cells that have any.
+_SMOOTH, _ASIDE = 1e-2, 1e-6
+_CORNERS = np.array(list(product((0, 1), repeat=3)))
+
+
+class LatticeFit:
+    """Gives particles, the nodes of a lattice, that move as points do.
+
+    Parameters
+    ----------
+    rest : (v, 3) array
+        The points at rest, metres.
+    faces : (m, 3) int array
+        Of the mesh whose vertices they are; may be empty.
+    carried : (n, 3) array
+        What is in the space to be carried, metres.
+
+    Attributes
+    ----------
+    nodes : (s, 3) float32 array
+        At rest, metres.
+
+    Raises
+    ------
+    UsageError
+        There are no points.
+    """
+
+    def __init__(self, rest: Array, faces: Array, carried: Array) -> None:
+        from scipy import sparse  # an engine starts without
+        from scipy.sparse.linalg import splu
+
+        self._rest = np.asarray(rest, np.float64)
+        if not len(self._rest):
+            raise UsageError("the proxy", "has no vertices", "Give it some")
+        self._normals = VertexNormals(faces, len(self._rest)) if len(faces) else None
+        self._lay_out(self._rest, np.asarray(carried, np.float64))
+        self.nodes = np.ascontiguousarray(self._origin + self._side * self._place, np.float32)
+        beside = self._beside(self._rest)
+        at, aside = self._trilinear(self._rest), self._trilinear(beside)
+        filled = len(np.unique((self._rest - self._origin) // self._side, axis=0))
+        weight = filled / len(self._rest)
+        smooth = self._second_differences()
+        moments = weight * (at.T @ at + _ASIDE * aside.T @ aside) + _SMOOTH * smooth.T @ smooth
+        moments += 1e-14 * sparse.identity(moments.shape[0])
+        self._solve = splu(moments.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve
+        self._data = weight * sparse.hstack([at.T, _ASIDE * aside.T]).tocsr()
+        self._rest_beside = beside
+        self._differences = [self._mean_difference(axis) for axis in range(3)]
+
+    def particles(self, vertices: Array) -> Particles:
+        """The nodes where the points are `vertices`, (v, 3), metres; not finite where one of these is not."""
+        now = np.asarray(vertices, np.float64)
+        lost = ~np.isfinite(now).all(axis=1)
+        now = np.where(lost[:, None], self._rest, now)
+        moved = self._solve(self._data @ np.concatenate([now - self._rest, self._beside(now) - self._rest_beside]))
+        slopes = np.stack([difference @ moved for difference in self._differences], axis=2)
+        gradients = np.ascontiguousarray(slopes + np.eye(3), np.float32)
+        if lost.any():
+            near = np.unique(self._trilinear(self._rest[lost]).indices)
+            moved[near] = np.nan
+        return Particles(self.nodes, np.ascontiguousarray(self.nodes + moved, np.float32), gradients, all=True)
+
+    def _beside(self, vertices: Array) -> Array:
+        """Points a cell away along the normals; the points themselves without faces."""
+        if self._normals is None:
+            return vertices
+        return vertices + self._side * self._normals(vertices.astype(np.float32)).astype(np.float64)
+
+    def _lay_out(self, rest: Array, carried: Array) -> None:
+        """Choose cells, and number their corners."""
+        from scipy import ndimage
+
+        every = np.concatenate([rest, carried])
+        low, extent = every.min(axis=0), np.ptp(every, axis=0)
+        self._side = max(float(extent.max()) / _CELLS, 1e-9)
+        while True:
+            self._origin = low - 2.5 * self._side
+            self._shape = np.ceil(extent / self._side).astype(int) + 6
+            cells = np.zeros(self._shape, bool)
+            cells[tuple(self._cell(every).T)] = True
+            with_points = np.zeros(self._shape, bool)
+            with_points[tuple(self._cell(rest).T)] = True
+            cells = ndimage.binary_dilation(cells)
+            while True:  # all that is carried is joined to points
+                part, count = ndimage.label(cells)
+                if len(np.setdiff1d(np.unique(part[with_points]), 0)) == count:
+                    break
+                cells = ndimage.binary_dilation(cells)
+            cells = ndimage.binary_fill_holes(cells)
+            if np.count_nonzero(cells) <= _MOST:
+                break
+            self._side *= 1.1
+        self._cells = cells
+        number = np.zeros(self._shape + 1, bool)
+        for corner in _CORNERS:
+            number[tuple(slice(c, c + n) for c, n in zip(corner, self._shape))] |= cells
+        self._place = np.argwhere(number)
+        self._number = np.full(number.shape, -1)
+        self._number[number] = np.arange(len(self._place))
+
+    def _cell(self, points: Array) -> Array:
+        found = np.floor((points - self._origin) / self._side).astype(int)
+        return np.clip(found, 0, self._shape - 1)
+
+    def _trilinear(self, points: Array):  # type: ignore[no-untyped-def]
+        """Sparse (n, s): values at points of a field that has values at the nodes; the field ends with its cells."""
+        from scipy import sparse
+
+        cell = self._cell(points)
+        inside = self._cells[tuple(cell.T)]
+        rows = np.flatnonzero(inside)
+        cell, share = cell[rows], ((points - self._origin) / self._side - cell)[rows].clip(0, 1)
+        weights = [np.where(corner, share, 1 - share).prod(axis=1) for corner in _CORNERS]
+        columns = [self._number[tuple((cell + corner).T)] for corner in _CORNERS]
+        places = np.concatenate(columns), np.tile(rows, len(_CORNERS))
+        return sparse.csr_matrix((np.concatenate(weights), places[::-1]), (len(points), len(self._place)))
+
+    def _edges(self, axis: int) -> Array:
+        """(k, 2) nodes that an edge of a cell along `axis` joins."""
+        there = np.zeros(self._shape + 1, bool)
+        for corner in _CORNERS[_CORNERS[:, axis] == 0]:
+            there[tuple(slice(c, c + n) for c, n in zip(corner, self._shape))] |= self._cells
+        first = np.argwhere(there)
+        return np.stack([self._number[tuple((first + step).T)] for step in (0, np.eye(3, dtype=int)[axis])], axis=1)
+
+    def _second_differences(self):  # type: ignore[no-untyped-def]
+        """Sparse (k, s): along each axis, and across each face of a cell."""
+        unit = np.eye(3, dtype=int)
+        parts = []
+        for axis in range(3):
+            edges = self._edges(axis)
+            following = np.full(len(self._place), -1)
+            following[edges[:, 0]] = edges[:, 1]
+            third = following[edges[:, 1]]
+            line = np.column_stack([edges, third])[third >= 0]
+            parts.append(self._rows(line, (1.0, -2.0, 1.0)))
+        for a, b in ((0, 1), (0, 2), (1, 2)):
+            other = 3 - a - b
+            there = np.zeros(self._shape + 1, bool)
+            for step in (0, 1):
+                into = [slice(0, n) for n in self._shape]
+                into[other] = slice(step, step + self._shape[other])
+                there[tuple(into)] |= self._cells
+            first = np.argwhere(there)
+            corners = [self._number[tuple((first + step).T)] for step in (0, unit[a], unit[b], unit[a] + unit[b])]
+            parts.append(self._rows(np.column_stack(corners), (1.0, -1.0, -1.0, 1.0)) * np.sqrt(2))
+        from scipy import sparse
+
+        return sparse.vstack(parts).tocsr()
+
+    def _rows(self, nodes: Array, values: tuple[float, ...]):  # type: ignore[no-untyped-def]
+        from scipy import sparse
+
+        rows = np.repeat(np.arange(len(nodes)), len(values))
+        return sparse.csr_matrix((np.tile(values, len(nodes)), (rows, nodes.reshape(-1))), (len(nodes), len(self._place)))
+
+    def _mean_difference(self, axis: int):  # type: ignore[no-untyped-def]
+        """Sparse (s, s): the mean slope of the edges along `axis` at each node."""
+        from scipy import sparse
+
+        edges = self._edges(axis)
+        count = np.bincount(edges.reshape(-1), minlength=len(self._place))
+        rows = np.concatenate([edges[:, 0], edges[:, 0], edges[:, 1], edges[:, 1]])
+        columns = np.concatenate([edges[:, 1], edges[:, 0], edges[:, 1], edges[:, 0]])
+        ones = np.ones(len(edges)) / self._side
+        shares = np.concatenate([ones, -ones, ones, -ones]) / count[rows]
+        return sparse.csr_matrix((shares, (rows, columns)), 2 * (len(self._place),))

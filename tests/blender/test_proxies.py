@@ -1,0 +1,172 @@
+"""Add Proxy Mesh: captures without a mesh are bent by what bends meshes, in pictures, exports and the viewport."""
+
+from __future__ import annotations
+
+from math import radians
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Matrix
+from scenes import armature_object, asset_of, mesh_object, new_world, part, read_exr, select, sphere
+
+pytestmark = pytest.mark.blender_api
+
+
+@pytest.fixture
+def cloud(scene, tmp_path):
+    """The ball's surfels alone, moved and turned."""
+    container, model = (part(f"drgs_blender.core.asset.{name}") for name in ("container", "model"))
+    path = tmp_path / "cloud.drgs"
+    container.write_asset(path, model.Asset(asset_of(*sphere()).surfels, model.Mesh.empty()))
+    bpy.ops.import_scene.drgs(filepath=str(path))
+    scene.drgs.rays_see = "surfels"
+    obj = bpy.context.object
+    obj.matrix_world = Matrix.Translation((1, 2, 0.5)) @ Matrix.Rotation(0.4, 4, "Z")
+    bpy.context.view_layer.update()
+    return obj
+
+
+def add_proxy(*others, faces=400):
+    assert bpy.ops.drgs.add_proxy(faces=faces) == {"FINISHED"}
+    return bpy.context.object
+
+
+def centres(obj) -> np.ndarray:
+    return part("addon.assets").load(part("addon.assets").file_of(obj)).surfels.centre
+
+
+def test_a_proxy_is_closed_around_all_surfels(cloud, export):
+    add_proxy()
+    assert 100 < len(cloud.data.polygons) < 700 and cloud.display_type == "WIRE"
+    edges = np.array([edge.vertices for edge in cloud.data.edges])
+    faces = [edge for polygon in cloud.data.polygons for edge in polygon.edge_keys]
+    assert len(faces) == 2 * len(edges), "every edge has two faces"
+    import bmesh
+
+    solid = bmesh.new()
+    solid.from_mesh(cloud.data)
+    assert solid.calc_volume(signed=True) > 4 / 3 * np.pi * 0.9**3, "it is around the ball, its faces outwards"
+    frame, warnings = export()
+    assert not warnings and frame.objects[0].proxy is None, "nothing moves it"
+
+
+def picture(scene) -> np.ndarray:
+    bpy.ops.render.render(write_still=True)
+    return read_exr(scene.render.filepath, 64, 48)
+
+
+def test_an_armature_bends_a_capture_without_a_mesh(scene, cloud, export):
+    """A bone that turns the whole proxy gives the picture of an object that is turned."""
+    scene.render.film_transparent = True
+    new_world(scene)[1].inputs["Color"].default_value = (1, 1, 1, 1)
+    rig = armature_object({"Bone": ((0, 0, -1), (0, 0, 1))})
+    cloud.matrix_world = rig.matrix_world = Matrix.Rotation(0.3, 4, "X")
+    select(cloud)
+    add_proxy()
+    select(rig, cloud)
+    assert bpy.ops.drgs.bind_to_armature() == {"FINISHED"}
+    before = picture(scene)
+    bone = rig.pose.bones["Bone"]
+    bone.rotation_mode, bone.rotation_euler, bone.location = "XYZ", (0, radians(70), 0), (0.3, 0.4, 0)
+    bpy.context.view_layer.update()
+    assert not export()[1]
+    found = picture(scene)
+    turn = bone.matrix @ bone.bone.matrix_local.inverted()
+    bone.rotation_euler = bone.location = (0, 0, 0)
+    cloud.matrix_world = cloud.matrix_world @ turn
+    bpy.context.view_layer.update()
+    want = picture(scene)
+    assert np.abs(found - want).mean() < 0.1 * np.abs(before - want).mean()
+    assert np.abs(before - want).mean() > 0.02
+
+
+def test_viewports_show_them_about_there(cloud, export):
+    select(cloud)
+    add_proxy()
+    twist = cloud.modifiers.new("Twist", "SIMPLE_DEFORM")
+    twist.deform_method, twist.angle, twist.deform_axis = "TWIST", radians(60), "Z"
+    bpy.context.view_layer.update()
+    proxy = export()[0].objects[0].proxy
+    shown = part("addon.proxies").carried(centres(cloud), proxy)
+    low, high = proxy.rest[:, 2].min(), proxy.rest[:, 2].max()
+    angle = radians(60) * ((centres(cloud)[:, 2] - low) / (high - low) - 0.5)
+    x, y, z = centres(cloud).T
+    want = np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y, z], axis=1)
+    assert np.abs(shown - want).max() < 0.06 < np.abs(want - centres(cloud)).max()
+
+
+def test_a_mesh_of_the_artist_is_the_proxy(cloud, export):
+    cage = mesh_object("Body", *sphere(6, 8))
+    cage.matrix_world = cloud.matrix_world
+    bpy.context.view_layer.update()
+    select(cage, cloud)
+    assert bpy.ops.drgs.add_proxy() == {"FINISHED"}
+    assert cage.hide_render and bpy.context.object == cloud
+    own = part("addon.mesh_arrays").read_vertices(cloud.data)
+    np.testing.assert_allclose(own, sphere(6, 8)[0], atol=1e-5)
+    cloud.shape_key_add(name="Basis")
+    key = cloud.shape_key_add(name="Up")
+    for point in key.data:
+        point.co.z += 0.25
+    key.value = 1.0
+    bpy.context.view_layer.update()
+    proxy = export()[0].objects[0].proxy
+    np.testing.assert_allclose(proxy.vertices - proxy.rest, np.tile((0, 0, 0.25), (len(own), 1)), atol=1e-6)
+
+
+def test_modifiers_may_subdivide_a_proxy(cloud, export):
+    """New vertices know where they were: only what moves them counts."""
+    select(cloud)
+    add_proxy()
+    cloud.modifiers.new("Finer", "SUBSURF").subdivision_type = "SIMPLE"
+    bpy.context.view_layer.update()
+    frame, warnings = export()
+    proxy = frame.objects[0].proxy
+    assert not warnings and (proxy is None or np.abs(proxy.vertices - proxy.rest).max() < 1e-5)
+
+
+def test_what_has_a_mesh_or_a_proxy_is_refused(ball, cloud):
+    select(ball)
+    with pytest.raises(RuntimeError, match="can be bent itself"):
+        bpy.ops.drgs.add_proxy()
+    select(cloud)
+    add_proxy()
+    with pytest.raises(RuntimeError, match="has a proxy already"):
+        bpy.ops.drgs.add_proxy()
+
+
+def test_meshes_that_are_no_proxy_are_refused_and_nothing_changes(cloud):
+    far = mesh_object("Far", *sphere(6, 8))
+    far.location = (100, 0, 0)
+    wires = mesh_object("Wires", [(0, 0, 0), (1, 0, 0)], [])
+    bpy.context.view_layer.update()
+    for other, words in ((far, "is not at"), (wires, "has no faces")):
+        select(other, cloud)
+        with pytest.raises(RuntimeError, match=words):
+            bpy.ops.drgs.add_proxy()
+        assert not len(cloud.data.vertices) and not other.hide_render
+
+
+def test_without_a_proxy_binding_says_what_to_do(cloud):
+    select(cloud)
+    with pytest.raises(RuntimeError, match="Add Proxy Mesh"):
+        bpy.ops.drgs.bind_to_lattice()
+
+
+def test_materials_of_a_proxy_are_refused_by_name(cloud):
+    select(cloud)
+    add_proxy()
+    with pytest.raises(RuntimeError, match="Use Adjustments"):
+        bpy.ops.drgs.set_material()
+
+
+def test_a_mask_of_a_proxy_is_told(cloud, export):
+    select(cloud)
+    add_proxy()
+    cloud.drgs.adjustment.saturation = 0.2
+    assert export()[0].objects[0].adjustment is not None and not export()[1]
+    cloud.vertex_groups.new(name="Half")
+    cloud.drgs.adjustment.mask = "Half"
+    frame, warnings = export()
+    assert frame.objects[0].adjustment is None and any('"Half"' in text for text in warnings)
