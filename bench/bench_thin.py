@@ -1,28 +1,34 @@
-"""Thin and open structures: light meets surfels, or a mesh made from them; Cycles judges.
+"""Thin and open structures: light meets surfels, or a mesh made from them; bent by a lattice; Cycles judges.
 
 python bench/bench_thin.py [--size 240] [--subjects plant fur]
 
 A plant of leaves and a ball of fur are made as meshes, which Cycles renders, and as surfels of the same shapes without
-any mesh. The mesh tracer gets what a reconstruction would give it: the surfels' TSDF.
+any mesh. The mesh tracer gets what a reconstruction would give it: the surfels' TSDF. Bent: in Blender one lattice
+bends the meshes, and the proxy mesh that Add Proxy Mesh has put around the surfels.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import subprocess
+import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from judge import cycles_pictures, decibels, environments, frame_camera, systematic_error, to_srgb
+from judge import blender_python, cycles_pictures, decibels, environments, frame_camera, systematic_error, to_srgb
 from ours import pinhole
-from report import OUT, table, write_section
+from report import OUT, ROOT, table, write_section
 from scipy.ndimage import binary_erosion
 
 from drgs_blender.build.proxy import mesh_from_surfels
 from drgs_blender.core.asset import Asset, Mesh, Surfels
 from drgs_blender.core.asset.container import write_asset
-from drgs_blender.core.frame import Frame, MeshState, ObjectState, RenderSettings, World
+from drgs_blender.core.frame import Frame, MeshState, ObjectState, ProxyMesh, RenderSettings, World
 from drgs_blender.core.materials import Material
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.binding import bind
@@ -33,6 +39,9 @@ Array = np.ndarray
 STRENGTH, BOUNCES, AA = 0.35, 3, 16
 GROUND = 0.5
 RESOLUTION = 192
+#: Triangles of proxies.
+FACES = 2000
+FIGURE = ROOT / "docs" / "images" / "proxies.png"
 
 
 def sheets(strips: Array, colours: Array, roughness: float) -> Mesh:
@@ -115,8 +124,46 @@ def with_ground(mesh: Mesh) -> dict[str, Array]:
     }
 
 
+def bent(path: Path, mesh: Mesh) -> tuple[Array, ProxyMesh]:
+    """Vertices of a mesh that a lattice bends in Blender, and the proxy of the asset at `path`, bent by the same."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        np.savez(folder / "mesh.npz", vertices=mesh.vertices, faces=mesh.faces)
+        job = {
+            "asset": str(path), "mesh": str(folder / "mesh.npz"), "faces": FACES, "checkout": str(ROOT),
+            "out": str(folder / "bent.npz"),
+        }  # fmt: skip
+        (folder / "job.json").write_text(json.dumps(job))
+        words = [str(blender_python()), str(ROOT / "bench" / "proxy_job.py"), str(folder / "job.json")]
+        user = {"BLENDER_USER_RESOURCES": str(folder / "user")}
+        subprocess.run(words, check=True, env=os.environ | user, timeout=600)
+        made = np.load(folder / "bent.npz")
+        return made["bent"], ProxyMesh(*(made[key] for key in ("rest", "vertices", "faces")))
+
+
+def judged(name: str, mesh: Mesh, camera: dict[str, Any], options: argparse.Namespace) -> Array:
+    """Two pictures of Cycles of a mesh on the ground."""
+    folder = OUT / "thin"
+    np.savez(folder / f"{name}.npz", **with_ground(mesh))
+    jobs = [
+        {
+            "mesh": str(folder / f"{name}.npz"), "environment": str(environments() / "city.exr"), "camera": camera,
+            "samples": options.spp, "bounces": BOUNCES, "strength": STRENGTH, "terminator_offset": 0.0,
+            "seed": seed, "out": str(folder / f"{name}-cycles-{options.size}-{seed}.npy"),
+        }
+        for seed in range(2)
+    ]  # fmt: skip
+    cycles_pictures(jobs, f"thin-{name}")
+    return np.stack([np.load(job["out"]) for job in jobs])
+
+
 def render(
-    asset: Asset, path: Path, camera: dict[str, Any], options: argparse.Namespace, **settings: Any
+    asset: Asset,
+    path: Path,
+    camera: dict[str, Any],
+    options: argparse.Namespace,
+    proxy: ProxyMesh | None = None,
+    **settings: Any,
 ) -> tuple[Array, Array, float]:
     """Our pictures with two seeds, where the subject is, processor seconds of the second."""
     write_asset(path, asset)
@@ -124,7 +171,7 @@ def render(
     key = session.load_asset(path)
     world = World(read_environment(environments() / "city.exr").radiance, strength=STRENGTH)
     how = RenderSettings(options.samples, bounces=BOUNCES, subpixel_samples=AA, film_transparent=True, **settings)
-    subject = ObjectState("subject", key, pass_index=1)
+    subject = ObjectState("subject", key, pass_index=1, proxy=proxy)
     frame = Frame(1, pinhole(camera), [subject], world, how, ("Combined", "IndexOB"), [ground()])
     pictures = []
     for seed in range(2):  # kernels are loaded, and trees built, by the first
@@ -145,22 +192,12 @@ def main() -> None:
     options = parser.parse_args()
     folder = OUT / "thin"
     folder.mkdir(parents=True, exist_ok=True)
-    rows = []
+    rows, figure = [], []
     for name in options.subjects:
         mesh = SUBJECTS[name]()
         surfels = surfels_of(name, mesh)
         camera = frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.9)
-        np.savez(folder / f"{name}.npz", **with_ground(mesh))
-        jobs = [
-            {
-                "mesh": str(folder / f"{name}.npz"), "environment": str(environments() / "city.exr"), "camera": camera,
-                "samples": options.spp, "bounces": BOUNCES, "strength": STRENGTH, "terminator_offset": 0.0,
-                "seed": seed, "out": str(folder / f"{name}-cycles-{options.size}-{seed}.npy"),
-            }
-            for seed in range(2)
-        ]  # fmt: skip
-        cycles_pictures(jobs, f"thin-{name}")
-        theirs = np.stack([np.load(job["out"]) for job in jobs])
+        theirs = judged(name, mesh, camera, options)
         began = time.process_time()
         made, _ = mesh_from_surfels(surfels, resolution=RESOLUTION)
         n = len(made.vertices)
@@ -168,30 +205,41 @@ def main() -> None:
         fused = Mesh(made.vertices, made.faces, albedo, np.full(n, surfels.roughness[0]), np.zeros(n))
         binding, _ = bind(fused, surfels)
         making = time.process_time() - began
-        found = {
-            "surfels": render(
-                Asset(surfels, Mesh.empty()), folder / f"{name}.drgs", camera, options, rays_see="surfels"
-            ),
-            "TSDF": render(Asset(surfels, fused, binding), folder / f"{name}-tsdf.drgs", camera, options),
-        }
-        save(folder / f"{name}.png", [theirs.mean(0), *(ours.mean(0) for ours, _, _ in found.values())])
-        for tracer, (ours, subject, seconds) in found.items():
-            parts = [binary_erosion(subject), binary_erosion(~subject & (theirs[0, ..., 3] > 0.999))]
-            errors = [decibels(systematic_error(ours, theirs, part)[0]) for part in parts]
+        alone, path = Asset(surfels, Mesh.empty()), folder / f"{name}.drgs"
+        write_asset(path, alone)
+        vertices, proxy = bent(path, mesh)
+        moved = replace(mesh, vertices=vertices)
+        beside = frame_camera(vertices, options.size, azimuth=-60, fill=0.9)
+        then = judged(f"{name}-bent", moved, beside, options)
+        met = {"rays_see": "surfels"}
+        found = [
+            ("at rest", "surfels", theirs, render(alone, path, camera, options, **met)),
+            ("at rest", "TSDF", theirs, render(Asset(surfels, fused, binding), folder / "tsdf.drgs", camera, options)),
+            ("bent", "surfels", then, render(alone, path, beside, options, proxy, **met)),
+        ]
+        save(
+            folder / f"{name}.png", [picture.mean(0) for _, _, true, (ours, _, _) in found for picture in (true, ours)]
+        )
+        for pose, tracer, true, (ours, subject, seconds) in found:
+            parts = [binary_erosion(subject), binary_erosion(~subject & (true[0, ..., 3] > 0.999))]
+            errors = [decibels(systematic_error(ours, true, part)[0]) for part in parts]
             rows.append(
-                (name, len(surfels), tracer, *(f"{x:.1f}" for x in errors), f"{seconds:.1f}",
+                (name, len(surfels), pose, tracer, *(f"{x:.1f}" for x in errors), f"{seconds:.1f}",
                  f"{making:.0f}" if tracer == "TSDF" else "-")
             )  # fmt: skip
     body = (
         f"{options.size}x{options.size}, city.exr, {BOUNCES} indirect bounces, {options.samples} samples, {AA} "
         f"sub-pixel samples, against "
         f"Cycles on the sheets themselves with {options.spp} spp. *surfels*: no mesh, `--rays-see surfels`. *TSDF*: "
-        f"`--rays-see mesh` with the mesh fused from the surfels at {RESOLUTION} voxels. PSNR in sRGB without the "
-        f"noise "
+        f"`--rays-see mesh` with the mesh fused from the surfels at {RESOLUTION} voxels. Bent: by a lattice of "
+        f"Blender, the surfels by a proxy of about {FACES} triangles. PSNR in sRGB without the noise "
         "of either, inside the subject and on the ground around it; processor seconds of a frame, and of making and "
         "binding that mesh.\n\n"
-        + table(("Subject", "Surfels", "Light meets", "Subject dB", "Ground dB", "CPU s", "Mesh CPU s"), rows)
+        f"![Of each subject at rest and bent: Cycles, and surfels](images/{FIGURE.name})\n\n"
+        + table(("Subject", "Surfels", "Pose", "Light meets", "Subject dB", "Ground dB", "CPU s", "Mesh CPU s"), rows)
     )
+    if len(figure) == len(SUBJECTS):
+        save(FIGURE, [np.concatenate(figure)])
     write_section("thin", "Thin and open structures", body)
 
 

@@ -31,7 +31,9 @@ class DRGS_OT_add_proxy(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
     bl_label = "Add Proxy Mesh"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
-    faces: IntProperty(name="Faces", description="Triangles of a new proxy, about", min=50, soft_max=10000, default=2000)
+    faces: IntProperty(
+        name="Faces", description="Triangles of a new proxy, about", min=50, soft_max=10000, default=2000
+    )
 
     def run(self, context: bpy.types.Context) -> set[str]:
         objects = selection.editable(selection.selected(context), vertices=False, data=True)
@@ -79,7 +81,9 @@ def shape_of(proxy: bpy.types.Object, obj: bpy.types.Object, context: bpy.types.
     vertices = world @ into[:3, :3].T + into[:3, 3]
     centre = assets.load(assets.file_of(obj)).surfels.centre
     size = float(np.ptp(centre, axis=0).max())
-    if (vertices.min(axis=0) > centre.max(axis=0) + size).any() or (vertices.max(axis=0) < centre.min(axis=0) - size).any():
+    if (vertices.min(axis=0) > centre.max(axis=0) + size).any() or (
+        vertices.max(axis=0) < centre.min(axis=0) - size
+    ).any():
         raise UsageError(f'Object "{proxy.name}"', f'is not at "{obj.name}"', "Move it over the capture, as its shape")
     return vertices, triangles
 
@@ -100,7 +104,9 @@ def hull_of(context: bpy.types.Context, obj: bpy.types.Object, faces: int) -> tu
         selection.add_modifier(made, "SMOOTH", "SMOOTH", factor=0.5, iterations=4)
         apply_modifiers(context, made)
         count = max(len(mesh_arrays.loop_triangles(made.data)), 1)
-        selection.add_modifier(made, "DECIMATE", "DECIMATE", ratio=min(1.0, faces / count), use_collapse_triangulate=True)
+        selection.add_modifier(
+            made, "DECIMATE", "DECIMATE", ratio=min(1.0, faces / count), use_collapse_triangulate=True
+        )
         apply_modifiers(context, made)
         clean(made.data, 1e-4 * side)
         found = mesh_arrays.read_vertices(made.data).astype(np.float64), mesh_arrays.loop_triangles(made.data)

@@ -165,8 +165,7 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
         if proxies.is_proxy(mesh, asset):
             fit = _without_removed(Fit(), obj, asset, depsgraph)
             adjustment = None if captured else _adjustment_of_all(obj, warn)
-            given = {"part": fit.part, "adjustment": adjustment, "proxy": proxies.read(mesh)}
-            return ObjectState(name=obj.name, asset=key_of(path), **given)
+            return ObjectState(obj.name, key_of(path), part=fit.part, adjustment=adjustment, proxy=proxies.read(mesh))
         point_caches.check(obj, asset.mesh, warn, final=depsgraph.mode == "RENDER")
         fit = _without_removed(check_topology(obj, mesh, asset.mesh, warn), obj, asset, depsgraph)
         vertices = mesh_arrays.read_vertices(mesh)

@@ -2,13 +2,13 @@
 
 The displacements u of the lattice's nodes minimise
 
-    sum_v |u(X_v) - d_v|^2 + s sum |D2 u|^2 + a sum_v |u(X_v + h N_v) - (x_v + h n_v - X_v - h N_v)|^2,
+    sum_v |u(X_v) - d_v|^2 + s sum |D2 u|^2 + a sum_v |u(X_v + h N_v) - d_v - h (n_v - N_v)|^2,
 
-u being trilinear between nodes, d_v the displacements of the points, D2 all second differences along axes and across the
-faces of cells, N and n the unit normals at rest and now. As second differences of affine maps are 0, these are followed
-exactly; between and beside the points space bends as little as it can. The last term, of little weight, says how space
-turns where all points lie in a sheet. Cells are only where points are or what they carry is, so that parts that are
-near each other, as leaves, are apart.
+u being trilinear between nodes, d_v the displacements of the points, D2 all second differences along axes and across
+the faces of cells, N and n the unit normals at rest and now. As second differences of affine maps are 0, these are
+followed exactly; between and beside the points space bends as little as it can. The last term, of little weight, says
+how space turns where all points lie in a sheet. Cells are only where points are or what they carry is, so that parts
+that are near each other, as leaves, are apart.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class LatticeFit:
     def particles(self, vertices: Array) -> Particles:
         """The nodes where the points are `vertices`, (v, 3), metres; not finite where one of these is not."""
         now = np.asarray(vertices, np.float64)
-        lost = ~np.isfinite(now).all(axis=1)
+        lost: Array = ~np.isfinite(now).all(axis=1)
         now = np.where(lost[:, None], self._rest, now)
         moved = self._solve(self._data @ np.concatenate([now - self._rest, self._beside(now) - self._rest_beside]))
         slopes = np.stack([difference @ moved for difference in self._differences], axis=2)
@@ -106,7 +106,7 @@ class LatticeFit:
             self._shape = np.ceil(extent / self._side).astype(int) + 6
             cells = np.zeros(self._shape, bool)
             cells[tuple(self._cell(every).T)] = True
-            with_points = np.zeros(self._shape, bool)
+            with_points: Array = np.zeros(self._shape, bool)
             with_points[tuple(self._cell(rest).T)] = True
             cells = ndimage.binary_dilation(cells)
             while True:  # all that is carried is joined to points
@@ -180,7 +180,9 @@ class LatticeFit:
         from scipy import sparse
 
         rows = np.repeat(np.arange(len(nodes)), len(values))
-        return sparse.csr_matrix((np.tile(values, len(nodes)), (rows, nodes.reshape(-1))), (len(nodes), len(self._place)))
+        return sparse.csr_matrix(
+            (np.tile(values, len(nodes)), (rows, nodes.reshape(-1))), (len(nodes), len(self._place))
+        )
 
     def _mean_difference(self, axis: int):  # type: ignore[no-untyped-def]
         """Sparse (s, s): the mean slope of the edges along `axis` at each node."""

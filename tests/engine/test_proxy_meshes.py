@@ -82,7 +82,7 @@ def test_a_sheet_turns_what_lies_beside_it(session, frame):
     axis = np.linspace(-1.1, 1.1, 12)
     rest = np.stack([*np.meshgrid(axis, axis), np.zeros((12, 12))], -1).reshape(-1, 3).astype(np.float32)
     first = (12 * np.arange(11)[:, None] + np.arange(11)).reshape(-1, 1)
-    faces = np.concatenate([first + (0, 1, 13), first + (0, 13, 12)]).astype(np.int32)
+    faces = np.concatenate([first + np.array((0, 1, 13)), first + np.array((0, 13, 12))]).astype(np.int32)
     turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     before = posed(session, frame).centre.copy()
     found = posed(session, frame, proxy=ProxyMesh(rest, np.array(rest @ turn.T, np.float32), faces)).centre
@@ -101,7 +101,7 @@ def test_two_leaves_near_each_other_move_apart(session, frame, tmp_path):
     from drgs_blender.core.asset.container import read_asset
 
     leaf = trimesh.creation.box((2.0, 0.5, 0.02)).subdivide().subdivide().subdivide()
-    rest = np.concatenate([leaf.vertices, leaf.vertices + (0, 0, 0.3)]).astype(np.float32)
+    rest = np.concatenate([leaf.vertices, leaf.vertices + np.array((0, 0, 0.3))]).astype(np.float32)
     faces = np.concatenate([leaf.faces, leaf.faces + len(leaf.vertices)]).astype(np.int32)
     upper = np.arange(len(rest)) >= len(leaf.vertices)
     asset = read_asset(Path(frame.objects[0].asset))
@@ -112,7 +112,7 @@ def test_two_leaves_near_each_other_move_apart(session, frame, tmp_path):
     path = tmp_path / "leaves.drgs"
     write_asset(path, Asset(replace(asset.surfels, centre=centre), Mesh.empty()))
     frame.objects[0].asset = session.load_asset(path)
-    now = np.where(upper[:, None], rest + (0, 0, 0.5), rest).astype(np.float32)
+    now = np.where(upper[:, None], rest + np.array((0, 0, 0.5)), rest).astype(np.float32)
     found = posed(session, frame, proxy=ProxyMesh(rest, now, faces)).centre
     assert np.abs(found[~above] - centre[~above]).max() < 1e-4
     assert np.abs(found[above] - centre[above] - (0, 0, 0.5)).max() < 1e-4
