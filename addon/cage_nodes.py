@@ -7,6 +7,8 @@ moved, turned and scaled as a whole does exactly that to the object.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import bpy
 import numpy as np
 from mathutils.kdtree import KDTree
@@ -19,6 +21,8 @@ Array = np.ndarray
 FACES = 6
 #: Point attributes, one for each of them: its corners in the cage, their weights, and that of the normal.
 CORNERS, WEIGHTS, HEIGHT = (f"drgs_cage_{what}_{{}}" for what in ("corners", "weights", "height"))
+#: Property of the mesh: the points of what carries it, when it was bound.
+COUNT = "drgs_cage_points"
 #: Name of the node that knows the cage.
 SOURCE = "DR-GS Cage"
 
@@ -26,6 +30,27 @@ SOURCE = "DR-GS Cage"
 def cage_of(modifier: bpy.types.Modifier) -> bpy.types.Object | None:
     """The mesh that carries an object by a modifier of `carry`; None of other modifiers."""
     return _known(modifier.node_group) if modifier.type == "NODES" and modifier.node_group is not None else None
+
+
+def check(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, warn: Callable[[str], None]) -> None:
+    """Warn where what carries an evaluated object by nodes has another number of points than when it was bound."""
+    bound = obj.original.data.get(COUNT)
+    for modifier in obj.original.modifiers:
+        cage = cage_of(modifier)
+        shown = modifier.show_render if depsgraph.mode == "RENDER" else modifier.show_viewport
+        if cage is None or bound is None or not shown:
+            continue
+        found = count_of(cage.evaluated_get(depsgraph))
+        if found != bound:
+            warn(
+                f'"{obj.name}": "{cage.name}", which carries it, has {found} points and had {bound} when it was bound, '
+                "so it does not follow. Keep their number, or bind again"
+            )
+
+
+def count_of(cage: bpy.types.Object) -> int:
+    """Points of an evaluated mesh or point cloud."""
+    return len(cage.data.points if cage.type == "POINTCLOUD" else cage.data.vertices)
 
 
 def _known(tree: bpy.types.NodeTree) -> bpy.types.Object | None:
@@ -42,10 +67,11 @@ def carry(obj: bpy.types.Object, cage: bpy.types.Object, modifier: bpy.types.Mod
     vertices = mesh_arrays.read_vertices(shape) @ into[:3, :3].T + into[:3, 3]
     corners, weights, heights = frames(points, vertices, mesh_arrays.loop_triangles(shape))
     for i in range(FACES):
-        _write(obj.data, CORNERS.format(i), "FLOAT_VECTOR", corners[:, i])
-        _write(obj.data, WEIGHTS.format(i), "FLOAT_VECTOR", weights[:, i])
-        _write(obj.data, HEIGHT.format(i), "FLOAT", heights[:, i])
-    trees = (t for t in bpy.data.node_groups if t.library is None and _known(t) == cage)
+        write(obj.data, CORNERS.format(i), "FLOAT_VECTOR", corners[:, i])
+        write(obj.data, WEIGHTS.format(i), "FLOAT_VECTOR", weights[:, i])
+        write(obj.data, HEIGHT.format(i), "FLOAT", heights[:, i])
+    obj.data[COUNT] = len(vertices)
+    trees = (t for t in bpy.data.node_groups if t.library is None and t.name.startswith(SOURCE) and _known(t) == cage)
     modifier.node_group = next(trees, None) or _tree(cage)
 
 
@@ -90,27 +116,27 @@ def frames(points: Array, vertices: Array, triangles: Array) -> tuple[Array, Arr
     )
 
 
-def _write(mesh: bpy.types.Mesh, name: str, kind: str, values: Array) -> None:
+def write(mesh: bpy.types.Mesh, name: str, kind: str, values: Array) -> None:
     if (old := mesh.attributes.get(name)) is not None:
         mesh.attributes.remove(old)
     attribute = mesh.attributes.new(name, kind, "POINT")
     attribute.data.foreach_set("vector" if kind == "FLOAT_VECTOR" else "value", values.astype(np.float32).ravel())
 
 
-class _Builder:
+class Builder:
     """Adds nodes to a tree; what is linked to an input is a socket or a value."""
 
     def __init__(self, tree: bpy.types.NodeTree) -> None:
-        self._tree = tree
+        self.tree = tree
 
     def node(self, kind: str, *inputs: object, **values: object) -> bpy.types.Node:
         """A node with `values` whose inputs, in their order, are linked or set."""
-        node = self._tree.nodes.new(kind)
+        node = self.tree.nodes.new(kind)
         for name, value in values.items():
             setattr(node, name, value)
         for socket, given in zip([s for s in node.inputs if s.enabled], inputs):
             if isinstance(given, bpy.types.NodeSocket):
-                self._tree.links.new(given, socket)
+                self.tree.links.new(given, socket)
             elif given is not None:
                 socket.default_value = given
         return node
@@ -126,7 +152,7 @@ class _Builder:
     def scaled(self, vector: bpy.types.NodeSocket, factor: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """`vector` times the number `factor`."""
         node = self.node("ShaderNodeVectorMath", vector, operation="SCALE")
-        self._tree.links.new(factor, node.inputs["Scale"])
+        self.tree.links.new(factor, node.inputs["Scale"])
         return node.outputs["Vector"]
 
     def attribute(self, name: str, kind: str) -> bpy.types.NodeSocket:
@@ -140,17 +166,7 @@ class _Builder:
 
 def _tree(cage: bpy.types.Object) -> bpy.types.NodeTree:
     """Nodes that bring each vertex to the mean of where its faces are on `cage` now."""
-    tree = bpy.data.node_groups.new(f"{SOURCE} {cage.name}", "GeometryNodeTree")
-    tree.is_modifier = True
-    for direction in ("INPUT", "OUTPUT"):
-        tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
-    build = _Builder(tree)
-    source = build.node("GeometryNodeObjectInfo", cage, transform_space="RELATIVE", name=SOURCE)
-    position, shape = build.out("GeometryNodeInputPosition"), source.outputs["Geometry"]
-
-    def place(index: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        return build.out("GeometryNodeSampleIndex", shape, position, index, data_type="FLOAT_VECTOR", domain="POINT")
-
+    build, place = begin(f"{SOURCE} {cage.name}", cage)
     total = None
     for i in range(FACES):
         corners = [place(index) for index in build.parts(build.attribute(CORNERS.format(i), "FLOAT_VECTOR"))]
@@ -163,9 +179,36 @@ def _tree(cage: bpy.types.Object) -> bpy.types.NodeTree:
         terms = [build.scaled(build.vector("NORMALIZE", cross), height), *map(build.scaled, corners, weights)]
         for term in terms:
             total = term if total is None else build.vector("ADD", total, term)
+    assert total is not None
+    return end(build, total)
+
+
+#: Gives the place of the point of an index.
+Place = Callable[[bpy.types.NodeSocket], bpy.types.NodeSocket]
+
+
+def begin(name: str, carrier: bpy.types.Object) -> tuple[Builder, Place]:
+    """A new tree of nodes for a modifier, and how it asks where points of `carrier` are."""
+    tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
+    tree.is_modifier = True
+    for direction in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
+    build = Builder(tree)
+    source = build.node("GeometryNodeObjectInfo", carrier, transform_space="RELATIVE", name=SOURCE)
+    position, shape = build.out("GeometryNodeInputPosition"), source.outputs["Geometry"]
+
+    def place(index: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        return build.out("GeometryNodeSampleIndex", shape, position, index, data_type="FLOAT_VECTOR", domain="POINT")
+
+    return build, place
+
+
+def end(build: Builder, places: bpy.types.NodeSocket) -> bpy.types.NodeTree:
+    """The tree, which brings each vertex to one of `places`."""
+    tree = build.tree
     given, result = tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
     moved = tree.nodes.new("GeometryNodeSetPosition")
     tree.links.new(given.outputs[0], moved.inputs["Geometry"])
-    tree.links.new(total, moved.inputs["Position"])
+    tree.links.new(places, moved.inputs["Position"])
     tree.links.new(moved.outputs["Geometry"], result.inputs[0])
     return tree

@@ -217,9 +217,9 @@ def main() -> None:
             ("at rest", "TSDF", theirs, render(Asset(surfels, fused, binding), folder / "tsdf.drgs", camera, options)),
             ("bent", "surfels", then, render(alone, path, beside, options, proxy, **met)),
         ]
-        save(
-            folder / f"{name}.png", [picture.mean(0) for _, _, true, (ours, _, _) in found for picture in (true, ours)]
-        )
+        pairs = [(true.mean(0), ours.mean(0)) for _, _, true, (ours, _, _) in found]
+        save(folder / f"{name}.png", [picture for pair in pairs for picture in pair])
+        figure.append(np.concatenate([picture for pair in pairs[::2] for picture in pair], axis=1))
         for pose, tracer, true, (ours, subject, seconds) in found:
             parts = [binary_erosion(subject), binary_erosion(~subject & (true[0, ..., 3] > 0.999))]
             errors = [decibels(systematic_error(ours, true, part)[0]) for part in parts]

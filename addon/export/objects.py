@@ -17,7 +17,7 @@ from ...drgs_blender.core.errors import first_of
 from ...drgs_blender.core.frame import Adjustment, ObjectState, ProxyMesh
 from ...drgs_blender.core.materials import ShaderAOV
 from ...drgs_blender.core.passes import Pass
-from .. import assets, cache_playback, mesh_arrays, point_caches, proxies, surfel_points
+from .. import assets, cache_playback, cage_nodes, mesh_arrays, point_caches, proxies, surfel_points
 from ..viewport_material import is_viewport_material, painted_images
 from .aov_nodes import aov_values
 from .export_cache import ExportCache, uid
@@ -87,6 +87,7 @@ class DrgsObjects:
             return
         if obj.original.data.attributes.get(proxies.REST) is None:
             check_modifiers(obj, self._depsgraph)
+        cage_nodes.check(obj, self._depsgraph, self._warn)
         cache_playback.check(obj, self._warn, final=self._depsgraph.mode == "RENDER")
         appearance = (
             obj.drgs.show_captured, obj.drgs.adjustment.values(), *cache_playback.fracture_state(obj).items(),

@@ -60,13 +60,14 @@ def _bind(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     if obj is None:
         return
     if not len(obj.data.vertices):
-        layout.operator("drgs.add_proxy", icon="MOD_MESHDEFORM")
+        layout.operator("drgs.add_proxy", icon="MESH_ICOSPHERE")
         return
     grid = layout.grid_flow(columns=2, align=True, even_columns=True)
     grid.operator("drgs.bind_to_rig", text="Transfer Rig", icon="OUTLINER_OB_ARMATURE")
     grid.operator("drgs.bind_to_armature", text="Armature", icon="ARMATURE_DATA")
     grid.operator("drgs.bind_to_lattice", text="Lattice", icon="LATTICE_DATA")
     grid.operator("drgs.bind_to_cage", text="Cage", icon="MESH_ICOSPHERE")
+    layout.operator("drgs.drive_from", icon="MOD_MESHDEFORM")
 
 
 def _pose(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

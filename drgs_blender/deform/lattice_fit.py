@@ -78,7 +78,7 @@ class LatticeFit:
     def particles(self, vertices: Array) -> Particles:
         """The nodes where the points are `vertices`, (v, 3), metres; not finite where one of these is not."""
         now = np.asarray(vertices, np.float64)
-        lost: Array = ~np.isfinite(now).all(axis=1)
+        lost = np.logical_not(np.isfinite(now).all(axis=1))
         now = np.where(lost[:, None], self._rest, now)
         moved = self._solve(self._data @ np.concatenate([now - self._rest, self._beside(now) - self._rest_beside]))
         slopes = np.stack([difference @ moved for difference in self._differences], axis=2)

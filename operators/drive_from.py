@@ -1,0 +1,104 @@
+"""Drive From: anything that deforms carries DR-GS objects: meshes, cloth, points, caches, particle systems."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from ..addon import assets, cage_nodes, point_nodes
+from ..drgs_blender.core.errors import UsageError
+from . import selection
+from .base import DrgsOperator
+
+NAME = "DR-GS Driver"
+#: What can carry others, as it is evaluated.
+KINDS = "MESH", "POINTCLOUD"
+
+
+class DRGS_OT_drive_from(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
+    """Let the other object that is selected carry the selected DR-GS objects, from where both are now: a mesh (also cloth, soft bodies, caches), points, or the particles of a system. It stays as it is"""  # noqa: E501
+
+    bl_idname = "drgs.drive_from"
+    bl_label = "Drive From Selected"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    source: bpy.props.EnumProperty(
+        name="From",
+        description="What of the other object carries",
+        items=(
+            ("GEOMETRY", "Geometry", "Its faces, or its points where it has no faces, with all modifiers"),
+            ("PARTICLES", "Particles", "The particles of its particle system; a mesh of a point for each is added"),
+        ),
+        default="GEOMETRY",
+    )
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        objects = selection.editable(selection.selected(context), data=True)
+        others = [o for kind in KINDS for o in selection.of_type(context.selected_objects, kind)]
+        if len(others) != 1:
+            problem = f"holds {len(others)} objects that could carry it" if others else "has nothing that carries it"
+            raise UsageError("Selection", problem, "Select one mesh or point cloud too")
+        (carrier,) = others
+        for obj in objects:
+            selection.check_size(obj)
+            if obj.data.users > 1:
+                raise UsageError(
+                    f'Object "{obj.name}"',
+                    f'shares its mesh "{obj.data.name}" with others, which are elsewhere',
+                    "Choose Object > Relations > Make Single User > Object & Data",
+                )
+        made = particles_of(context, carrier) if self.source == "PARTICLES" else None
+        try:
+            drive(context, objects, carrier if made is None else made)
+        except UsageError:
+            if made is not None:
+                bpy.data.meshes.remove(made.data)  # and the object
+            raise
+        selection.select_only(context, objects, objects[-1])
+        return {"FINISHED"}
+
+
+def drive(context: bpy.types.Context, objects: list[bpy.types.Object], carrier: bpy.types.Object) -> None:
+    """Let `carrier` carry `objects`: by its faces, or its points where it has none.
+
+    Raises
+    ------
+    UsageError
+        It has no points, or they are nowhere; nothing has been changed then.
+    """
+    context.view_layer.update()
+    evaluated = carrier.evaluated_get(context.evaluated_depsgraph_get())
+    selection.in_world(carrier, point_nodes.read_points(evaluated))
+    faces = carrier.type == "MESH" and any(p.area > 0 for p in evaluated.data.polygons)
+    for obj in objects:
+        modifier = selection.add_modifier(obj, "NODES", NAME)
+        context.view_layer.update()
+        (cage_nodes if faces else point_nodes).carry(obj, carrier, modifier)
+    context.view_layer.update()
+
+
+def particles_of(context: bpy.types.Context, emitter: bpy.types.Object) -> bpy.types.Object:
+    """A mesh with a vertex for each particle of the active system of `emitter`, born or not.
+
+    Raises
+    ------
+    UsageError
+        It has none.
+    """
+    system = emitter.particle_systems.active if emitter.type == "MESH" else None
+    if system is None:
+        raise UsageError(f'Object "{emitter.name}"', "has no particle system", "Add one, or choose From: Geometry")
+    mesh = bpy.data.meshes.new(f"{emitter.name} particles")
+    mesh.from_pydata([(0.0, 0.0, 0.0)], [], [])
+    points = bpy.data.objects.new(mesh.name, mesh)
+    assets.collection(context).objects.link(points)
+    index = int(np.flatnonzero([s == system for s in emitter.particle_systems])[0]) + 1
+    selection.add_modifier(
+        points, "PARTICLE_INSTANCE", "Particles", object=emitter, particle_system_index=index, use_normal=True,
+        show_unborn=True, show_alive=True, show_dead=True, use_path=False, space="WORLD",
+    )  # fmt: skip
+    points.hide_render = True
+    return points
+
+
+CLASSES = (DRGS_OT_drive_from,)

@@ -1,0 +1,151 @@
+"""Drive From: other objects carry DR-GS objects, whatever they are made of; what cannot is refused or told."""
+
+from __future__ import annotations
+
+from math import radians
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Matrix
+from scenes import mesh_object, part, select, sphere
+
+pytestmark = pytest.mark.blender_api
+
+
+def drive(obj, carrier, source="GEOMETRY"):
+    select(carrier, obj)
+    assert bpy.ops.drgs.drive_from(source=source) == {"FINISHED"}
+    assert bpy.context.object == obj
+
+
+def world(obj) -> np.ndarray:
+    bpy.context.view_layer.update()
+    evaluated = obj.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    matrix = np.array(evaluated.matrix_world)
+    return part("addon.mesh_arrays").read_vertices(evaluated.data) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def cloud_of(points):
+    """An object of points alone: vertices without faces."""
+    return mesh_object("Points", points, [])
+
+
+def grid(count=5, size=1.2):
+    axis = np.linspace(-size, size, count)
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+
+
+AFFINE = Matrix(((1.2, 0.3, 0, 0.4), (-0.2, 0.9, 0.1, -0.1), (0, 0.2, 0.8, 0.3), (0, 0, 0, 1)))
+
+
+@pytest.mark.parametrize("points", [grid(), grid()[:, :2] @ np.eye(2, 3), grid(2)[:1]], ids=["solid", "sheet", "one"])
+def test_nothing_moves_when_it_is_bound(ball, points):
+    ball.matrix_world = Matrix.Translation((2, 0, 1)) @ Matrix.Rotation(0.5, 4, "X")
+    carrier = cloud_of(points)
+    carrier.matrix_world = Matrix.Translation((2.1, 0, 1)) @ Matrix.Rotation(0.2, 4, "Z")
+    bpy.context.view_layer.update()
+    before = world(ball)
+    drive(ball, carrier)
+    np.testing.assert_allclose(world(ball), before, atol=2e-6)
+
+
+def test_points_that_move_affinely_carry_it_alike(ball):
+    carrier = cloud_of(grid())
+    before = world(ball)
+    drive(ball, carrier)
+    carrier.data.transform(AFFINE)
+    matrix = np.array(AFFINE)
+    np.testing.assert_allclose(world(ball), before @ matrix[:3, :3].T + matrix[:3, 3], atol=2e-4)
+
+
+def test_a_point_cloud_of_nodes_carries_it(ball):
+    """What nodes make of a mesh may be a cloud: its points count."""
+    carrier = cloud_of(grid())
+    tree = bpy.data.node_groups.new("To Points", "GeometryNodeTree")
+    for direction in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
+    given, result = tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
+    move = tree.nodes.new("GeometryNodeSetPosition")
+    tree.links.new(given.outputs[0], move.inputs["Geometry"])
+    tree.links.new(move.outputs[0], result.inputs[0])
+    carrier.modifiers.new("Move", "NODES").node_group = tree
+    before = world(ball)
+    drive(ball, carrier)
+    move.inputs["Offset"].default_value = (0, 0, 0.7)
+    np.testing.assert_allclose(world(ball) - before, np.tile((0, 0, 0.7), (len(before), 1)), atol=1e-5)
+
+
+def test_a_body_of_other_faces_carries_it_and_stays_as_it_is(ball):
+    body = mesh_object("Body", *sphere(6, 9))
+    before = world(ball)
+    drive(ball, body)
+    assert not body.hide_render and body.display_type == "TEXTURED"
+    body.rotation_euler = (0, 0, radians(40))
+    turn = np.array(Matrix.Rotation(radians(40), 3, "Z"))
+    np.testing.assert_allclose(world(ball), before @ turn.T, atol=1e-4)
+
+
+def test_cloth_carries_it(ball, scene):
+    """A cloth that falls takes it along."""
+    size = np.linspace(-1.2, 1.2, 8)
+    vertices = np.stack([*np.meshgrid(size, size), np.zeros((8, 8))], -1).reshape(-1, 3)
+    quads = [(8 * i + j, 8 * i + j + 1, 8 * i + j + 9, 8 * i + j + 8) for i in range(7) for j in range(7)]
+    cloth = mesh_object("Cloth", vertices, quads)
+    cloth.modifiers.new("Cloth", "CLOTH")
+    scene.frame_set(1)
+    before = world(ball)
+    drive(ball, cloth)
+    for frame in range(1, 12):
+        scene.frame_set(frame)
+    moved = world(cloth)[:, 2].mean()
+    assert moved < -0.1
+    assert abs((world(ball) - before)[:, 2].mean() - moved) < 0.05 * abs(moved)
+
+
+def test_particles_of_a_system_carry_it(ball, scene):
+    emitter = mesh_object("Emitter", *sphere(8, 12))
+    emitter.modifiers.new("Particles", "PARTICLE_SYSTEM")
+    settings = emitter.particle_systems[0].settings
+    settings.count, settings.frame_start, settings.frame_end, settings.lifetime = 200, 1, 1, 100
+    settings.normal_factor, settings.effector_weights.gravity = 0.0, 1.0
+    for frame in (1, 2):
+        scene.frame_set(frame)
+    before = world(ball)
+    drive(ball, emitter, "PARTICLES")
+    points = bpy.data.objects["Emitter particles"]
+    assert points.hide_render and len(world(points)) == 200
+    start = world(points)[:, 2].mean()
+    for frame in range(3, 12):
+        scene.frame_set(frame)
+    moved = world(points)[:, 2].mean() - start
+    assert moved < -0.1
+    assert abs((world(ball) - before)[:, 2].mean() - moved) < 0.03 * abs(moved)
+
+
+def test_another_number_of_points_is_told(ball, export):
+    carrier = cloud_of(grid())
+    drive(ball, carrier)
+    assert not any("when it was bound" in text for text in export()[1])
+    carrier.data.clear_geometry()
+    carrier.data.from_pydata(grid(4).tolist(), [], [])
+    bpy.context.view_layer.update()
+    assert any('"Points"' in text and "has 64 points and had 125" in text for text in export()[1])
+
+
+def test_what_cannot_carry_is_refused_and_nothing_changes(ball):
+    empty = mesh_object("Nothing", [], [])
+    broken = cloud_of([(0, 0, 0), (np.nan, 0, 0)])
+    plain = mesh_object("Plain", *sphere(4, 6))
+    for carrier, source, words in (
+        (empty, "GEOMETRY", "has no points"),
+        (broken, "GEOMETRY", "not finite"),
+        (plain, "PARTICLES", "has no particle system"),
+    ):
+        select(carrier, ball)
+        with pytest.raises(RuntimeError, match=words):
+            bpy.ops.drgs.drive_from(source=source)
+        assert not len(ball.modifiers) and "Plain particles" not in bpy.data.objects
+    select(ball)
+    with pytest.raises(RuntimeError, match="nothing that carries"):
+        bpy.ops.drgs.drive_from()
