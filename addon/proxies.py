@@ -44,8 +44,7 @@ def read(mesh: bpy.types.Mesh) -> ProxyMesh | None:
 
     Vertices of no face are left out where there are faces.
     """
-    rest = np.empty((len(mesh.vertices), 3), np.float32)
-    mesh.attributes[REST].data.foreach_get("vector", rest.ravel())
+    rest = read_rest(mesh)
     vertices, faces = mesh_arrays.read_vertices(mesh), mesh_arrays.loop_triangles(mesh)
     if len(faces):
         used, faces = np.unique(faces, return_inverse=True)
@@ -56,6 +55,13 @@ def read(mesh: bpy.types.Mesh) -> ProxyMesh | None:
     for array in (rest, vertices, faces):
         array.flags.writeable = False  # so that the engine's client need not copy it
     return ProxyMesh(rest, vertices, faces)
+
+
+def read_rest(mesh: bpy.types.Mesh) -> Array:
+    """(n, 3) float32 places of the vertices of a proxy at rest."""
+    rest = np.empty((len(mesh.vertices), 3), np.float32)
+    mesh.attributes[REST].data.foreach_get("vector", rest.ravel())
+    return rest
 
 
 class _Parts(NamedTuple):

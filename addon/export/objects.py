@@ -165,8 +165,12 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     with _readable(obj, depsgraph) as mesh:
         if proxies.is_proxy(mesh, asset):
             fit = _without_removed(Fit(), obj, asset, depsgraph)
-            adjustment = None if captured else _adjustment_of_all(obj, warn)
-            return ObjectState(obj.name, key_of(path), part=fit.part, adjustment=adjustment, proxy=proxies.read(mesh))
+            state = ObjectState(obj.name, key_of(path), part=fit.part, proxy=proxies.read(mesh))
+            state.adjustment = None if captured else _adjustment_of_all(obj, warn)
+            given = mesh_arrays.read_vertices(mesh), proxies.read_rest(mesh)
+            if state.proxy is not None and (particles := particles_of(obj, depsgraph, *given, warn)) is not None:
+                state.proxy, state.particles = None, replace(particles, all=True)
+            return state
         point_caches.check(obj, asset.mesh, warn, final=depsgraph.mode == "RENDER")
         fit = _without_removed(check_topology(obj, mesh, asset.mesh, warn), obj, asset, depsgraph)
         vertices = mesh_arrays.read_vertices(mesh)
@@ -179,7 +183,7 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
             if array is not None:
                 array.flags.writeable = False  # so that the engine's client need not copy it
         appearance = cache_playback.fracture_state(obj)
-        appearance["particles"] = particles_of(obj, depsgraph, vertices, warn)
+        appearance["particles"] = particles_of(obj, depsgraph, vertices, fit.rest(asset.mesh, len(vertices)), warn)
         adjustment = None if captured else _adjustment(obj, mesh, fit, warn)
         return ObjectState(
             name=obj.name, asset=key_of(path), part=fit.part, adjustment=adjustment, **arrays, **appearance

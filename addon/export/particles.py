@@ -22,13 +22,13 @@ _CLOSE = 1e-4
 _PROBES = 4096
 #: A mesh is flat where it is thinner than this part of its size.
 _FLAT = 1e-6
-#: Particles at rest by folder and digest of their cache, and how many caches are known at most.
-_rests: dict[tuple[str, str], Array] = {}
+#: Particles and vertices at rest by folder and digest of their cache, and how many caches are known at most.
+_rests: dict[tuple[str, str], tuple[Array, Array]] = {}
 _MOST = 16
 
 
 def particles_of(
-    obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, vertices: Array, warn: Warn
+    obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, vertices: Array, rest: Array, warn: Warn
 ) -> Particles | None:
     """What carries the splats of an evaluated object besides the faces of its mesh; None: they alone do.
 
@@ -38,6 +38,8 @@ def particles_of(
     depsgraph : bpy.types.Depsgraph
     vertices : (n, 3) float32 array
         Of its evaluated mesh, in the mesh's order, object space.
+    rest : (n, 3) float array
+        Where they are when the surfels are as in the asset; not finite where that is not known.
     warn : callable
         Told why particles that were asked for, or are there, carry nothing.
     """
@@ -58,9 +60,17 @@ def particles_of(
             return None
         played = cache_playback.Played(path, header)
         frame = _frame_of(modifier, header, depsgraph.scene_eval)
-        particles, shown = cache.driving(frame, _rest_of(cache, header), last=played.last, place=_placing(played))
+        points, began = _rest_of(cache, header)
+        particles, shown = cache.driving(frame, points, last=played.last, place=_placing(played))
     except (DrgsError, OSError) as error:
         warn(f'"{obj.name}": splats follow the mesh, as particles cannot be read: {error}')
+        return None
+    if not _same_places(began, rest):
+        if wanted == "particles":
+            warn(
+                f'"{obj.name}": its simulation begins with another shape than the captured one (posed, or edited), '
+                "so splats follow the mesh; Driven By: Surface says so for good"
+            )
         return None
     moved = _moved(particles, _affine(shown, vertices))
     if moved is None:
@@ -81,12 +91,21 @@ def _frame_of(modifier: bpy.types.Modifier, header: Header, scene: bpy.types.Sce
     return header.first + (round(index) if modifier.interpolation == "NONE" else index)
 
 
-def _rest_of(cache: ParticleCache, header: Header) -> Array:
-    """Particles of a cache at rest, read once."""
+def _same_places(a: Array, b: Array) -> bool:
+    """Whether vertices are where others are, as far as these are known."""
+    known = np.isfinite(b).all(axis=1)
+    if a.shape != b.shape or not known.any():
+        return False
+    return bool(np.abs(a[known] - b[known]).max() <= _CLOSE * float(np.ptp(b[known], axis=0).max()))
+
+
+def _rest_of(cache: ParticleCache, header: Header) -> tuple[Array, Array]:
+    """Particles and vertices of a cache at rest, read once."""
     key = str(cache.folder), header.digest
     if key in _rests:
         return _rests[key]
-    rest = np.array(cache.rest().points)
+    read = cache.rest()
+    rest = np.array(read.points), np.array(read.vertices)
     now = cache.header()
     if now is None or now.digest != header.digest:
         raise AssetError(str(cache.folder), "is being baked again", "Wait for the first frames")

@@ -98,6 +98,15 @@ class Fit(NamedTuple):
         """Values of the mesh's vertices for those of the part."""
         return values if self.vertices is None else values[self.vertices]
 
+    def rest(self, mesh: Mesh, count: int) -> Array:
+        """(count, 3) places at rest of the vertices of the mesh, by those of the asset's; NaN of new ones."""
+        own = self.of_asset(mesh.vertices)
+        if self.vertices is None:
+            return own
+        found = np.full((count, 3), np.nan, np.float32)
+        found[self.vertices] = own
+        return found
+
     def of_asset(self, values: Array) -> Array:
         """Values of the asset's vertices for those of the part."""
         return values if self.part is None else values[self.part.vertices]

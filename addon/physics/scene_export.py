@@ -21,7 +21,7 @@ from ...drgs_blender.core.asset import Asset, Binding, Mesh, Surfels
 from ...drgs_blender.core.asset.archive import replace_file
 from ...drgs_blender.core.asset.container import write_asset
 from ...drgs_blender.core.errors import UsageError, WriteError
-from .. import assets, cache_playback, mesh_arrays, messages
+from .. import assets, cache_playback, mesh_arrays, messages, proxies
 from ..export.topology_check import check_modifiers, check_topology
 from ..physics_settings import DrgsPhysicsCollider
 from .forces import describe_field, fields_on, row_of
@@ -236,7 +236,7 @@ def _read(obj: bpy.types.Object, *, fits: bool = False) -> tuple[Array, Array, A
 
     Parameters
     ----------
-    fits : the mesh must be the object's asset, moved
+    fits : the mesh must be the object's asset, moved, or its proxy
     """
     depsgraph = _depsgraph()
     evaluated = obj.evaluated_get(depsgraph)
@@ -246,10 +246,9 @@ def _read(obj: bpy.types.Object, *, fits: bool = False) -> tuple[Array, Array, A
         check_modifiers(evaluated, depsgraph)
     mesh = evaluated.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
     try:
-        if fits:
-            check_topology(
-                evaluated, mesh, assets.load(assets.file_of(obj)).mesh, lambda text: messages.note("INFO", text)
-            )
+        asset = assets.load(assets.file_of(obj)) if fits else None
+        if asset is not None and not proxies.is_proxy(mesh, asset):
+            check_topology(evaluated, mesh, asset.mesh, lambda text: messages.note("INFO", text))
         vertices = mesh_arrays.read_vertices(mesh)
         corners, _ = mesh_arrays.read_loop_triangles(mesh)
         faces = mesh_arrays.read_corner_vertices(mesh)[corners]

@@ -145,3 +145,15 @@ def test_a_damaged_cache_is_told_and_the_mesh_plays_on(baked, export):
     assert [text for text in told if baked.name in text and "cannot be read" in text]
     state, told = state_at(baked, 4, export=export)
     assert state.particles is not None and not [text for text in told if "cannot be read" in text]
+
+
+def test_a_simulation_that_begins_posed_leaves_surfels_to_the_mesh(body, scene, captured, export):
+    """Its particles at rest are not where the surfels were captured."""
+    bend = body.modifiers.new("Bend", "SIMPLE_DEFORM")
+    bend.deform_method, bend.angle = "BEND", 1.0
+    bpy.ops.drgs.bake_physics()
+    state, told = state_at(body, 3, export=export)
+    assert state.particles is None and not [text for text in told if "splats follow" in text]
+    body.drgs.physics.driven_by = "particles"
+    state, told = state_at(body, 3, export=export)
+    assert state.particles is None and [text for text in told if "begins with another shape" in text]

@@ -170,3 +170,23 @@ def test_a_mask_of_a_proxy_is_told(cloud, export):
     cloud.drgs.adjustment.mask = "Half"
     frame, warnings = export()
     assert frame.objects[0].adjustment is None and any('"Half"' in text for text in warnings)
+
+
+def test_a_proxy_is_simulated_and_its_particles_carry_the_surfels(scene, cloud, export, captured):
+    """What is inside of the proxy is the matter; without particles the proxy's vertices carry."""
+    select(cloud)
+    add_proxy()
+    physics = cloud.drgs.physics
+    physics.use = True
+    physics.youngs_modulus, physics.resolution, physics.frame_end = 2e4, 8, 4
+    bpy.ops.drgs.bake_physics()
+    scene.frame_set(4)
+    frame, warnings = export()
+    state = frame.objects[0]
+    assert not warnings and state.proxy is None and state.particles.all
+    assert (state.particles.points[:, 2] < state.particles.rest[:, 2]).all(), "it falls"
+    fallen = (state.particles.points - state.particles.rest)[:, 2].mean()
+    physics.driven_by = "surface"
+    state = export()[0].objects[0]
+    assert state.particles is None
+    assert abs((state.proxy.vertices - state.proxy.rest)[:, 2].mean() - fallen) < 0.05 * abs(fallen)
