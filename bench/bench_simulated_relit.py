@@ -4,8 +4,9 @@ python bench/bench_simulated_relit.py --scenes scenes [--objects cat helmet robo
 
 The true mesh of each object is simulated as jelly that stands on a floor in a side wind; Cycles renders it as it then
 is, under lights that were not photographed. Its particles carry the asset that bench_asset.py has learned from
-photographs: the mesh by `gmls`, the surfels as each way has it. Scenes are those of `drgs evaluate --make-scenes
-scenes`.
+photographs: the mesh by `gmls`, the surfels as each way has it. Beside them what other methods do, with the captured
+colours that particles carry along: the same particles (as PhysGaussian), and those of a simulation by positions (XPBD,
+as GSP). Scenes are those of `drgs evaluate --make-scenes scenes`.
 """
 
 from __future__ import annotations
@@ -18,12 +19,13 @@ from pathlib import Path
 import numpy as np
 from bench_asset import FOLDER, relit_truth
 from bench_evaluate import mean, similarity
+from other_methods import Baked
 from report import OUT, ROOT, table, write_section
 
 from drgs_blender.cli.evaluate import session_renderer
 from drgs_blender.cli.find_blender import find_blender
 from drgs_blender.core.asset.model import Mesh
-from drgs_blender.core.frame import RenderSettings
+from drgs_blender.core.frame import Camera, Particles, RenderSettings, World
 from drgs_blender.core.particle_cache import ParticleCache
 from drgs_blender.deform.gmls import bind_points, carry
 from drgs_blender.engine.session import Session
@@ -43,13 +45,14 @@ WAYS = ("surface", "automatic", "particles")
 VIEWS = 4
 
 
-def simulated(name: str, mesh: Mesh, last: int) -> ParticleCache:
+def simulated(name: str, mesh: Mesh, last: int, solver: str = "mpm") -> ParticleCache:
     """The true object as jelly, in a cache of its own."""
     settings = {
         "material": {"name": "jelly", "youngs_modulus": 2e4, "density": 500.0},
         "floor": float(mesh.vertices[:, 2].min()), "wind": [6.0, 0.0, 0.0], "drag": 1.0, "resolution": 64, "last": last,
+        "solver": solver,
     }  # fmt: skip
-    cache = ParticleCache(OUT / "simulated" / name)
+    cache = ParticleCache(OUT / "simulated" / (name if solver == "mpm" else f"{name}-{solver}"))
     bake(prepare(mesh, parse_settings(settings), name), cache, overwrite=True)
     return cache
 
@@ -79,6 +82,21 @@ def scored(
     return rows
 
 
+def in_colours_of_the_day(
+    session: Session, key: str, truth: Truth, folder: Path, particles: Particles, baked: Baked
+) -> list[dict]:
+    """Rows of the captured colours, carried by particles, under the truth's lights."""
+    draw = session_renderer(session, key, RenderSettings(samples=1, bounces=0), driven_by="particles")
+    capture, asset = read_capture(folder), session.asset(key)
+    pose = Posed(asset.mesh.vertices, particles)
+
+    def picture(camera: Camera, light: World, _: Posed | None) -> dict[str, Array]:
+        return draw(camera, light, pose) | {"Combined": baked(camera, None, particles)}
+
+    rows: list[dict] = compare(asset, replace(capture, views=capture.training), truth, picture)["lights"]
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=Path, required=True)
@@ -93,6 +111,7 @@ def main() -> None:
         key = session.load_asset(FOLDER / f"{name}.drgs")
         own = session.asset(key).mesh
         cache = simulated(name, true.mesh, max(options.frames))
+        quick, baked = simulated(name, true.mesh, max(options.frames), "xpbd"), Baked(session.asset(key))
         rest = cache.rest().points
         weights = bind_points(own.vertices, rest, space=volume_of(rest, *spacings(rest)))
         found = scored(session, key, relit_truth(folder, views=VIEWS), folder, options.samples, None)
@@ -108,11 +127,18 @@ def main() -> None:
                 figures = f"{mean(found, 'scaled', 'foreground'):.2f}", similarity(found)
                 rows.append([name, f"frame {frame}, moved by {moved:.0f} cm in the mean", way, *figures])
                 print(*rows[-1], flush=True)
+            for title, given in (("PhysGaussian", particles), ("GSP", quick.driving(frame)[0])):
+                found = in_colours_of_the_day(session, key, truth, folder, given, baked)
+                figures = f"{mean(found, 'scaled', 'foreground'):.2f}", similarity(found)
+                rows.append([name, f"frame {frame}", f"colours of the day, by particles (as {title})", *figures])
+                print(*rows[-1], flush=True)
     body = (
         "Jelly (E = 2e4 Pa) on a floor in a side wind, the true object's particles carrying what was learned from "
         f"photographs; {VIEWS} views under each of the lights that were not photographed, PSNR of the foreground in "
         "dB, scaled by one factor a channel; SSIM and FLIP of the scaled frames on white. Objects are some "
-        "1.6 m large. Streaks beside the object count in SSIM and FLIP alone.\n\n"
+        "1.6 m large. Streaks beside the object count in SSIM and FLIP alone. Colours of the day: those that the "
+        "surfels were captured in, with harmonics, in no new light; by the same particles, or by those of the solver "
+        "by positions (`other_methods.py`).\n\n"
     )
     columns = ("Object", "Pose", "Surfels carried by", "Relit, foreground", "SSIM / FLIP")
     write_section("simulated-relit", "Simulated and relit", body + table(columns, rows))

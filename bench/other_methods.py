@@ -15,7 +15,7 @@ from bench_recovered_light import directions, reduced
 from drgs_blender.core.asset import Asset
 from drgs_blender.core.asset.model import PosedSurfels
 from drgs_blender.core.color import srgb_to_linear
-from drgs_blender.core.frame import Camera, World
+from drgs_blender.core.frame import Camera, Particles, World
 from drgs_blender.deform.gmls import Weights, bind_points, carry
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.deform.sources import MeshSource
@@ -62,14 +62,20 @@ class Baked:
         self._source = MeshSource(mesh.vertices, mesh.faces)
         self._by_mesh = bind_points(self._particles, mesh.vertices)
         self._by_particles: Weights = bind_points(self._rest.centre, self._particles)
+        self._simulated: tuple[Array, Weights] | None = None
 
-    def pose(self, vertices: Array | None) -> tuple[PosedSurfels, Array]:
-        """Surfels, and what has turned each (n, 3, 3)."""
+    def pose(self, vertices: Array | None, simulated: Particles | None = None) -> tuple[PosedSurfels, Array]:
+        """Surfels, and what has turned each (n, 3, 3); by `simulated` particles in place of those in the mesh."""
         rest = self._rest
-        if vertices is None:
+        if simulated is not None:
+            if self._simulated is None or self._simulated[0] is not simulated.rest:
+                self._simulated = simulated.rest, bind_points(rest.centre, simulated.rest)
+            centre, gradient, _ = carry(self._simulated[1], simulated.points, simulated.gradients)
+        elif vertices is None:
             return rest, np.tile(np.eye(3), (len(rest), 1, 1))
-        x, gradients, _ = carry(self._by_mesh, vertices.astype(np.float64), self._source.gradients(vertices))
-        centre, gradient, _ = carry(self._by_particles, x, gradients)
+        else:
+            x, gradients, _ = carry(self._by_mesh, vertices.astype(np.float64), self._source.gradients(vertices))
+            centre, gradient, _ = carry(self._by_particles, x, gradients)
         left, _, right = np.linalg.svd(gradient.astype(np.float64))
         turned = left @ right
         surfels = self._asset.surfels
@@ -80,9 +86,9 @@ class Baked:
         )  # fmt: skip
         return posed, turned
 
-    def __call__(self, camera: Camera, vertices: Array | None) -> Array:
+    def __call__(self, camera: Camera, vertices: Array | None, simulated: Particles | None = None) -> Array:
         """(h, w, 4) linear, premultiplied."""
-        posed, turned = self.pose(vertices)
+        posed, turned = self.pose(vertices, simulated)
         at_rest = np.einsum("nji,nj->ni", turned, -towards(posed, camera))
         sh = self._asset.surfels.sh
         assert sh is not None

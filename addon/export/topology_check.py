@@ -11,7 +11,7 @@ import numpy as np
 from ...drgs_blender.core.asset import Mesh
 from ...drgs_blender.core.asset.part import Part
 from ...drgs_blender.core.errors import AssetError
-from .. import mesh_arrays
+from .. import mesh_arrays, proxies
 from .face_match import Matched, match_faces
 
 Array = np.ndarray
@@ -199,6 +199,12 @@ def _keys(edges: Array) -> Array:
 def _wrong_count(obj: bpy.types.Object, found: int, expected: int) -> AssetError:
     subject = f'Object "{obj.name}"'
     own = len(obj.original.data.vertices)
+    if not expected:
+        if obj.original.data.attributes.get(proxies.REST) is not None:
+            problem = f"{_suspects(obj) or 'a modifier'} makes vertices that do not know where they are at rest"
+            return AssetError(subject, problem, "Remove it, or disable it for renders")
+        problem = f"its mesh has {own} vertices, and {obj.original.drgs.asset.name} has no mesh"
+        return AssetError(subject, problem, "Delete them; with another mesh selected, Add Proxy Mesh takes that")
     if own != expected:
         return AssetError(
             subject,

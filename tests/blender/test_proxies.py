@@ -190,3 +190,34 @@ def test_a_proxy_is_simulated_and_its_particles_carry_the_surfels(scene, cloud, 
     state = export()[0].objects[0]
     assert state.particles is None
     assert abs((state.proxy.vertices - state.proxy.rest)[:, 2].mean() - fallen) < 0.05 * abs(fallen)
+
+
+def test_vectors_of_what_has_no_mesh_are_told(scene, cloud, ball, export):
+    scene.view_layers[0].use_pass_vector = True
+    told = [text for text in export()[1] if "Vector" in text]
+    assert len(told) == 1 and "cloud" in told[0] and "ball" not in told[0]
+    scene.view_layers[0].use_pass_vector = False
+    assert not export()[1]
+
+
+def test_a_proxy_in_edit_mode_shows_what_is_edited(cloud, export):
+    select(cloud)
+    add_proxy()
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="SELECT")
+    bpy.ops.transform.translate(value=(0, 0, 0.5))
+    proxy = export()[0].objects[0].proxy
+    np.testing.assert_allclose((proxy.vertices - proxy.rest)[:, 2], 0.5, atol=1e-5)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    proxy = export()[0].objects[0].proxy
+    np.testing.assert_allclose((proxy.vertices - proxy.rest)[:, 2], 0.5, atol=1e-5)
+
+
+def test_a_modifier_that_forgets_the_proxy_is_named(cloud, export):
+    """Remesh makes vertices that do not know where they were."""
+    select(cloud)
+    add_proxy()
+    cloud.modifiers.new("New mesh", "REMESH").voxel_size = 0.2
+    bpy.context.view_layer.update()
+    with pytest.raises(part("drgs_blender.core.errors").AssetError, match="New mesh"):
+        export()
