@@ -240,6 +240,7 @@ def hidden(obj: bpy.types.Object) -> Iterator[None]:
             modifier.show_viewport = False
         yield
     finally:
-        for name, value in shown:
-            if name in obj.modifiers:
-                obj.modifiers[name].show_viewport = value
+        with suppress(ReferenceError):  # the object was removed meanwhile
+            for name, value in shown:
+                if name in obj.modifiers:
+                    obj.modifiers[name].show_viewport = value

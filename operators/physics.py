@@ -128,7 +128,7 @@ class _JobOperator(DrgsOperator):
         try:
             if self.guard(self._part, context) == {"PASS_THROUGH"}:
                 return {"PASS_THROUGH"}
-            self._job.close()
+            self._succeeded |= self._job.cancel()  # frames of a bake that failed are worth an undo step, too
             if self._next(context):
                 return {"PASS_THROUGH"}
         except Exception:
@@ -139,16 +139,21 @@ class _JobOperator(DrgsOperator):
 
     def _part(self, context: bpy.types.Context) -> set[str]:
         """Go on with the present job for a moment."""
-        if self._job.step(_SHARE):
-            return self._report_done(context)
+        try:
+            if self._job.step(_SHARE):
+                return self._report_done(context)
+        except bake_job.Removed as removed:  # by the artist, whose next keys the window of an error would swallow
+            self.warn(str(removed))
+            return {"CANCELLED"}
         context.workspace.status_text_set(f"{self._job.subject}: {self._job.progress()[1]}. Esc cancels")
         _redraw(context, "PROPERTIES")
         return {"PASS_THROUGH"}
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """End the job, and those that were to follow; also called when Blender closes or loads a file."""
+        """End the job, and those that were to follow; also called when its window closes, or another file is loaded."""
         self._abandon()
-        self._job.close()
+        if bake_job.running.get(self._job.key) is self._job:
+            self.stopped()
         self._release(context)
 
     def _abandon(self) -> None:
@@ -192,7 +197,8 @@ class DRGS_OT_bake_physics(_JobOperator, bpy.types.Operator):
     def stopped(self) -> set[str]:
         assert isinstance(self._job, bake_job.Bake), self._job
         kept = self._job.cancel()
-        text = f"{self._job.subject}: stopped at {self._job.progress()[1].split(',')[0].lower()}; Bake goes on"
+        following = "Resume goes on" if kept else "Bake begins again"
+        text = f"{self._job.subject}: stopped at {self._job.progress()[1].split(',')[0].lower()}; {following}"
         messages.note("INFO", text)
         self.report({"INFO"}, text)
         return {"FINISHED"} if kept or self._succeeded else {"CANCELLED"}

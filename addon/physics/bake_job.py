@@ -42,6 +42,10 @@ running: dict[int, Job] = {}
 waiting: set[int] = set()
 
 
+class Removed(UsageError):
+    """The object was removed while it was simulated."""
+
+
 class Job:
     """A run of the engine's program for one object.
 
@@ -97,6 +101,7 @@ class Job:
         DrgsError
             Whatever went wrong; `close` it then.
         """
+        self.target()
         if self._process is None:
             until = time.monotonic() + seconds
             for part in self._capture:
@@ -121,6 +126,11 @@ class Job:
         self.end_process()
         running.pop(self.key, None)
 
+    def cancel(self) -> bool:
+        """End before its time; whether what is done can be seen in the scene."""
+        self.close()
+        return False
+
     def end_process(self) -> None:
         """End the engine's program if it runs."""
         if self._process is not None:
@@ -131,12 +141,13 @@ class Job:
 
         Raises
         ------
-        UsageError
-            It was removed.
+        Removed
+            There is none any more.
         """
         found = object_of(self.key)
         if found is None:
-            raise UsageError(self.subject, "was removed while it was simulated", "Undo, and bake again: it goes on")
+            remedy = "Bring it back by undo or redo, and bake again: it goes on"
+            raise Removed(self.subject, "was removed while it was simulated", remedy)
         return found
 
     def progress(self) -> tuple[float, str]:
@@ -196,12 +207,14 @@ class Bake(Job):
         return min(1.0, self.count / self.frames), text
 
     def cancel(self) -> bool:
-        """End before its time; whether there are frames to play. Another bake goes on from them."""
+        """End before its time; whether the object plays frames. Another bake goes on from them."""
         self.close()
-        if self._process is not None and not self.count:
-            with suppress(DrgsError):  # whatever it is, the next bake says it
+        with suppress(DrgsError):  # whatever it is, the next bake says it
+            if self._process is not None and not self.count:
                 self._read_frames(0.0)
-        return self.count > 0
+            self._show(renew=True)  # what played them may be undone
+            return self.count > 0
+        return False
 
     def _read_frames(self, seconds: float) -> bool:
         if self.process.counts is None:

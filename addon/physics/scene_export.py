@@ -68,7 +68,7 @@ def export_scene(
     WriteError
         Naming file and reason.
     """
-    physics = obj.drgs.physics
+    physics, subject = obj.drgs.physics, subject_of(obj)
     frames = range(physics.frame_start, physics.frame_end + 1)
     now = scene.frame_current, scene.frame_subframe
     with _writing(folder), cache_playback.hidden(obj):
@@ -93,10 +93,11 @@ def export_scene(
             replace_file(folder / SETTINGS, [text.encode()])
         except ReferenceError as error:
             raise UsageError(
-                subject_of(obj), "a collider or force field was removed while the scene was read", "Bake again"
+                subject, "a collider or force field was removed while the scene was read", "Bake again"
             ) from error
         finally:
-            scene.frame_set(now[0], subframe=now[1])
+            with suppress(ReferenceError):  # undo has made another scene, or it was removed
+                scene.frame_set(now[0], subframe=now[1])
     yield 1.0
 
 

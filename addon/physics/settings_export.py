@@ -13,10 +13,13 @@ import numpy as np
 
 from ...drgs_blender.core.errors import UsageError
 from ...drgs_blender.core.sim_materials import MATERIALS
+from .. import cache_playback
 from ..physics_settings import ANGLES, DrgsPhysicsSettings, numbers_of
 
 #: Where to look for the settings, in messages.
 PANEL = "Physics > DR-GS Physics"
+#: Where caches lie that the artist has chosen no folder for.
+_CACHES = "//drgs_cache"
 
 
 def subject_of(obj: bpy.types.Object) -> str:
@@ -43,8 +46,23 @@ def folder_of(obj: bpy.types.Object) -> Path:
 
 
 def _path_of(obj: bpy.types.Object) -> str:
-    """The cache of an object as the artist wrote it, or the one that it has by itself."""
-    return obj.drgs.physics.folder.rstrip("/\\") or f"//drgs_cache/{bpy.path.clean_name(obj.name)}"
+    """The cache of an object as the artist wrote it, or the one that it has by itself, also after it was renamed."""
+    written = obj.drgs.physics.folder.rstrip("/\\")
+    return written or _played_alone(obj) or f"{_CACHES}/{bpy.path.clean_name(obj.name)}"
+
+
+def _played_alone(obj: bpy.types.Object) -> str:
+    """The cache with a name of its own making that this object plays and no other, which a duplicate would; "" else."""
+    played = _played(obj)
+    others = (other for other in bpy.data.objects if other != obj and other.library == obj.library)
+    return "" if played and any(_played(other) == played for other in others) else played
+
+
+def _played(obj: bpy.types.Object) -> str:
+    """The cache in `_CACHES` that an object plays, "" for none."""
+    modifier = cache_playback.modifier_of(obj) if obj.type == "MESH" and obj.users_scene else None
+    folder, _, file = modifier.filepath.replace("\\", "/").rpartition("/") if modifier is not None else ("", "", "")
+    return folder if file == cache_playback.FILE and folder.startswith(f"{_CACHES}/") else ""
 
 
 def check(obj: bpy.types.Object) -> None:

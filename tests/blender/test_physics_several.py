@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import bpy
 import pytest
-from physics_scenes import FRAMES, PATIENCE, bake_job, cache_of, world
+from physics_scenes import FRAMES, PATIENCE, bake_job, begin_of, cache_of, settings_export, world
 from scenes import part, select
 
 
@@ -51,20 +51,27 @@ class Window(SimpleNamespace):
         super().__init__(scene=scene, window=object(), window_manager=manager, workspace=workspace)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("ending", ["all", "without the second", "escape", "a loaded file"])
-def test_a_bake_that_waits_says_so_and_can_be_cancelled(body, scene, monkeypatch, ending):
-    """The operator's own steps, on a window that stands in for Blender's: there is none in the background."""
+def in_window(obj, scene, monkeypatch):
+    """The operator as it runs beside a window, the window, and a list of what it tells."""
     operators = part("operators.physics")
     monkeypatch.setattr(operators, "bpy", SimpleNamespace(app=SimpleNamespace(background=False), types=bpy.types))
-    other = body.copy()
-    scene.collection.objects.link(other)
-    select(body, other)
     own = {n: v for n, v in vars(operators.DRGS_OT_bake_physics).items() if not n.startswith(("__", "bl_"))}
     told: list[str] = []
     bake = type("StandIn", (operators._JobOperator,), own | {"report": lambda self, _, text: told.append(text)})()
     context = Window(scene)
-    context.object = context.active_object = other
+    context.object = context.active_object = obj
+    context.selected_objects = [obj]
+    return bake, context, told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", ["all", "without the second", "escape", "a closed window", "removed"])
+def test_a_bake_that_waits_says_so_and_can_be_cancelled(body, scene, monkeypatch, ending):
+    """The operator's own steps, on a window that stands in for Blender's: there is none in the background."""
+    other = body.copy()
+    scene.collection.objects.link(other)
+    select(body, other)
+    bake, context, told = in_window(other, scene, monkeypatch)
     context.selected_objects = [body, other]
     assert bake.run(context) == {"RUNNING_MODAL"}
     assert bake_job.of(body) and bake_job.is_waiting(other) and not bake_job.of(other)
@@ -73,18 +80,58 @@ def test_a_bake_that_waits_says_so_and_can_be_cancelled(body, scene, monkeypatch
         assert bpy.ops.drgs.cancel_physics() == {"FINISHED"} and bake_job.of(body)
     elif ending == "escape":
         assert bake.modal(context, SimpleNamespace(type="ESC", value="PRESS")) == {"CANCELLED"}
-    elif ending == "a loaded file":
+    elif ending == "a closed window":
         bake.cancel(context)
+    elif ending == "removed":
+        context.selected_objects.remove(body)
+        bpy.data.objects.remove(body)
     result = {"RUNNING_MODAL"}
     until = time.monotonic() + PATIENCE
-    while ending in ("all", "without the second") and result <= {"RUNNING_MODAL", "PASS_THROUGH"}:
+    while ending not in ("escape", "a closed window") and result <= {"RUNNING_MODAL", "PASS_THROUGH"}:
         assert time.monotonic() < until
         result = bake.modal(context, SimpleNamespace(type="TIMER", value="NOTHING"))
     assert not bake_job.running and not bake_job.waiting and bpy.ops.drgs.bake_physics.poll()
+    if ending == "removed":
+        assert result == {"FINISHED"} and len(cache_of(other).frames()) == FRAMES
+        assert "was removed while it was simulated" in told[0] and "frames baked" in told[1] and len(told) == 2
+        return
     frames = [len(cache_of(obj).frames()) for obj in (body, other)]
     if ending in ("all", "without the second"):
         assert result == {"FINISHED"} and frames == [FRAMES, FRAMES if ending == "all" else 0]
         assert len(told) == sum(map(bool, frames)) and all("frames baked" in text for text in told)
+    else:
+        assert len(told) == 1 and "stopped at" in told[0]
+
+
+@pytest.mark.slow
+def test_undo_during_a_bake_that_fails_takes_no_frames_away(body, scene, monkeypatch):
+    """What plays them is there again at the end, and in the undo step that the operator then makes."""
+    bake, context, told = in_window(body, scene, monkeypatch)
+    body.drgs.physics.frame_end = 1000
+    assert bake.run(context) == {"RUNNING_MODAL"}
+    begin_of(bake._job, 2)
+    part("addon.cache_playback").detach(body)
+    bake._job.process._process.kill()
+    result, until = {"PASS_THROUGH"}, time.monotonic() + PATIENCE
+    while result == {"PASS_THROUGH"}:
+        assert time.monotonic() < until
+        result = bake.modal(context, SimpleNamespace(type="TIMER", value="NOTHING"))
+    assert "frames can be played" in told[0] and result == {"FINISHED"}
+    assert [m.type for m in body.modifiers] == ["MESH_CACHE"]
+
+
+def test_a_renamed_object_keeps_its_cache(ball, scene):
+    """Of the objects that play one cache, as duplicates do, each has the one of its name."""
+    before = settings_export.folder_of(ball)
+    part("addon.cache_playback").attach(ball, before / "mesh.pc2", 1)
+    ball.name = "Fireball"
+    assert settings_export.folder_of(ball) == before
+    other = ball.copy()
+    scene.collection.objects.link(other)
+    folders = [settings_export.folder_of(obj).name for obj in (ball, other)]
+    assert folders == ["Fireball", "Fireball_001"]
+    bpy.data.objects.remove(other)
+    assert settings_export.folder_of(ball) == before
 
 
 def test_frames_are_the_scenes_until_the_artist_chooses(ball, scene):

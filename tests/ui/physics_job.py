@@ -1,4 +1,4 @@
-"""Runs inside Blender with a window, for test_physics.py: two objects are baked by one click, then stopped by Esc."""
+"""Runs inside Blender with a window, for test_physics.py: two objects are baked by a click, stopped by Esc, undone."""
 
 from __future__ import annotations
 
@@ -81,6 +81,28 @@ def steps() -> Iterator[float]:
     yield from photograph("physics-5-played")
     found["modifiers"] = [[m.type for m in obj.modifiers] for obj in subjects()]
     found["messages"] = [m.text for m in part("addon.messages").history]
+    yield from undone()
+
+
+def undone() -> Iterator[float]:
+    """Undo while a bake goes on, until what is baked was never there, then redo."""
+    part("addon.messages").clear()
+    bpy.context.view_layer.objects.active.location.y = 1
+    bpy.ops.ed.undo_push(message="Move")
+    yield from hands.move(hands.middle())
+    with hands.context_of():
+        bpy.ops.drgs.bake_physics("INVOKE_DEFAULT")
+    yield from until(lambda: at_work()[0] == 1, "the bake that is undone", 60)
+    undos = 0
+    while subjects():
+        yield from key("Z", ctrl=True)
+        undos += 1
+    yield from until(lambda: at_work() == (0, 0), "the end of the bake without an object", 60)
+    yield from photograph("physics-6-undone")
+    for _ in range(undos):
+        yield from key("Z", ctrl=True, shift=True)
+    found["redone"] = [obj.location.y for obj in subjects()]
+    found["undone"] = [[m.level, m.text] for m in part("addon.messages").history]
 
 
 hands.run(steps())

@@ -28,4 +28,11 @@ def test_escape_stops_the_one_and_what_waits(seen):
     going, waited = sorted(seen.result["stopped"], reverse=True)
     assert going > FRAMES and waited == FRAMES
     stopped = [text for text in seen.result["messages"] if "stopped at" in text]
-    assert len(stopped) == 1 and '"robot.001": stopped at frame' in stopped[0], "the active one is last"
+    assert len(stopped) == 1 and '.001": stopped at frame' in stopped[0], "the active one is last"
+
+
+def test_undo_of_what_is_baked_ends_the_bake_with_a_warning_that_takes_no_keys(seen):
+    """The redos after it arrive, as they would not below the window of an error."""
+    assert sorted(seen.result["redone"]) == [0.0, 1.0]
+    removed = [level for level, text in seen.result["undone"] if "was removed while it was simulated" in text]
+    assert removed and {level for level, _ in seen.result["undone"]} <= {"WARNING", "INFO"}
