@@ -31,14 +31,14 @@ history: deque[Message] = deque(maxlen=MAX_MESSAGES)
 
 
 def note(level: str, text: str, logged: bool = True) -> None:
-    """Remember a message; a repetition of the latest one only renews its time.
+    """Remember a message; a repetition of the latest one, as every redraw has it, only renews its time.
 
     Not `logged` is one that Blender prints as well, by a report.
     """
-    if logged:
-        log.log(getattr(logging, level), text)
     if history and history[-1][1:] == (level, text):
         history.pop()
+    elif logged:
+        log.log(getattr(logging, level), text)
     history.append(Message(time.time(), level, text))
 
 

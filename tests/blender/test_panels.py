@@ -223,6 +223,14 @@ def test_the_newest_problem_is_in_the_header_of_viewports(scene, monkeypatch):
     assert told[0][0].startswith("word word") and len(told[0][0]) <= 40
 
 
+def test_what_every_redraw_says_again_is_printed_once(scene, monkeypatch, caplog):
+    messages = part("addon.messages")
+    monkeypatch.setattr(messages, "history", type(messages.history)(maxlen=3))
+    for text in ("Gone", "Gone", "Back", "Gone"):
+        messages.note("ERROR", text)
+    assert [record.message for record in caplog.records] == ["Gone", "Back", "Gone"]
+
+
 GROUPS = (
     ("addon.properties", "DrgsSceneSettings"),
     ("addon.properties", "DrgsViewLayerSettings"),
