@@ -46,7 +46,6 @@ def set_up(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, others: str,
     old = partner_of(scene)
     collection = _gather(scene)
     partner = scene.copy()
-    partner.name = f"{scene.name} DR-GS"
     if old is not None:
         _copy(old.drgs, partner.drgs)
     partner.drgs.background_scene = scene
@@ -68,7 +67,8 @@ def set_up(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, others: str,
     shown.use_pass_cryptomatte_asset = False
     if old is not None:
         _copy(old.view_layers[0].drgs, shown.drgs)
-        _remove(old)
+        _replace(old, partner, tree_of(scene))
+    partner.name = f"{scene.name} DR-GS"
     shown.drgs.others = others
     shown.use_pass_z = True
     rendered = bpy.data.collections.new(RENDERED)
@@ -175,6 +175,16 @@ def _remove(partner: bpy.types.Scene) -> None:
     for collection in [c for c in partner.collection.children if c.name.startswith(RENDERED)]:
         bpy.data.collections.remove(collection)
     bpy.data.scenes.remove(partner)
+
+
+def _replace(old: bpy.types.Scene, new: bpy.types.Scene, tree: bpy.types.NodeTree | None) -> None:
+    """Remove a second scene; nodes of the artist that read it, such as mattes, read the new one."""
+    for node in tree.nodes if tree is not None else ():
+        if getattr(node, "scene", None) == old:
+            node.scene = new
+            if node.bl_idname == "CompositorNodeRLayers":
+                node.layer = new.view_layers[0].name
+    _remove(old)
 
 
 def _layer_collections(

@@ -68,6 +68,23 @@ def test_mattes_of_the_second_scene_are_the_artists_to_switch_on(shared_scene):
         layer.use_pass_cryptomatte_object = True
 
 
+def test_nodes_of_the_artist_that_read_the_second_scene_read_what_replaces_it(shared_scene):
+    """Its name stays, too."""
+    compositing = part("addon.compositing")
+    bpy.ops.drgs.set_up_compositing()
+    partner = compositing.partner_of(shared_scene)
+    name = partner.name
+    kinds = ("CompositorNodeRLayers", "CompositorNodeCryptomatteV2")
+    nodes = [compositing.tree_of(shared_scene).nodes.new(kind) for kind in kinds]
+    for node in nodes:
+        node.scene = partner
+    for _ in range(2):
+        bpy.ops.drgs.set_up_compositing()
+        partner = compositing.partner_of(shared_scene)
+        assert partner.name == name and all(node.scene == partner for node in nodes)
+        assert nodes[0].layer == partner.view_layers[0].name
+
+
 def test_the_nodes_of_others_stay_between_picture_and_result(shared_scene):
     """What the artist does with the picture is done with both; again and again gives the same nodes."""
     compositing = part("addon.compositing")
