@@ -29,6 +29,20 @@ def partner_of(scene: bpy.types.Scene) -> bpy.types.Scene | None:
     return next((s for s in bpy.data.scenes if s.drgs.background_scene is scene and s is not scene), None)
 
 
+def bereft(scene: bpy.types.Scene) -> bool:
+    """Whether the second scene of `scene` was deleted by hand: its objects are missing from the picture then."""
+    tree = tree_of(scene)
+    return tree is not None and any(
+        node.label == LABEL and node.bl_idname == "CompositorNodeRLayers" and node.scene is None for node in tree.nodes
+    )
+
+
+def orphaned(scene: bpy.types.Scene) -> bool:
+    """Whether `scene` is a second scene whose first one was deleted."""
+    own = any(c.name.startswith(RENDERED) for c in scene.collection.children)
+    return own and scene.drgs.background_scene is None
+
+
 def set_up(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, others: str, compare: bool) -> bpy.types.Scene:
     """Have `scene` composited with DR-GS; what an earlier call made is made again, but its render settings are kept.
 
@@ -88,17 +102,17 @@ def set_up(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, others: str,
 def clear(scene: bpy.types.Scene) -> bool:
     """Undo `set_up`; whether there was anything. The objects stay in their collection, which is shown again."""
     partner, tree = partner_of(scene), tree_of(scene)
+    found = partner is not None or bereft(scene)
     if tree is not None:
         _take_out(tree)
     for collection in _known(scene):
         collection.hide_render = False
-        for layer in scene.view_layers:
-            for found in _layer_collections(layer.layer_collection, collection):
-                found.indirect_only = False
-    if partner is None:
-        return False
-    _remove(partner)
-    return True
+        for view_layer in scene.view_layers:
+            for layer in _layer_collections(view_layer.layer_collection, collection):
+                layer.indirect_only = False
+    if partner is not None:
+        _remove(partner)
+    return found
 
 
 def differences(partner: bpy.types.Scene) -> list[str]:

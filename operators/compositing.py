@@ -73,7 +73,7 @@ class DRGS_OT_clear_compositing(DrgsOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if compositing.partner_of(context.scene) is None:
+        if compositing.partner_of(context.scene) is None and not compositing.bereft(context.scene):
             cls.poll_message_set("DR-GS is not composited over this scene")
             return False
         cls.poll_message_set("Go to Object Mode")

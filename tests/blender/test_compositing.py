@@ -147,6 +147,34 @@ def test_compositing_that_is_left_over_is_told_with_what_removes_it(shared_scene
     assert not panel.poll(bpy.context) and compositing.partner_of(scene) is None
 
 
+def test_a_second_scene_that_was_deleted_is_told_and_what_is_left_can_be_removed(shared_scene):
+    scene = shared_scene
+    compositing = part("addon.compositing")
+    bpy.ops.drgs.set_up_compositing(shadows="HOLDOUT")
+    nodes = compositing.tree_of(scene).nodes
+    assert not compositing.bereft(scene)
+    bpy.data.scenes.remove(compositing.partner_of(scene))
+    assert compositing.bereft(scene) and bpy.ops.drgs.clear_compositing.poll()
+    assert bpy.ops.drgs.clear_compositing() == {"FINISHED"}
+    assert not compositing.bereft(scene) and not bpy.ops.drgs.clear_compositing.poll()
+    assert not [node for node in nodes if node.label == compositing.LABEL]
+    assert not any(layer.indirect_only for layer in scene.view_layers[0].layer_collection.children)
+
+
+def test_a_second_scene_alone_says_what_it_shows(shared_scene, export):
+    bpy.ops.drgs.set_up_compositing()
+    partner = part("addon.compositing").partner_of(shared_scene)
+    with bpy.context.temp_override(scene=partner, view_layer=partner.view_layers[0]):
+        bpy.data.scenes.remove(shared_scene)
+        told: list[str] = []
+        part("addon.export").export_frame(bpy.context.evaluated_depsgraph_get(), str, told.append)
+        assert [text for text in told if "is deleted" in text and f'"{partner.name}"' in text]
+        partner.view_layers[0].drgs.others = "SEEN"
+        told.clear()
+        part("addon.export").export_frame(bpy.context.evaluated_depsgraph_get(), str, told.append)
+        assert not [text for text in told if "is deleted" in text]
+
+
 def test_what_cannot_be_composited_is_refused_in_words(shared_scene, ball):
     scene = shared_scene
     scene.render.engine = "DRGS"
