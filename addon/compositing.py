@@ -160,8 +160,9 @@ def _gather(scene: bpy.types.Scene) -> bpy.types.Collection:
     collection = known[0] if known else bpy.data.collections.new(COLLECTION)
     if not known:
         scene.collection.children.link(collection)
+    inside_already = set(collection.objects)  # by name a linked object and a local one would be the same
     for obj in objects:
-        if obj.name not in collection.objects:
+        if obj not in inside_already:
             collection.objects.link(obj)
         for other in [c for c in obj.users_collection if c in inside and c is not collection]:
             other.objects.unlink(obj)

@@ -185,8 +185,8 @@ def _check_features(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, war
             warn(f"{below} has another {', '.join(changed)} now: press Set Up Compositing again")
     elif view_layer.drgs.others != "SEEN" and compositing.orphaned(scene):
         warn(
-            f'Scene "{scene.name}" was laid over a scene that is deleted, and shows DR-GS objects alone. Delete it, too, '
-            "or set View Layer > Passes > Other Objects to Visible"
+            f'Scene "{scene.name}" was laid over a scene that is deleted, and shows DR-GS objects alone. Delete it '
+            "too, or set View Layer > Passes > Other Objects to Visible"
         )
     if lacking := not_rendered(view_layer):
         warn(f'View layer "{view_layer.name}": DR-GS has no pass {", ".join(lacking)}')

@@ -147,6 +147,21 @@ def test_compositing_that_is_left_over_is_told_with_what_removes_it(shared_scene
     assert not panel.poll(bpy.context) and compositing.partner_of(scene) is None
 
 
+def test_a_linked_object_with_the_name_of_a_local_one_is_in_the_picture(shared_scene, ball, tmp_path):
+    compositing = part("addon.compositing")
+    path = str(tmp_path / "library.blend")
+    bpy.data.libraries.write(path, {ball})
+    with bpy.data.libraries.load(path, link=True) as (_, wanted):
+        wanted.objects = [ball.name]
+    (linked,) = wanted.objects
+    shared_scene.collection.objects.link(linked)
+    assert linked.name == ball.name and linked != ball
+    for _ in range(2):
+        bpy.ops.drgs.set_up_compositing()
+        for scene in (shared_scene, compositing.partner_of(shared_scene)):
+            assert {linked, ball} <= set(scene.objects)
+
+
 def test_a_second_scene_that_was_deleted_is_told_and_what_is_left_can_be_removed(shared_scene):
     scene = shared_scene
     compositing = part("addon.compositing")
