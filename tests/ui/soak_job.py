@@ -72,6 +72,7 @@ def work() -> Iterator[float]:
     yield from switch()
     yield from settled()
     yield from hands.photograph("soak-5-switched")
+    yield from render()
     found["errors"] = [m.text for m in part("addon.messages").history if m.level == "ERROR"]
 
 
@@ -116,6 +117,36 @@ def switch() -> Iterator[float]:
             bpy.ops.preferences.addon_enable(module=hands.PACKAGE)
         yield 0.3 + 0.2 * (i % 8)
     found["left"] = left
+
+
+def render() -> Iterator[float]:
+    """The same picture by F12 twice; during the second the object is moved and deleted."""
+    scene, rendering = bpy.context.scene, lambda: bpy.app.is_job_running("RENDER")
+    with hands.context_of():
+        bpy.ops.drgs.add_camera()
+        bpy.ops.ed.undo_push(message="Camera")
+    bpy.context.preferences.view.render_display_type = "NONE"
+    scene.render.resolution_x, scene.render.resolution_y = 480, 270
+    scene.drgs.use_strategy_samples, scene.drgs.samples, scene.drgs.use_animated_seed = False, 256, False
+    for name in ("alone", "disturbed"):
+        with hands.context_of():
+            bpy.ops.render.render("INVOKE_DEFAULT")
+        yield from hands.until(rendering, "F12", 60)
+        if name == "disturbed":
+            yield 0.1
+            move(1.0)
+            with hands.context_of():
+                subject().select_set(True)
+                bpy.ops.object.delete("EXEC_DEFAULT", True)
+            found["deleted while it renders"] = rendering()
+        yield from hands.until(lambda: not rendering(), "the end of F12", 300)
+        yield 0.5
+        found[name] = str(hands.FOLDER / f"{name}.png")
+        bpy.data.images["Render Result"].save_render(found[name])
+    for _ in range(2):  # not before: undo ends a picture of any engine
+        with hands.context_of():
+            bpy.ops.ed.undo()
+    found["brought back"] = subject().location.x
 
 
 hands.run(work())

@@ -54,6 +54,13 @@ def test_one_engine_at_a_time_and_none_without_the_add_on(seen):
     assert not seen.result["left"]
 
 
+def test_what_is_edited_during_f12_changes_nothing_of_its_picture(seen):
+    """The object is moved and deleted meanwhile; undo brings it back."""
+    assert seen.result["deleted while it renders"] and seen.result["brought back"] == 0.0
+    alone, disturbed = (window.picture(seen.result[name]) for name in ("alone", "disturbed"))
+    assert np.array_equal(alone, disturbed) and alone.std() > 0.05
+
+
 def test_no_process_outlives_blender(seen):
     left = []
     for process in psutil.process_iter(["cmdline"]):
