@@ -11,7 +11,7 @@ from bpy.props import EnumProperty, IntProperty
 
 from ..addon import assets, messages
 from ..addon.export.export_cache import uid
-from ..addon.physics import bake_job, particle_display
+from ..addon.physics import bake_job, particle_display, settings_export
 from . import selection
 from .base import DrgsOperator
 
@@ -67,6 +67,11 @@ class _JobOperator(DrgsOperator):
         """End the job before its time; what the operator returns then."""
         self._job.close()
         return {"CANCELLED"}
+
+    def ended(self) -> bool:
+        """End the job, done or failed; whether the scene shows what there is of it, which is worth an undo step."""
+        self._job.close()
+        return False
 
     def run(self, context: bpy.types.Context) -> set[str]:
         self._queue = list(map(uid, self.objects(context)))
@@ -128,7 +133,7 @@ class _JobOperator(DrgsOperator):
         try:
             if self.guard(self._part, context) == {"PASS_THROUGH"}:
                 return {"PASS_THROUGH"}
-            self._succeeded |= self._job.cancel()  # frames of a bake that failed are worth an undo step, too
+            self._succeeded |= self.ended()
             if self._next(context):
                 return {"PASS_THROUGH"}
         except Exception:
@@ -142,7 +147,7 @@ class _JobOperator(DrgsOperator):
         try:
             if self._job.step(_SHARE):
                 return self._report_done(context)
-        except bake_job.Removed as removed:  # by the artist, whose next keys the window of an error would swallow
+        except settings_export.Removed as removed:  # an error's window would swallow the artist's next keys
             self.warn(str(removed))
             return {"CANCELLED"}
         context.workspace.status_text_set(f"{self._job.subject}: {self._job.progress()[1]}. Esc cancels")
@@ -202,6 +207,10 @@ class DRGS_OT_bake_physics(_JobOperator, bpy.types.Operator):
         messages.note("INFO", text)
         self.report({"INFO"}, text)
         return {"FINISHED"} if kept or self._succeeded else {"CANCELLED"}
+
+    def ended(self) -> bool:
+        assert isinstance(self._job, bake_job.Bake), self._job
+        return self._job.cancel()
 
     def done(self, context: bpy.types.Context) -> str:
         assert isinstance(self._job, bake_job.Bake), self._job

@@ -25,7 +25,7 @@ from .. import assets, cache_playback, messages, output_check
 from ..export.export_cache import uid
 from ..physics_settings import DrgsPhysicsSettings
 from . import particle_display, scene_export
-from .settings_export import check, describe, exclusive_folder, folder_of, subject_of
+from .settings_export import Removed, check, describe, exclusive_folder, folder_of, subject_of
 from .simulate_process import SimulateProcess, ending
 
 #: Where a capture lies inside the cache.
@@ -40,10 +40,6 @@ _START, _FRAME, _KEEP = 3.0, 0.02, 5e-7
 running: dict[int, Job] = {}
 #: Objects whose bake begins when those before it have ended, by `uid`.
 waiting: set[int] = set()
-
-
-class Removed(UsageError):
-    """The object was removed while it was simulated."""
 
 
 class Job:
@@ -126,11 +122,6 @@ class Job:
         self.end_process()
         running.pop(self.key, None)
 
-    def cancel(self) -> bool:
-        """End before its time; whether what is done can be seen in the scene."""
-        self.close()
-        return False
-
     def end_process(self) -> None:
         """End the engine's program if it runs."""
         if self._process is not None:
@@ -146,8 +137,7 @@ class Job:
         """
         found = object_of(self.key)
         if found is None:
-            remedy = "Bring it back by undo or redo, and bake again: it goes on"
-            raise Removed(self.subject, "was removed while it was simulated", remedy)
+            raise Removed(self.subject, "was removed while it was simulated", "Undo or redo, and bake again")
         return found
 
     def progress(self) -> tuple[float, str]:

@@ -22,6 +22,10 @@ PANEL = "Physics > DR-GS Physics"
 _CACHES = "//drgs_cache"
 
 
+class Removed(UsageError):
+    """The object was removed while it was simulated."""
+
+
 def subject_of(obj: bpy.types.Object) -> str:
     """Name of an object in messages."""
     return f'Object "{obj.name}"'

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import bpy
 import numpy as np
 import pytest
 from scenes import mesh_object, new_world, part, read_exr
 from test_composed import CUBE, SIDES, add_light, painted
+from test_panels import Layout
 
 pytestmark = pytest.mark.blender_api
 
@@ -170,6 +173,9 @@ def test_a_second_scene_that_was_deleted_is_told_and_what_is_left_can_be_removed
     assert not compositing.bereft(scene)
     bpy.data.scenes.remove(compositing.partner_of(scene))
     assert compositing.bereft(scene) and bpy.ops.drgs.clear_compositing.poll()
+    told: list = []
+    part("addon.panels.compositing").DRGS_PT_compositing.draw(SimpleNamespace(layout=Layout(told)), bpy.context)
+    assert "deleted" in repr(told) and "drgs.clear_compositing" in repr(told)
     assert bpy.ops.drgs.clear_compositing() == {"FINISHED"}
     assert not compositing.bereft(scene) and not bpy.ops.drgs.clear_compositing.poll()
     assert not [node for node in nodes if node.label == compositing.LABEL]
