@@ -13,6 +13,7 @@ import bpy
 import numpy as np
 from mathutils.kdtree import KDTree
 
+from ..drgs_blender.core.errors import UsageError
 from . import mesh_arrays
 
 Array = np.ndarray
@@ -21,7 +22,7 @@ Array = np.ndarray
 FACES = 6
 #: Point attributes, one for each of them: its corners in the cage, their weights, and that of the normal.
 CORNERS, WEIGHTS, HEIGHT = (f"drgs_cage_{what}_{{}}" for what in ("corners", "weights", "height"))
-#: Property of the mesh: the points of what carries it, when it was bound.
+#: Property of the mesh, and point attribute: the points of what carries it, when it was bound.
 COUNT = "drgs_cage_points"
 #: Name of the node that knows the cage.
 SOURCE = "DR-GS Cage"
@@ -36,9 +37,13 @@ def check(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, warn: Callable[
     """Warn where what carries an evaluated object by nodes has another number of points than when it was bound."""
     bound = obj.original.data.get(COUNT)
     for modifier in obj.original.modifiers:
-        cage = cage_of(modifier)
         shown = modifier.show_render if depsgraph.mode == "RENDER" else modifier.show_viewport
-        if cage is None or bound is None or not shown:
+        if bound is None or not shown or not carries(modifier):
+            continue
+        if (cage := cage_of(modifier)) is None:
+            warn(
+                f'"{obj.name}": what carried it by modifier "{modifier.name}" is deleted. Remove the modifier, or undo'
+            )
             continue
         found = count_of(cage.evaluated_get(depsgraph))
         if found != bound:
@@ -46,6 +51,29 @@ def check(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, warn: Callable[
                 f'"{obj.name}": "{cage.name}", which carries it, has {found} points and had {bound} when it was bound, '
                 "so it does not follow. Keep their number, or bind again"
             )
+
+
+def carries(modifier: bpy.types.Modifier) -> bool:
+    """Whether it is one of `carry`, also where what carried is deleted."""
+    tree = modifier.node_group if modifier.type == "NODES" else None
+    return tree is not None and tree.nodes.get(SOURCE) is not None
+
+
+def check_free(obj: bpy.types.Object, name: str) -> None:
+    """UsageError where nodes of a modifier that is not called `name` carry an object: its mesh knows one carrier."""
+    for modifier in obj.modifiers:
+        if modifier.name != name and carries(modifier):
+            raise UsageError(
+                f'Object "{obj.name}"',
+                f'is carried by modifier "{modifier.name}"',
+                "Apply that or remove it, then bind",
+            )
+
+
+def note_count(mesh: bpy.types.Mesh, count: int) -> None:
+    """Keep how many points carry a mesh: its nodes move nothing where there are others."""
+    mesh[COUNT] = count
+    write(mesh, COUNT, "FLOAT", np.full(len(mesh.vertices), count))
 
 
 def count_of(cage: bpy.types.Object) -> int:
@@ -70,7 +98,7 @@ def carry(obj: bpy.types.Object, cage: bpy.types.Object, modifier: bpy.types.Mod
         write(obj.data, CORNERS.format(i), "FLOAT_VECTOR", corners[:, i])
         write(obj.data, WEIGHTS.format(i), "FLOAT_VECTOR", weights[:, i])
         write(obj.data, HEIGHT.format(i), "FLOAT", heights[:, i])
-    obj.data[COUNT] = len(vertices)
+    note_count(obj.data, len(vertices))
     trees = (t for t in bpy.data.node_groups if t.library is None and t.name.startswith(SOURCE) and _known(t) == cage)
     modifier.node_group = next(trees, None) or _tree(cage)
 
@@ -166,7 +194,7 @@ class Builder:
 
 def _tree(cage: bpy.types.Object) -> bpy.types.NodeTree:
     """Nodes that bring each vertex to the mean of where its faces are on `cage` now."""
-    build, place = begin(f"{SOURCE} {cage.name}", cage)
+    build, place, same = begin(f"{SOURCE} {cage.name}", cage)
     total = None
     for i in range(FACES):
         corners = [place(index) for index in build.parts(build.attribute(CORNERS.format(i), "FLOAT_VECTOR"))]
@@ -180,15 +208,15 @@ def _tree(cage: bpy.types.Object) -> bpy.types.NodeTree:
         for term in terms:
             total = term if total is None else build.vector("ADD", total, term)
     assert total is not None
-    return end(build, total)
+    return end(build, total, same)
 
 
 #: Gives the place of the point of an index.
 Place = Callable[[bpy.types.NodeSocket], bpy.types.NodeSocket]
 
 
-def begin(name: str, carrier: bpy.types.Object) -> tuple[Builder, Place]:
-    """A new tree of nodes for a modifier, and how it asks where points of `carrier` are."""
+def begin(name: str, carrier: bpy.types.Object) -> tuple[Builder, Place, bpy.types.NodeSocket]:
+    """A new tree of nodes for a modifier, how it asks where points of `carrier` are, whether it has as many as then."""
     tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
     tree.is_modifier = True
     for direction in ("INPUT", "OUTPUT"):
@@ -200,15 +228,19 @@ def begin(name: str, carrier: bpy.types.Object) -> tuple[Builder, Place]:
     def place(index: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         return build.out("GeometryNodeSampleIndex", shape, position, index, data_type="FLOAT_VECTOR", domain="POINT")
 
-    return build, place
+    bound = build.attribute(COUNT, "FLOAT")
+    found = [build.out("GeometryNodeAttributeDomainSize", shape, component=kind) for kind in ("MESH", "POINTCLOUD")]
+    same = [build.out("FunctionNodeCompare", n, bound, 0.5, data_type="FLOAT", operation="EQUAL") for n in found]
+    return build, place, build.out("FunctionNodeBooleanMath", *same, operation="OR")
 
 
-def end(build: Builder, places: bpy.types.NodeSocket) -> bpy.types.NodeTree:
-    """The tree, which brings each vertex to one of `places`."""
+def end(build: Builder, places: bpy.types.NodeSocket, chosen: bpy.types.NodeSocket) -> bpy.types.NodeTree:
+    """The tree, which brings each vertex that is `chosen` to one of `places`."""
     tree = build.tree
     given, result = tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
     moved = tree.nodes.new("GeometryNodeSetPosition")
     tree.links.new(given.outputs[0], moved.inputs["Geometry"])
+    tree.links.new(chosen, moved.inputs["Selection"])
     tree.links.new(places, moved.inputs["Position"])
     tree.links.new(moved.outputs["Geometry"], result.inputs[0])
     return tree

@@ -61,7 +61,7 @@ def carry(obj: bpy.types.Object, carrier: bpy.types.Object, modifier: bpy.types.
         cage_nodes.write(obj.data, INDICES.format(i), "FLOAT_VECTOR", index[:, three])
         cage_nodes.write(obj.data, WEIGHTS.format(i), "FLOAT_VECTOR", weight[:, three])
     cage_nodes.write(obj.data, LEFT, "FLOAT_VECTOR", left)
-    obj.data[cage_nodes.COUNT] = len(points)
+    cage_nodes.note_count(obj.data, len(points))
     modifier.node_group = _tree(carrier)
 
 
@@ -105,11 +105,11 @@ def _tree(carrier: bpy.types.Object) -> bpy.types.NodeTree:
         source = tree.nodes.get(cage_nodes.SOURCE) if tree.library is None and tree.name.startswith(NAME) else None
         if source is not None and source.inputs["Object"].default_value == carrier:
             return tree
-    build, place = cage_nodes.begin(name, carrier)
+    build, place, same = cage_nodes.begin(name, carrier)
     total = build.attribute(LEFT, "FLOAT_VECTOR")
     for i in range(_THREES):
         indices = build.parts(build.attribute(INDICES.format(i), "FLOAT_VECTOR"))
         weights = build.parts(build.attribute(WEIGHTS.format(i), "FLOAT_VECTOR"))
         for index, weight in zip(indices, weights):
             total = build.vector("ADD", total, build.scaled(place(index), weight))
-    return cage_nodes.end(build, total)
+    return cage_nodes.end(build, total, same)

@@ -6,10 +6,12 @@ simulations and nodes move it as they move any mesh, and the surfels follow.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import bpy
 import numpy as np
+from mathutils.kdtree import KDTree
 
 from ..drgs_blender.core.asset import Asset
 from ..drgs_blender.core.frame import ProxyMesh
@@ -17,10 +19,14 @@ from . import mesh_arrays
 
 Array = np.ndarray
 
-#: Attribute with the place of each vertex at rest, object space, metres.
+#: Attribute with the place of each vertex at rest, object space, metres; 0, as Blender has it, of those added later.
 REST = "drgs_rest"
+#: Modifiers that copy or thicken a mesh.
+_COPYING = {"ARRAY", "MIRROR", "SOLIDIFY", "BEVEL", "WIREFRAME", "SCREW"}
 #: Viewports show surfels by the rigid maps of so many parts of a proxy's length, each of its nearest vertices.
 _PARTS, _NEAREST = 32, 12
+#: Divisions that are kept.
+_KEPT = 8
 
 
 def is_proxy(mesh: bpy.types.Mesh, asset: Asset) -> bool:
@@ -32,6 +38,7 @@ def is_proxy(mesh: bpy.types.Mesh, asset: Asset) -> bool:
 
 def fill(mesh: bpy.types.Mesh, vertices: Array, triangles: Array) -> None:
     """Make an empty mesh a proxy of (n, 3) vertices and (m, 3) triangles, object space, which are at rest."""
+    vertices = np.where(vertices.any(axis=1, keepdims=True), vertices, 1e-9)
     mesh.clear_geometry()
     mesh.from_pydata(vertices.tolist(), [], triangles.tolist())
     attribute = mesh.attributes.new(REST, "FLOAT_VECTOR", "POINT")
@@ -39,17 +46,42 @@ def fill(mesh: bpy.types.Mesh, vertices: Array, triangles: Array) -> None:
     mesh.update()
 
 
+def check(obj: bpy.types.Object, rest: Array, warn: Callable[[str], None], *, final: bool) -> None:
+    """Warn of what an evaluated proxy has that does not move surfels as it looks; `rest` is that of `read_rest`."""
+    if lost := int((~np.isfinite(rest).all(axis=1)).sum()):
+        warn(
+            f'"{obj.name}": {lost} vertices of its proxy do not know where they are at rest (added by hand, or joined '
+            "to it), so they carry nothing"
+        )
+    for modifier in obj.original.modifiers:
+        if not (modifier.show_render if final else modifier.show_viewport):
+            continue
+        smooth = modifier.type == "SUBSURF" and modifier.subdivision_type != "SIMPLE"
+        if smooth and (modifier.render_levels if final else modifier.levels):
+            warn(
+                f'"{obj.name}": modifier "{modifier.name}" shrinks its proxy, and its surfels with it: set it to Simple'
+            )
+        elif modifier.type in _COPYING:
+            warn(
+                f'"{obj.name}": modifier "{modifier.name}" gives its proxy another shape, which surfels take for a '
+                "motion: disable it"
+            )
+
+
 def read(mesh: bpy.types.Mesh) -> ProxyMesh | None:
     """What an evaluated proxy does; None where it is as at rest.
 
-    Vertices of no face are left out where there are faces.
+    Vertices of no face are left out where there are faces, and those that do not know where they are at rest.
     """
     rest = read_rest(mesh)
     vertices, faces = mesh_arrays.read_vertices(mesh), mesh_arrays.loop_triangles(mesh)
+    known = np.isfinite(rest).all(axis=1)
+    faces = faces[known[faces].all(axis=1)]
+    used = np.flatnonzero(known)
     if len(faces):
         used, faces = np.unique(faces, return_inverse=True)
-        rest, vertices = np.ascontiguousarray(rest[used]), np.ascontiguousarray(vertices[used])
-        faces = np.ascontiguousarray(faces.reshape(-1, 3), np.int32)
+    rest, vertices = np.ascontiguousarray(rest[used]), np.ascontiguousarray(vertices[used])
+    faces = np.ascontiguousarray(faces.reshape(-1, 3), np.int32)
     if np.array_equal(rest, vertices):
         return None
     for array in (rest, vertices, faces):
@@ -58,15 +90,18 @@ def read(mesh: bpy.types.Mesh) -> ProxyMesh | None:
 
 
 def read_rest(mesh: bpy.types.Mesh) -> Array:
-    """(n, 3) float32 places of the vertices of a proxy at rest."""
+    """(n, 3) float32 places of the vertices of a proxy at rest; NaN of those that do not know theirs."""
     rest = np.empty((len(mesh.vertices), 3), np.float32)
     mesh.attributes[REST].data.foreach_get("vector", rest.ravel())
+    rest[~rest.any(axis=1)] = np.nan
     return rest
 
 
 class _Parts(NamedTuple):
     """Parts of space: which one each surfel is in, and the vertices that move each, at rest."""
 
+    centre: Array
+    rest: Array
     part: Array
     nearest: Array
     weight: Array
@@ -74,7 +109,8 @@ class _Parts(NamedTuple):
     offset: Array
 
 
-_parts: mesh_arrays.OfArrays[dict[bytes, _Parts]] = mesh_arrays.OfArrays(4)
+#: The last first. What is left of an asset is another array after every edit, so that values count.
+_parts: list[_Parts] = []
 
 
 def carried(centre: Array, proxy: ProxyMesh, rows: Array | slice = slice(None)) -> Array:
@@ -83,17 +119,19 @@ def carried(centre: Array, proxy: ProxyMesh, rows: Array | slice = slice(None)) 
     Parameters
     ----------
     centre : (n, 3) float32 array
-        Of the surfels at rest, the asset's own array.
+        Of the surfels at rest.
     proxy : ProxyMesh
     rows : (k,) int array or slice
         Chooses surfels.
     """
-    known = _parts.get(centre, dict)
-    key = proxy.rest.tobytes()
-    if key not in known:
-        known.clear()
-        known[key] = _divided(np.asarray(centre), proxy.rest)
-    parts = known[key]
+    for i, parts in enumerate(_parts):
+        if _same(parts.centre, centre) and _same(parts.rest, proxy.rest):
+            del _parts[i]
+            break
+    else:
+        parts = _divided(centre, proxy.rest)
+    _parts.insert(0, parts)
+    del _parts[_KEPT:]
     now = proxy.vertices.astype(np.float64)[parts.nearest]
     middle = np.einsum("pk,pkc->pc", parts.weight, now)
     moved = np.nan_to_num(now - middle[:, None])
@@ -106,25 +144,21 @@ def carried(centre: Array, proxy: ProxyMesh, rows: Array | slice = slice(None)) 
     return np.ascontiguousarray(found, np.float32)
 
 
+def _same(a: Array, b: Array) -> bool:
+    return a is b or np.array_equal(a, b)
+
+
 def _divided(centre: Array, rest: Array) -> _Parts:
     side = max(float(np.ptp(centre, axis=0).max()) / _PARTS, 1e-9)
     cells, part = np.unique(np.floor(centre / side).astype(np.int32), axis=0, return_inverse=True)
-    places, rest = (cells + 0.5) * side, rest.astype(np.float64)
-    count = min(_NEAREST, len(rest))
-    nearest = np.empty((len(places), count), np.int64)
-    squared = np.empty((len(places), count))
-    for first in range(0, len(places), 256):  # bounds memory
-        some = slice(first, first + 256)
-        away = _squares(places[some], rest)
-        nearest[some] = np.argpartition(away, count - 1, axis=1)[:, :count]
-        squared[some] = np.take_along_axis(away, nearest[some], axis=1)
-    weight = 1.0 / (squared + (0.25 * side) ** 2)
+    tree = KDTree(len(rest))
+    for number, vertex in enumerate(rest.tolist()):
+        tree.insert(vertex, number)
+    tree.balance()
+    found = [tree.find_n(place, min(_NEAREST, len(rest))) for place in ((cells + 0.5) * side).tolist()]
+    nearest = np.array([[hit[1] for hit in hits] for hits in found])
+    weight = 1.0 / (np.array([[hit[2] for hit in hits] for hits in found]) ** 2 + (0.25 * side) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
-    middle = np.einsum("pk,pkc->pc", weight, rest[nearest])
-    return _Parts(part.reshape(-1), nearest, weight, middle, rest[nearest] - middle[:, None])
-
-
-def _squares(a: Array, b: Array) -> Array:
-    """(n, m) squared distances."""
-    found = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * a @ b.T
-    return np.maximum(found, 0.0)
+    places = rest.astype(np.float64)[nearest]
+    middle = np.einsum("pk,pkc->pc", weight, places)
+    return _Parts(centre, rest, part.reshape(-1), nearest, weight, middle, places - middle[:, None])

@@ -95,6 +95,7 @@ def _check_carried(objects: list[bpy.types.Object], cage: bpy.types.Object) -> N
     for obj in selection.editable(objects, data=True) if objects else ():
         selection.check_size(obj)
         selection.check_size(cage)
+        cage_nodes.check_free(obj, NAME)
         if obj.data.users > 1:
             raise UsageError(
                 f'Object "{obj.name}"',

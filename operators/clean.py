@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty
 
-from ..addon import assets, mesh_arrays, surfel_points
+from ..addon import assets, mesh_arrays, proxies, surfel_points
 from ..addon.export.face_match import match_faces
 from ..addon.viewport.surfels import posed_centres
 from ..drgs_blender.core.asset import Asset
@@ -264,7 +264,7 @@ class DRGS_OT_crop(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
             bpy.data.meshes.remove(mesh)
             if not (left.all() and len(rows) == len(asset.surfels)):
                 obj.drgs.surfel_points = surfel_points.new_points(f"{obj.name} surfels", rows[left], places[left])
-            if gone.any() and len(gone) == len(obj.data.vertices):
+            if gone.any() and len(gone) == len(obj.data.vertices) and len(asset.mesh.vertices):
                 delete_vertices_or_faces(obj, vertices=gone)
             obj.update_tag()
         return {"FINISHED"}
@@ -303,13 +303,14 @@ def points_of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.type
     count, left = len(asset.surfels), surfel_points.left_of(obj, asset)
     rows = np.arange(count, dtype=np.int32) if left is None else left
     unfinished = surfel_points.is_unfinished(obj)
-    vertices = evaluated_vertices(obj, depsgraph)
+    vertices, shown = evaluated_vertices(obj, depsgraph), obj.evaluated_get(depsgraph).data
+    proxy = proxies.read(shown) if proxies.is_proxy(shown, asset) else None
     own = mesh_arrays.source_rows(obj.data, asset.mesh)
     if own is not None and len(own) == len(vertices):  # what was deleted stays where it was
         posed = asset.mesh.vertices.copy()
         posed[own[own >= 0]] = vertices[own >= 0]
         vertices = posed
-    places = posed_centres(asset, vertices)[rows]
+    places = (posed_centres(asset, vertices) if proxy is None else proxies.carried(asset.surfels.centre, proxy))[rows]
     obj.drgs.surfel_points = mesh = surfel_points.new_points(f"{obj.name} surfels", rows, places)
     before = known[surfel_points.SURFEL] if known is not None and unfinished else surfel_points.lacking(rows, count)
     mesh[surfel_points.SURFEL] = before.tolist() if isinstance(before, np.ndarray) else list(before)

@@ -41,6 +41,7 @@ class DRGS_OT_drive_from(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
         (carrier,) = others
         for obj in objects:
             selection.check_size(obj)
+            cage_nodes.check_free(obj, NAME)
             if obj.data.users > 1:
                 raise UsageError(
                     f'Object "{obj.name}"',

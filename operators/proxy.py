@@ -40,9 +40,11 @@ class DRGS_OT_add_proxy(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
         given = list(selection.of_type(context.selected_objects, "MESH"))
         if len(given) > 1:
             raise UsageError("Selection", f"holds {len(given)} other meshes", "Select one proxy, or none for a new one")
-        shapes = [shape_of(given[0], obj, context) if given else None for obj in _without_mesh(objects)]
-        for obj, shape in zip(objects, shapes):
-            vertices, triangles = shape or hull_of(context, obj, self.faces)
+        shapes = [
+            shape_of(given[0], obj, context) if given else hull_of(context, obj, self.faces)
+            for obj in _without_mesh(objects)
+        ]
+        for obj, (vertices, triangles) in zip(objects, shapes):
             selection.own_mesh(obj)
             proxies.fill(obj.data, vertices, triangles)
             obj.display_type = "WIRE"

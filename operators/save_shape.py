@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 from bpy.props import BoolProperty, StringProperty
 
-from ..addon import assets, blend_paths, mesh_arrays, surfel_points
+from ..addon import assets, blend_paths, mesh_arrays, proxies, surfel_points
 from ..addon.export.face_match import MOST, match_faces
 from ..addon.viewport_material import update_viewport_material
 from ..drgs_blender.core.asset import MATERIAL_CHANNELS, Asset, Mesh
@@ -112,6 +112,9 @@ def edit_of(obj: bpy.types.Object, asset: Asset) -> dict[str, Array]:
     """
     mesh, rest = obj.data, asset.mesh
     rows = mesh_arrays.source_rows(mesh, rest)
+    if proxies.is_proxy(mesh, asset):
+        problem = "has a proxy in place of a mesh, which is no shape of its surfels"
+        raise AssetError(f'Object "{obj.name}"', problem, "Choose Save Edited Asset, or export it as splats")
     if rows is None:
         raise AssetError(
             f'Object "{obj.name}"', f"its mesh has {len(mesh.vertices)} vertices, the asset {len(rest.vertices)}",

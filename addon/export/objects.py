@@ -171,6 +171,7 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
             state = ObjectState(obj.name, key_of(path), part=fit.part, proxy=proxies.read(mesh))
             state.adjustment = None if captured else _adjustment_of_all(obj, warn)
             given = mesh_arrays.read_vertices(mesh), proxies.read_rest(mesh)
+            proxies.check(obj, given[1], warn, final=depsgraph.mode == "RENDER")
             if state.proxy is not None and (particles := particles_of(obj, depsgraph, *given, warn)) is not None:
                 state.proxy, state.particles = None, replace(particles, all=True)
             return state

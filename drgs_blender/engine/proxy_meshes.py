@@ -14,7 +14,7 @@ from ..core.errors import AssetError
 from ..core.frame import ObjectState, ProxyMesh
 from ..deform.lattice_fit import LatticeFit
 
-_REMEDY = "Choose Add Proxy Mesh again"
+_REMEDY = "Delete its vertices, then choose Add Proxy Mesh"
 
 
 class _Known(NamedTuple):

@@ -149,3 +149,47 @@ def test_what_cannot_carry_is_refused_and_nothing_changes(ball):
     select(ball)
     with pytest.raises(RuntimeError, match="nothing that carries"):
         bpy.ops.drgs.drive_from()
+
+
+def moved(scene_object, of):
+    """Whether `of` is another place than its mesh says."""
+    return np.abs(world(scene_object) - of).max() > 1e-4
+
+
+@pytest.mark.parametrize("faces", [True, False], ids=["faces", "points"])
+def test_without_the_points_of_then_it_stays_and_that_is_told(ball, export, faces):
+    """With other points, with none, and when what carried it is deleted."""
+    carrier = mesh_object("Carrier", *sphere(6, 9)) if faces else cloud_of(grid())
+    before = world(ball)
+    drive(ball, carrier)
+    for vertices in (grid(2).tolist(), []):
+        carrier.data.clear_geometry()
+        carrier.data.from_pydata(vertices, [], [])
+        assert not moved(ball, before) and any("does not follow" in text for text in export()[1])
+    bpy.data.objects.remove(carrier)
+    assert not moved(ball, before) and any('"DR-GS Driver" is deleted' in text for text in export()[1])
+    ball.modifiers.clear()
+    bpy.context.view_layer.update()
+    assert not export()[1]
+
+
+def test_one_mesh_is_not_carried_twice_by_nodes(ball):
+    """It knows the faces of one carrier; the first would carry it by those of the second."""
+    body = mesh_object("Body", *sphere(6, 9))
+    vertices, faces = sphere(5, 7)
+    wing = [int(faces[0][0]), int(faces[0][1]), len(vertices)]  # three faces at an edge: Surface Deform refuses
+    cage = mesh_object("Cage", [*vertices, (0, 0, 3)], [*(list(map(int, face)) for face in faces), wing])
+    drive(ball, body)
+    before = world(ball)
+    select(cage, ball)
+    with pytest.raises(RuntimeError, match='carried by modifier "DR-GS Driver"'):
+        bpy.ops.drgs.bind_to_cage()
+    assert [m.name for m in ball.modifiers] == ["DR-GS Driver"]
+    body.location.x += 1
+    np.testing.assert_allclose(world(ball) - before, np.tile((1, 0, 0), (len(before), 1)), atol=1e-5)
+    ball.modifiers.clear()
+    select(cage, ball)
+    assert bpy.ops.drgs.bind_to_cage() == {"FINISHED"}
+    select(body, ball)
+    with pytest.raises(RuntimeError, match='carried by modifier "DR-GS Cage"'):
+        bpy.ops.drgs.drive_from()

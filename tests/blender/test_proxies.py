@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from math import radians
 
 import bpy
@@ -221,3 +222,106 @@ def test_a_modifier_that_forgets_the_proxy_is_named(cloud, export):
     bpy.context.view_layer.update()
     with pytest.raises(part("drgs_blender.core.errors").AssetError, match="New mesh"):
         export()
+
+
+def moved_up(obj, by):
+    obj.shape_key_add(name="Basis")
+    key = obj.shape_key_add(name="Up")
+    for point in key.data:
+        point.co.z += by
+    key.value = 1.0
+    bpy.context.view_layer.update()
+
+
+def test_vertices_that_are_added_or_joined_carry_nothing_and_are_told(cloud, export):
+    """Blender gives them 0 as their place at rest."""
+    select(cloud)
+    add_proxy()
+    count = len(cloud.data.vertices)
+    other = mesh_object("Other", *sphere(6, 8))
+    other.location = (30, 0, 0)
+    bpy.context.view_layer.update()
+    select(other, cloud)
+    bpy.ops.object.join()
+    cloud.data.vertices[0].co.z += 0.1
+    bpy.context.view_layer.update()
+    frame, warnings = export()
+    assert len(frame.objects[0].proxy.rest) == count < len(cloud.data.vertices)
+    added = len(cloud.data.vertices) - count
+    assert any(f"{added} vertices of its proxy do not know" in text for text in warnings)
+
+
+def test_a_vertex_in_the_origin_is_known(cloud, export):
+    select(cloud)
+    cage = mesh_object("Sheet", [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0), (0, 0, 0)], [(0, 1, 4), (2, 3, 4)])
+    cage.matrix_world = cloud.matrix_world
+    bpy.context.view_layer.update()
+    select(cage, cloud)
+    bpy.ops.drgs.add_proxy()
+    assert not export()[1] and export()[0].objects[0].proxy is None
+
+
+@pytest.mark.parametrize("kind", ["ARRAY", "MIRROR", "SOLIDIFY", "SUBSURF"])
+def test_modifiers_that_change_the_shape_of_a_proxy_are_named(cloud, export, kind):
+    select(cloud)
+    add_proxy()
+    cloud.modifiers.new("Other shape", kind)
+    bpy.context.view_layer.update()
+    assert any('"Other shape"' in text for text in export()[1])
+    cloud.modifiers[0].show_viewport = False
+    bpy.context.view_layer.update()
+    assert not export()[1]
+
+
+def test_surfels_are_edited_and_cropped_where_they_are_seen(cloud, scene):
+    select(cloud)
+    add_proxy()
+    moved_up(cloud, 2.0)
+    count = len(cloud.data.vertices)
+    box = bpy.data.objects.new("Box", None)
+    scene.collection.objects.link(box)
+    box.empty_display_type, box.matrix_world = "CUBE", cloud.matrix_world @ Matrix.Translation((0, 0, 3))
+    bpy.context.view_layer.update()
+    select(box, cloud)
+    assert bpy.ops.drgs.crop() == {"FINISHED"}
+    kept = part("addon.surfel_points").left_of(cloud, part("addon.assets").load(part("addon.assets").file_of(cloud)))
+    assert 0 < len(kept) < len(centres(cloud)) and (centres(cloud)[kept, 2] > -0.05).all()
+    assert len(cloud.data.vertices) == count
+    select(cloud)
+    bpy.ops.drgs.edit_surfels()
+    bpy.ops.object.mode_set(mode="OBJECT")
+    shown = part("addon.mesh_arrays").read_vertices(bpy.context.object.data)
+    np.testing.assert_allclose(shown, centres(cloud)[kept] + (0, 0, 2), atol=1e-4)
+
+
+def test_viewports_find_the_parts_of_what_is_left_once(cloud, export, monkeypatch):
+    """After an edit the surfels are another array at every update, and two objects may have one asset."""
+    select(cloud)
+    add_proxy()
+    moved_up(cloud, 0.5)
+    proxies, proxy, made = part("addon.proxies"), export()[0].objects[0].proxy, []
+    divided = proxies._divided
+    monkeypatch.setattr(proxies, "_divided", lambda *given: made.append(given) or divided(*given))
+    other = type(proxy)(proxy.rest * np.float32(1.1), proxy.vertices, proxy.faces)
+    for each in (proxy, other, proxy, other):
+        proxies.carried(centres(cloud)[::2].copy(), each)
+    assert len(made) == 2
+
+
+def test_one_that_has_no_room_for_a_proxy_leaves_the_others_as_they_are(cloud, scene, tmp_path):
+    container, model = (part(f"drgs_blender.core.asset.{name}") for name in ("container", "model"))
+    ball = asset_of(*sphere()).surfels
+    none = {f.name: value[:0] for f in fields(ball) if isinstance(value := getattr(ball, f.name), np.ndarray)}
+    container.write_asset(tmp_path / "none.drgs", model.Asset(replace(ball, **none), model.Mesh.empty()))
+    bpy.ops.import_scene.drgs(filepath=str(tmp_path / "none.drgs"))
+    select(cloud, bpy.context.object)
+    with pytest.raises(RuntimeError, match="has no surfels"):
+        bpy.ops.drgs.add_proxy()
+    assert not len(cloud.data.vertices)
+
+
+def test_a_proxy_is_not_saved_as_a_shape(cloud, tmp_path):
+    select(cloud)
+    add_proxy()
+    with pytest.raises(RuntimeError, match="has a proxy in place of a mesh"):
+        bpy.ops.drgs.save_shape(filepath=str(tmp_path / "shape.drgs"))
