@@ -42,6 +42,9 @@ class DRGS_OT_drive_from(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
         for obj in objects:
             selection.check_size(obj)
             cage_nodes.check_free(obj, NAME)
+            if obj in shaped_by(carrier):
+                problem = f'shapes "{carrier.name}", which should carry it'
+                raise UsageError(f'Object "{obj.name}"', problem, "Remove the modifier there, or apply it")
             if obj.data.users > 1:
                 raise UsageError(
                     f'Object "{obj.name}"',
@@ -76,6 +79,22 @@ def drive(context: bpy.types.Context, objects: list[bpy.types.Object], carrier: 
         context.view_layer.update()
         (cage_nodes if faces else point_nodes).carry(obj, carrier, modifier)
     context.view_layer.update()
+
+
+def shaped_by(carrier: bpy.types.Object) -> set[bpy.types.Object]:
+    """The objects that shape another by its modifiers, and those that shape these."""
+    found: set[bpy.types.Object] = set()
+    left = [carrier]
+    while left:
+        for modifier in left.pop().modifiers:
+            given = [getattr(modifier, p.identifier) for p in modifier.bl_rna.properties if p.type == "POINTER"]
+            if modifier.type == "NODES" and modifier.node_group is not None:
+                given += [modifier[key] for key in modifier.keys()]  # noqa: SIM118 - no dictionary
+                given += [s.default_value for n in modifier.node_group.nodes for s in n.inputs if s.type == "OBJECT"]
+            new = {other for other in given if isinstance(other, bpy.types.Object)} - found
+            found |= new
+            left += new
+    return found
 
 
 def particles_of(context: bpy.types.Context, emitter: bpy.types.Object) -> bpy.types.Object:

@@ -174,7 +174,11 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
             raise UsageError("Export", "no selected object is a DR-GS object", "Select one")
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
-        write_alembic(context, target, frames, names if self.use_selection else [], self.scale)
+        written = write_alembic(context, target, frames, names if self.use_selection else [], self.scale)
+        for obj in map(context.view_layer.objects.get, written):
+            if not len(assets.load(assets.file_of(obj)).mesh.vertices):
+                found = "only its proxy" if len(obj.data.vertices) else "nothing"
+                self.warn(f'"{obj.name}" has no mesh: {target.name} has {found} of it. A USD sequence has its surfels')
         self.report({"INFO"}, f"{target.name}: {LOST_IN_ALEMBIC}")
         return {"FINISHED"}
 

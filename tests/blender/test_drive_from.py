@@ -193,3 +193,26 @@ def test_one_mesh_is_not_carried_twice_by_nodes(ball):
     select(body, ball)
     with pytest.raises(RuntimeError, match='carried by modifier "DR-GS Cage"'):
         bpy.ops.drgs.drive_from()
+
+
+@pytest.mark.parametrize("between", [False, True])
+def test_what_it_shapes_itself_cannot_carry_it(ball, between):
+    """Blender would evaluate one of them without the other."""
+    body = mesh_object("Body", *sphere(6, 9))
+    target = ball
+    if between:
+        target = mesh_object("Between", *sphere(6, 9))
+        tree = bpy.data.node_groups.new("Shape", "GeometryNodeTree")
+        tree.nodes.new("GeometryNodeObjectInfo").inputs["Object"].default_value = ball
+        target.modifiers.new("Shape", "NODES").node_group = tree
+    body.modifiers.new("Wrap", "SHRINKWRAP").target = target
+    select(body, ball)
+    with pytest.raises(RuntimeError, match='shapes "Body"'):
+        bpy.ops.drgs.drive_from()
+    assert not len(ball.modifiers)
+    body.modifiers.clear()
+    body.parent = ball  # moves it, does not shape it
+    bpy.context.view_layer.update()
+    before = world(ball)
+    drive(ball, body)
+    assert not moved(ball, before)

@@ -325,3 +325,11 @@ def test_a_proxy_is_not_saved_as_a_shape(cloud, tmp_path):
     add_proxy()
     with pytest.raises(RuntimeError, match="has a proxy in place of a mesh"):
         bpy.ops.drgs.save_shape(filepath=str(tmp_path / "shape.drgs"))
+
+
+def test_an_alembic_file_of_a_proxy_is_told(cloud, tmp_path, capfd):
+    """It has no surfels; the proxy alone is not what was captured."""
+    select(cloud)
+    add_proxy()
+    bpy.ops.drgs.export("EXEC_DEFAULT", filepath=str(tmp_path / "x.abc"), format="Alembic sequence", frame_end=2)
+    assert '"cloud" has no mesh: x.abc has only its proxy' in capfd.readouterr().out
