@@ -89,12 +89,20 @@ def shaped_by(carrier: bpy.types.Object) -> set[bpy.types.Object]:
         for modifier in left.pop().modifiers:
             given = [getattr(modifier, p.identifier) for p in modifier.bl_rna.properties if p.type == "POINTER"]
             if modifier.type == "NODES" and modifier.node_group is not None:
-                given += [modifier[key] for key in modifier.keys()]  # noqa: SIM118 - no dictionary
+                given += _inputs_of(modifier)
                 given += [s.default_value for n in modifier.node_group.nodes for s in n.inputs if s.type == "OBJECT"]
             new = {other for other in given if isinstance(other, bpy.types.Object)} - found
             found |= new
             left += new
     return found
+
+
+def _inputs_of(modifier: bpy.types.Modifier) -> list[object]:
+    """What a nodes modifier is given in its panel."""
+    if not hasattr(modifier, "properties"):  # before Blender 5.2
+        return [modifier[key] for key in modifier.keys()]  # noqa: SIM118 - no dictionary
+    inputs = modifier.properties.inputs
+    return [getattr(getattr(inputs, p.identifier), "value", None) for p in inputs.bl_rna.properties]
 
 
 def particles_of(context: bpy.types.Context, emitter: bpy.types.Object) -> bpy.types.Object:

@@ -195,7 +195,7 @@ def test_one_mesh_is_not_carried_twice_by_nodes(ball):
         bpy.ops.drgs.drive_from()
 
 
-@pytest.mark.parametrize("between", [False, True])
+@pytest.mark.parametrize("between", ["", "a node", "an input"])
 def test_what_it_shapes_itself_cannot_carry_it(ball, between):
     """Blender would evaluate one of them without the other."""
     body = mesh_object("Body", *sphere(6, 9))
@@ -203,8 +203,16 @@ def test_what_it_shapes_itself_cannot_carry_it(ball, between):
     if between:
         target = mesh_object("Between", *sphere(6, 9))
         tree = bpy.data.node_groups.new("Shape", "GeometryNodeTree")
-        tree.nodes.new("GeometryNodeObjectInfo").inputs["Object"].default_value = ball
-        target.modifiers.new("Shape", "NODES").node_group = tree
+        modifier = target.modifiers.new("Shape", "NODES")
+        if between == "a node":
+            tree.nodes.new("GeometryNodeObjectInfo").inputs["Object"].default_value = ball
+        else:
+            name = tree.interface.new_socket("By", in_out="INPUT", socket_type="NodeSocketObject").identifier
+        modifier.node_group = tree
+        if between == "an input" and hasattr(modifier, "properties"):
+            getattr(modifier.properties.inputs, name).value = ball
+        elif between == "an input":
+            modifier[name] = ball
     body.modifiers.new("Wrap", "SHRINKWRAP").target = target
     select(body, ball)
     with pytest.raises(RuntimeError, match='shapes "Body"'):

@@ -161,3 +161,26 @@ def test_what_is_no_proxy_is_refused_by_name(session, frame, what):
     frame.objects[0].proxy = broken(what)
     with pytest.raises(AssetError, match=frame.objects[0].name):
         session.render(frame)
+
+
+def test_another_proxy_of_as_many_vertices_is_not_taken_for_the_last_one(session, frame):
+    """A proxy made anew: where its vertices are at rest counts."""
+    posed(session, frame, proxy=proxy_of(bent))
+    other = proxy_of(lambda rest: 1.1 * rest + (0, 0, 0.5))
+    other.rest = np.ascontiguousarray(np.float32(1.1) * other.rest)
+    before = posed(session, frame).centre.copy()
+    posed(session, frame, proxy=proxy_of(bent))
+    assert np.abs(posed(session, frame, proxy=other).centre - before - (0, 0, 0.5)).max() < 1e-4
+
+
+def test_a_proxy_is_fitted_once_for_all_frames_and_objects(session, frame):
+    """Two objects that move apart share it; without them it is forgotten."""
+    proxies = session._scene_cache._proxies
+    posed(session, frame, proxy=proxy_of())
+    (known,) = proxies._known
+    first = replace(frame.objects[0], proxy=proxy_of(bent))
+    both = replace(frame, objects=[first, replace(first, name="other", proxy=proxy_of(lambda rest: rest + 1))])
+    session.prepare(both)
+    assert [each.fit is known.fit for each in proxies._known] == [True]
+    posed(session, frame)
+    assert not proxies._known
