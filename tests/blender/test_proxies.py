@@ -333,3 +333,14 @@ def test_an_alembic_file_of_a_proxy_is_told(cloud, tmp_path, capfd):
     add_proxy()
     bpy.ops.drgs.export("EXEC_DEFAULT", filepath=str(tmp_path / "x.abc"), format="Alembic sequence", frame_end=2)
     assert '"cloud" has no mesh: x.abc has only its proxy' in capfd.readouterr().out
+
+
+def test_viewports_turn_what_lies_beside_a_sheet(cloud):
+    """Points in a plane have a mirror image on each side: only one is a turn."""
+    axis = np.linspace(-1, 1, 9)
+    rest = np.stack([*np.meshgrid(axis, axis), np.zeros((9, 9))], -1).reshape(-1, 3).astype(np.float32)
+    frame, proxies = part("drgs_blender.core.frame"), part("addon.proxies")
+    for axis, angle in (("X", 0.5), ("Y", 2.0), ("Z", 3.0)):
+        turn = np.array(Matrix.Rotation(angle, 3, axis), np.float32)
+        proxy = frame.ProxyMesh(rest, rest @ turn.T, np.zeros((0, 3), np.int32))
+        np.testing.assert_allclose(proxies.carried(centres(cloud), proxy), centres(cloud) @ turn.T, atol=1e-3)
