@@ -103,6 +103,8 @@ def export_frame(
                 lights.append(light if others == "SEEN" else replace(light, camera=False))
         elif item.object.type in UNRENDERED:
             unrendered.add(item.object)
+        elif item.is_hair:
+            meshes.add(item)
         elif assets.is_drgs(item.object):
             objects.add(item)
         else:

@@ -12,18 +12,23 @@ import numpy as np
 from ...drgs_blender.core.errors import Cancelled, first_of
 from ...drgs_blender.core.frame import Visibility
 from .. import assets, splat_attributes
+from . import hair
 
 T = TypeVar("T")
 Warn = Callable[[str], None]
 
 #: What has a surface that a picture without it would lack, by the type of the object.
-UNRENDERED = {"CURVES": "hair", "POINTCLOUD": "point cloud", "VOLUME": "volume"}
+UNRENDERED = {"POINTCLOUD": "point cloud", "VOLUME": "volume"}
+#: What of it is rendered.
+RENDERED = ("MESH", "LIGHT", "CURVES")
+#: At the end of the number in an instance's key: the hair on it.
+_HAIR = -1
 _SPLATS = "splat"
 #: What to do about a kind of them.
 _REMEDIES = {_SPLATS: "; Object > Convert > DR-GS makes objects of them that are"}
 
 
-#: Identifies an instance, at any time: its object, what makes it, its number there.
+#: Identifies an instance, at any time: its object, what makes it, its number there (and that of the hair on it).
 Key = tuple[int, int, tuple[int, ...]]
 
 
@@ -43,6 +48,7 @@ class Visible:
     Attributes
     ----------
     parent : the original object that makes the instance; None for an object itself
+    is_particle_hair : whether it is the hair on the object, not the object
     """
 
     key: Key
@@ -50,10 +56,16 @@ class Visible:
     matrix_world: np.ndarray
     visibility: Visibility
     parent: bpy.types.Object | None = None
+    is_particle_hair: bool = False
+
+    @property
+    def is_hair(self) -> bool:
+        """Whether it consists of strands."""
+        return self.is_particle_hair or self.object.type == "CURVES"
 
 
 def visible(depsgraph: bpy.types.Depsgraph) -> Iterator[Visible]:
-    """Meshes, lights and what cannot be rendered. Valid during the iteration only.
+    """Meshes, lights, hair and what cannot be rendered. Valid during the iteration only.
 
     Curves, texts, surfaces and metaballs appear twice, as themselves and as the mesh they were made into; only the
     mesh is given.
@@ -62,7 +74,9 @@ def visible(depsgraph: bpy.types.Depsgraph) -> Iterator[Visible]:
     known: dict[tuple[int, int], Visibility | None] = {}
     for instance in depsgraph.object_instances:
         obj = instance.object
-        if not instance.show_self or not (obj.type in ("MESH", "LIGHT") or obj.type in UNRENDERED):
+        is_shown = instance.show_self and (obj.type in RENDERED or obj.type in UNRENDERED)
+        is_furry = instance.show_particles and _is_furry(instance, depsgraph)
+        if not (is_shown or is_furry):
             continue
         parent = instance.parent if instance.is_instance else None
         key = obj.original.as_pointer(), parent.original.as_pointer() if parent else 0
@@ -72,7 +86,19 @@ def visible(depsgraph: bpy.types.Depsgraph) -> Iterator[Visible]:
         if visibility is not None:
             number = tuple(instance.persistent_id) if parent else ()
             matrix = np.array(instance.matrix_world, np.float64, order="C")
-            yield Visible((*key, number), obj, matrix, visibility, parent.original if parent else None)
+            maker = parent.original if parent else None
+            if is_shown:
+                yield Visible((*key, number), obj, matrix, visibility, maker)
+            if is_furry:
+                yield Visible((*key, (*number, _HAIR)), obj, matrix, visibility, maker, is_particle_hair=True)
+
+
+def _is_furry(instance: bpy.types.DepsgraphObjectInstance, depsgraph: bpy.types.Depsgraph) -> bool:
+    """Whether hair grows on an instance: not on what Geometry Nodes make of its object."""
+    obj = instance.object
+    if next(hair.systems(obj, depsgraph.mode), None) is None:
+        return False
+    return not instance.is_instance or obj.data == obj.original.evaluated_get(depsgraph).data
 
 
 def uncancelled(items: Iterable[T], cancelled: Callable[[], bool] | None) -> Iterator[T]:
@@ -116,14 +142,12 @@ class Unrendered:
         self._names: dict[str, set[str]] = {}
 
     def add(self, obj: bpy.types.Object) -> None:
-        """Remember an object of a type in `UNRENDERED`, splats as points or as vertices, or the hair on another."""
+        """Remember an object of a type in `UNRENDERED`, or splats as points or as vertices."""
         kind = None if assets.shows_anchor(obj) else UNRENDERED.get(obj.type)
         if obj.type == "POINTCLOUD" or (obj.type == "MESH" and not obj.data.polygons):
             kind = _SPLATS if splat_attributes.is_splats(obj.data) else kind
         if kind is not None:
             self._names.setdefault(kind, set()).add(obj.name)
-        elif any(p.settings.type == "HAIR" and p.settings.render_type == "PATH" for p in obj.particle_systems):
-            self._names.setdefault("hair", set()).add(obj.name)
 
     def report(self, warn: Warn) -> None:
         """One warning per kind."""

@@ -32,6 +32,8 @@ _KINDS = {
     "INT8": ("value", 1),
     "BOOLEAN": ("value", 1),
 }
+#: What the node Hair Info says of strands (see `hair`), as attributes, and their domain.
+HAIR_INFO = {"Hair Info: Intercept": "POINT", "Hair Info: Random": "CURVE"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +63,13 @@ class LayerRef:
         return " ".join(part for part in (self.source, self.name, place, self.mark) if part)
 
     def values(self, mesh: bpy.types.Mesh, corners: Array, polygons: Array, corner_vertices: Array) -> Array | None:
-        """(m, 3, 2) or (m, 3, 4) float32 at the corners (m, 3) of triangles; None where the mesh has no such thing."""
+        """(m, 3, 2) or (m, 3, 4) float32 at the corners (m, 3) of triangles; None where the mesh has no such thing.
+
+        `mesh` may be `hair.Hair`, which knows its corners.
+        """
+        if hasattr(mesh, "layer"):
+            found = mesh.layer(self)
+            return None if found is None else np.asarray(found)
         if self.source == "uv":
             uvs = mesh_arrays.read_uvs(mesh, self.name)
             return None if uvs is None else uvs[corners]
@@ -139,6 +147,8 @@ class AttributeRef:
 
 def attribute_values(mesh: bpy.types.Mesh, name: str) -> Array | None:
     """(n, 4) float32 values of a mesh's attribute as Cycles reads them, colours linear; None without any."""
+    if hasattr(mesh, "attribute_values"):
+        return mesh.attribute_values(name)  # of `hair.Hair`
     attribute = mesh.attributes.get(name)
     if attribute is None or attribute.data_type not in _KINDS or attribute.domain == "EDGE" or not len(attribute.data):
         return None

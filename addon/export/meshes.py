@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import bpy
 import numpy as np
@@ -12,9 +14,11 @@ import numpy as np
 from ...drgs_blender.core.arrays import shareable
 from ...drgs_blender.core.frame import Layer, MeshState
 from ...drgs_blender.core.materials import Image
+from ...drgs_blender.core.strands import Tubes
 from .. import mesh_arrays
 from ..bakes.requests import Wanted
 from .export_cache import ExportCache, uid
+from .hair import Hair, Strands, read_strands
 from .holdouts import Holdouts
 from .instances import Key, Visible, terminator_offset
 from .light_links import LightLinks
@@ -63,9 +67,27 @@ class _Arrays:
             mesh_arrays.smooth_or_corner_normals(mesh) if at_corners else None,
         )
 
+    @classmethod
+    def of_hair(cls, hair: Hair) -> _Arrays:
+        """Those of strands, whose tubes are theirs alone."""
+        made = hair.tubes
+        count = len(made.faces)
+        index = hair.strands.slot[made.strand[made.ring]]
+        return cls(
+            _shared(made.vertices, np.float32),
+            np.arange(3 * count, dtype=np.int32).reshape(-1, 3),
+            np.arange(count, dtype=np.int32),
+            made.faces.ravel(),
+            index if index.any() else None,
+            _shared(made.normals, np.float32),
+            None,
+        )
 
-#: Reads them of an evaluated mesh, or knows them.
-ReadArrays = Callable[[bpy.types.Mesh], _Arrays]
+
+#: What is exported as a mesh; hair answers for itself where Blender's meshes are read by `mesh_arrays`.
+Surface: TypeAlias = bpy.types.Mesh | Hair
+#: Reads them of an evaluated mesh or of hair, or knows them.
+ReadArrays = Callable[[Surface], _Arrays]
 
 
 class Meshes:
@@ -87,23 +109,31 @@ class Meshes:
         self._shapes: dict[tuple[object, ...], _Shape] = {}
 
     def add(self, item: Visible) -> None:
-        """Take in a visible instance of a mesh."""
+        """Take in a visible instance of a mesh, or of hair."""
         obj = item.object
         slots, sent = self._materials.slots(obj), self._links.numbers_of(item)
         owners = uid(obj.data), uid(obj)
-        stands = (*owners, obj.data.as_pointer(), obj.data.is_editmode)
+        stands = (*owners, obj.data.as_pointer(), item.is_hair or obj.data.is_editmode, item.is_particle_hair)
 
-        def arrays(mesh: bpy.types.Mesh) -> _Arrays:
-            return self._cache.get(("arrays", *stands), owners, lambda: _Arrays.read(mesh))
+        def read() -> AbstractContextManager[Surface]:
+            if not item.is_hair:
+                return _read(obj, self._depsgraph)
+            strands, made = self._cache.get(("strands", *stands), owners, lambda: self._strands(obj))
+            return contextlib.nullcontext(Hair(obj, strands, made, self._depsgraph.mode))
+
+        def arrays(mesh: Surface) -> _Arrays:
+            make = _Arrays.of_hair if isinstance(mesh, Hair) else _Arrays.read
+            return self._cache.get(("arrays", *stands), owners, lambda: make(mesh))
 
         def material_index() -> Array | None:
-            with _read(obj, self._depsgraph) as mesh:
+            with read() as mesh:
                 return arrays(mesh).material_index
 
         item = self._holdouts.cut_out(item, slots, material_index)
         rays = item.visibility
         key = (
             obj.data.as_pointer(),
+            item.is_particle_hair,
             *(m.as_pointer() if m else 0 for m in slots),
             *(getattr(rays, name) for name in rays.__slots__),
             self._with_uv_map,
@@ -115,7 +145,7 @@ class Meshes:
         shape = self._shapes.get(key)
         if shape is None:
             state, pictures, bakes = self._cache.get(
-                ("mesh", *stands, obj.name, *key), owners, lambda: self._state(item, slots, arrays)
+                ("mesh", *stands, obj.name, *key), owners, lambda: self._state(item, slots, arrays, read)
             )
             self._materials.images |= pictures
             shape = self._shapes[key] = _Shape(state)
@@ -145,12 +175,21 @@ class Meshes:
         """Instance keys of each of `states`, one per matrix."""
         return [shape.keys for shape in self._shapes.values() if shape.state is not None]
 
+    def _strands(self, obj: bpy.types.Object) -> tuple[Strands, Tubes]:
+        strands = read_strands(obj, self._depsgraph.mode)
+        return strands, strands.tubes(obj.name, self._warn)
+
     def _state(
-        self, item: Visible, slots: list[bpy.types.Material | None], arrays: ReadArrays
+        self,
+        item: Visible,
+        slots: list[bpy.types.Material | None],
+        arrays: ReadArrays,
+        read: Callable[[], AbstractContextManager[Surface]],
     ) -> tuple[MeshState | None, dict[str, Image], SurfaceBakes | None]:
         """What all instances share, the images on it and its bakes; None where the mesh has no faces that are seen."""
-        with _read(item.object, self._depsgraph) as mesh:
-            bakes = None if self._wanted is None else SurfaceBakes(self._wanted, item.object, mesh, slots)
+        with read() as mesh:
+            wanted = None if item.is_hair else self._wanted  # hair has no texels
+            bakes = None if wanted is None else SurfaceBakes(wanted, item.object, mesh, slots)
             state = self._describe(item, mesh, slots, arrays, bakes)
         if bakes is not None:
             bakes.end()
@@ -159,7 +198,7 @@ class Meshes:
     def _describe(
         self,
         item: Visible,
-        mesh: bpy.types.Mesh,
+        mesh: Surface,
         slots: list[bpy.types.Material | None],
         read: ReadArrays,
         bakes: SurfaceBakes | None,
@@ -201,7 +240,7 @@ class Meshes:
         )
 
     def _layers(
-        self, name: str, mesh: bpy.types.Mesh, elements: tuple[Array, Array, Array], exported: list[ExportedMaterial]
+        self, name: str, mesh: Surface, elements: tuple[Array, Array, Array], exported: list[ExportedMaterial]
     ) -> list[Layer]:
         """All that textures of its materials refer to besides the UV map that each asks for first."""
         found = []
@@ -220,13 +259,13 @@ class Meshes:
             "choose a map that it has"
         )
 
-    def _uv_map(self, mesh: bpy.types.Mesh, corners: Array) -> Array | None:
+    def _uv_map(self, mesh: Surface, corners: Array) -> Array | None:
         """(m, 3, 2) float32 frozen: the UV map that renders, for the pass UV; None without one."""
-        values = mesh_arrays.read_uvs(mesh, "") if self._with_uv_map else None
+        values = _uvs_of(mesh, "") if self._with_uv_map else None
         return None if values is None else _taken(values, corners)
 
     def _uvs(
-        self, name: str, mesh: bpy.types.Mesh, corners: Array, index: Array | None, exported: list[ExportedMaterial]
+        self, name: str, mesh: Surface, corners: Array, index: Array | None, exported: list[ExportedMaterial]
     ) -> Array | None:
         """(m, 3, 2) float32 frozen: for every face the UV map that its material asks for; None where none does."""
         requested = [material.uv_map for material in exported]
@@ -234,7 +273,7 @@ class Meshes:
             return None
         uvs = shareable((len(corners), 3, 2), np.float32)
         for uv_map in {u for u in requested if u is not None}:
-            values = mesh_arrays.read_uvs(mesh, uv_map)
+            values = _uvs_of(mesh, uv_map)
             if values is None:
                 self._lacks_uvs(name, uv_map)
                 continue
@@ -247,6 +286,11 @@ class Meshes:
             else:
                 uvs[faces] = values[corners[faces]]
         return _frozen(uvs)
+
+
+def _uvs_of(mesh: Surface, name: str) -> Array | None:
+    """(l, 2) float32 of a UV map; "" is the one that renders."""
+    return mesh.corner_uvs(name) if isinstance(mesh, Hair) else mesh_arrays.read_uvs(mesh, name)
 
 
 @contextlib.contextmanager

@@ -12,6 +12,7 @@ from ...drgs_blender.core.asset.part import Part
 from ...drgs_blender.core.frame import Frame, MotionStep, Pose
 from .. import assets, mesh_arrays
 from .camera import export_camera, picture_of
+from .hair import read_strands
 from .instances import Key, uncancelled, visible
 
 Array = np.ndarray
@@ -75,7 +76,7 @@ def _moment(
     shape_of = {key: ("object", i) for i, key in enumerate(object_keys)}
     shape_of |= {key: ("mesh", i) for i, keys in enumerate(mesh_keys) for key in keys}
     matrices: dict[Key, Array] = {}
-    read: dict[int, Array] = {}
+    read: dict[tuple[int, bool], Array] = {}
     vertices: dict[tuple[str, int], Array] = {}
     for item in uncancelled(visible(depsgraph), cancelled):
         if item.key not in shape_of:
@@ -83,13 +84,16 @@ def _moment(
         matrices[item.key] = item.matrix_world
         shape, mesh = shape_of[item.key], item.object.data
         # While a mesh is edited, its evaluated data has no arrays; nor does it move.
-        if shape not in vertices and not mesh.is_editmode:
-            pointer = mesh.as_pointer()
-            if pointer not in read:
+        if shape not in vertices and (item.is_hair or not mesh.is_editmode):
+            which = mesh.as_pointer(), item.is_hair
+            if which not in read:
                 part = frame.objects[shape[1]].part if shape[0] == "object" else None
-                read[pointer] = mesh_arrays.read_vertices(mesh) if part is None else _vertices(item.object, part)
-                read[pointer].flags.writeable = False
-            vertices[shape] = read[pointer]
+                if item.is_hair:
+                    read[which] = read_strands(item.object, depsgraph.mode).tubes().vertices
+                else:
+                    read[which] = mesh_arrays.read_vertices(mesh) if part is None else _vertices(item.object, part)
+                read[which].flags.writeable = False
+            vertices[shape] = read[which]
 
     def moved(shape: tuple[str, int], now: Array | None) -> Array | None:
         other = vertices.get(shape)

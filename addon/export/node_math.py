@@ -144,3 +144,23 @@ def _conductor_at(n: Array, k: Array, cosine: float) -> Array:
     s = (length + square - 2 * a * cosine) / (length + square + 2 * a * cosine)
     p = s * (square * length + sine * sine - 2 * a * cosine * sine)
     return (s + p / (square * length + sine * sine + 2 * a * cosine * sine)) / 2
+
+
+def _roughness_factor(rough: Array) -> Array:
+    """Chiang et al. 2016, equation 9, in the radial roughness."""
+    x = np.clip(rough, 0, 1)
+    return (((((0.245 * x) + 5.574) * x - 10.73) * x + 2.532) * x - 0.215) * x + 5.969
+
+
+def hair_colour(absorption: Array, rough: Array) -> Array:
+    """Colour of many hairs together by what one absorbs per radius (Chiang et al. 2016)."""
+    return np.exp(-np.sqrt(np.maximum(absorption, 0)) * _roughness_factor(rough))
+
+
+def melanin_colour(melanin: Array, redness: Array, tint: Array, rough: Array) -> Array:
+    """Colour of many hairs together by their pigment, as Cycles' Principled Hair BSDF reads it."""
+    amount = -np.log(np.maximum(1 - np.clip(melanin, 0, 1), 1e-4))
+    red = np.clip(redness, 0, 1)
+    pigment = (1 - red) * np.array((0.506, 0.841, 1.653)) + red * np.array((0.343, 0.733, 1.924))
+    dye = (np.log(np.clip(tint, 1e-5, 1)) / _roughness_factor(rough)) ** 2
+    return hair_colour(amount * pigment + dye, rough)

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 
 from . import images
-from .layers import AttributeRef, LayerRef, attribute_values, colour_average
+from .layers import HAIR_INFO, AttributeRef, LayerRef, attribute_values, colour_average
 from .node_math import reflectance
 from .nodes import Walker, euler, vector_rotate
 from .socket_value import Array, SocketValue, Warn, uniform
@@ -26,7 +26,8 @@ class TextureWalker(Walker):
     ) -> None:
         super().__init__(f'Material "{material.name}"', warn, approximate)
         self.material, self.mesh = material, mesh
-        self.uses_mesh = False
+        #: Hair is never baked, so its materials are its own.
+        self.uses_mesh = not isinstance(mesh, bpy.types.Mesh)
 
     def report(self, problem: str) -> None:
         """Warn of the material as a whole."""
@@ -123,6 +124,13 @@ class TextureWalker(Walker):
         if (np.ptp(values, axis=0) == 0).all():
             return SocketValue(texture.mean(self._warn))
         return SocketValue(np.ones(3), texture)
+
+    def node_hair_info(self, output: SocketRef) -> SocketValue:
+        is_hair = not isinstance(self.mesh, bpy.types.Mesh)
+        if output.socket.name == "Is Strand":
+            return uniform(float(is_hair))
+        name = f"Hair Info: {output.socket.name}"
+        return self.attribute(output, name) if is_hair and name in HAIR_INFO else self.nearest(output, output)
 
     def node_ambient_occlusion(self, output: SocketRef) -> SocketValue:
         if output.socket.type == "RGBA":
