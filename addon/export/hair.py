@@ -11,9 +11,10 @@ from typing import Any
 
 import bpy
 import numpy as np
+from mathutils.bvhtree import BVHTree
 
-from ...drgs_blender.core.color import srgb_to_linear
 from ...drgs_blender.core.strands import MOST_TRIANGLES, SIDES, Tubes, triangle_count, tubes
+from .. import mesh_arrays
 from .layers import HAIR_INFO, LayerRef, attribute_values
 
 Array = np.ndarray
@@ -87,12 +88,12 @@ def read_strands(obj: bpy.types.Object, mode: str) -> Strands:
 
 
 def _of_curves(data: Any) -> Strands:
-    offsets = np.zeros(len(data.curve_offset_data), np.int32)
-    data.curve_offset_data.foreach_get("value", offsets)
+    offsets = np.zeros(len(data.curves) + 1, np.int32)
+    if len(data.curves):
+        data.curve_offset_data.foreach_get("value", offsets)
     points = np.zeros((len(data.points), 3), np.float32)
     if len(points):
         data.attributes["position"].data.foreach_get("vector", points.ravel())
-    slot = np.zeros(max(len(offsets) - 1, 0), np.int32)
     radii = np.full(len(points), _RADIUS, np.float32)
     attribute = data.attributes.get("radius")
     if attribute is not None and attribute.data_type == "FLOAT" and len(attribute.data):
@@ -101,7 +102,7 @@ def _of_curves(data: Any) -> Strands:
         radii = values if attribute.domain == "POINT" else np.repeat(values, np.diff(offsets))
     kind = data.attributes.get("curve_type")
     linear = kind is not None and len(kind.data) > 0 and kind.data[0].value == _POLY
-    return Strands(points, radii, offsets if len(offsets) else np.zeros(1, np.int32), slot, linear)
+    return Strands(points, radii, offsets, np.zeros(len(data.curves), np.int32), linear)
 
 
 def _numbers(system: Any, mode: str) -> range:
@@ -154,8 +155,9 @@ def _profile(points: Array, settings: Any) -> Array:
 class Hair:
     """What stands for the mesh where the materials of strands are read; valid while the evaluated object is."""
 
-    def __init__(self, obj: bpy.types.Object, strands: Strands, made: Tubes, mode: str) -> None:
-        self._obj, self._data, self._mode = obj, obj.data, mode
+    def __init__(self, obj: bpy.types.Object, strands: Strands, made: Tubes) -> None:
+        self._data = obj.data
+        self._places: tuple[tuple[Array, ...], Array] | None = None
         self.strands, self.tubes, self.name = strands, made, obj.data.name
         self.polygons = range(len(made.faces))
         self._is_curves = obj.type == "CURVES"
@@ -177,31 +179,22 @@ class Hair:
 
         "" is the one that renders: of Curves the first.
         """
-        names = self.uv_layers
-        if not self._is_curves and not name:
-            name = next((layer.name for layer in self._data.uv_layers if layer.active_render), "")
-        if not names or (name and name not in names):
-            return None
         if self._is_curves:
-            roots = attribute_values(self._data, name or names[0])
+            names = self.uv_layers
+            roots = attribute_values(self._data, name or names[0]) if names and (not name or name in names) else None
         else:
-            number = names.index(name)
-            roots = self._at_roots("uv_on_emitter", uv_no=number)
+            uvs = mesh_arrays.read_uvs(self._data, name)
+            roots = None if uvs is None else self._at_roots(uvs, "CORNER")
         made = self.tubes
         return None if roots is None else np.repeat(roots[made.strand[made.ring], :2], 3, axis=0)
 
     def attribute_values(self, name: str) -> Array | None:
-        """(n, 4) float32 values as of `layers.attribute_values`; on particles colours of the emitter alone."""
+        """(n, 4) float32 values as of `layers.attribute_values`; of particles those of the emitter at the roots."""
         if name in HAIR_INFO:
             values = self._info(name)
             return np.column_stack((values, values, values, np.ones_like(values))).astype(np.float32)
-        if self._is_curves:
-            return attribute_values(self._data, name)
-        names = self._painted()
-        if name not in names:
-            return None
-        values = self._at_roots("mcol_on_emitter", vcol_no=names.index(name))
-        return np.column_stack((srgb_to_linear(values), np.ones(len(values), np.float32)))
+        found = attribute_values(self._data, name)
+        return found if found is None or self._is_curves else self._at_roots(found, self._data.attributes[name].domain)
 
     def layer(self, ref: LayerRef) -> Array | None:
         """(m, 3, 2) or (m, 3, 4) float32 at the corners of the faces, as of `LayerRef.values`."""
@@ -249,30 +242,47 @@ class Hair:
 
     def _generated(self) -> Array:
         """(k, 3): of particles the root in the mesh's texture space, of Curves the root."""
-        roots = self.strands.points[np.minimum(self.strands.offsets[:-1], max(len(self.strands.points) - 1, 0))]
+        roots = self._roots()
         if self._is_curves:
             return roots
         size = np.array(self._data.texspace_size)
         size = np.divide(0.5, size, out=np.zeros(3), where=size != 0)
         return (roots - np.array(self._data.texspace_location)) * size + 0.5
 
-    def _painted(self) -> list[str]:
-        """Colours of the emitter that Blender tells the roots of its particles."""
-        return [a.name for a in self._data.attributes if a.data_type == "BYTE_COLOR" and a.domain == "CORNER"]
+    def _roots(self) -> Array:
+        """(k, 3): the first point of each strand."""
+        return self.strands.points[np.minimum(self.strands.offsets[:-1], max(len(self.strands.points) - 1, 0))]
 
-    def _at_roots(self, function: str, **which: int) -> Array:
-        """(k, c) float32: what a function of Blender says of the root of every strand."""
-        found = []
-        for modifier in systems(self._obj, self._mode):
-            system = modifier.particle_system
-            ask, parents = getattr(system, function), system.particles
-            for i in _numbers(system, self._mode):
-                parent = parents[i if i < len(parents) else 0]
-                found.append(ask(modifier=modifier, particle=parent, particle_no=i, **which)[:])
-        return np.array(found, np.float32)
+    def _at_roots(self, values: Array, domain: str) -> Array:
+        """(k, c) float32: values of the mesh on which the strands grow, where it is nearest to their roots."""
+        mesh = self._data
+        if self._places is None:
+            corners, polygons = mesh_arrays.read_loop_triangles(mesh)
+            vertices = np.nan_to_num(mesh_arrays.read_vertices(mesh)).astype(np.float64)
+            faces = mesh_arrays.read_corner_vertices(mesh)[corners]
+            tree = BVHTree.FromPolygons(vertices.tolist(), faces.tolist(), all_triangles=True)
+            found = [tree.find_nearest(root)[2] for root in np.nan_to_num(self._roots()).tolist()]
+            face = np.array([0 if number is None else number for number in found], np.int64)
+            weights = _barycentric(self._roots().astype(np.float64), vertices[faces[face]])
+            self._places = (corners[face], polygons[face], faces[face]), weights
+        (corner, polygon, vertex), weights = self._places
+        if domain == "FACE":
+            return values[polygon]
+        return np.einsum("kj,kjc->kc", weights, values[corner if domain == "CORNER" else vertex]).astype(np.float32)
 
     def _at_corners(self, values: Array, domain: str) -> Array:
         """(m, 3, c) values of strands or points at the corners of the faces."""
         made = self.tubes
         rings = values[made.strand] if domain == "CURVE" else made.blend(values).astype(np.float32)
         return rings[made.faces // (2 * made.sides)]
+
+
+def _barycentric(points: Array, triangles: Array) -> Array:
+    """(k, 3) weights, within [0, 1], of the corners of a triangle (k, 3, 3) each for points (k, 3) on it."""
+    a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    p = points - triangles[:, 0]
+    aa, ab, bb, pa, pb = ((x * y).sum(axis=1) for x, y in ((a, a), (a, b), (b, b), (p, a), (p, b)))
+    area = np.maximum(aa * bb - ab * ab, 1e-30)
+    weights = np.clip(np.stack((aa * 0, bb * pa - ab * pb, aa * pb - ab * pa), axis=1) / area[:, None], 0, 1)
+    weights[:, 0] = np.clip(1 - weights[:, 1] - weights[:, 2], 0, 1)
+    return np.nan_to_num(weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9))

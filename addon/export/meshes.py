@@ -119,7 +119,7 @@ class Meshes:
             if not item.is_hair:
                 return _read(obj, self._depsgraph)
             strands, made = self._cache.get(("strands", *stands), owners, lambda: self._strands(obj))
-            return contextlib.nullcontext(Hair(obj, strands, made, self._depsgraph.mode))
+            return contextlib.nullcontext(Hair(obj, strands, made))
 
         def arrays(mesh: Surface) -> _Arrays:
             make = _Arrays.of_hair if isinstance(mesh, Hair) else _Arrays.read

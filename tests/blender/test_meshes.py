@@ -354,20 +354,15 @@ def test_faces_of_which_nothing_is_seen_are_left_out(scene, export):
     assert export()[0].meshes == []
 
 
-@pytest.mark.parametrize("kind", ["hair", "particles"])
-def test_particles_on_a_mesh(scene, export, kind):
+def test_particles_on_a_mesh(scene, export):
     obj = cube("Furry")
     with bpy.context.temp_override(object=obj, active_object=obj):
         bpy.ops.object.particle_system_add()
     settings = obj.particle_systems[0].settings
     settings.count = 5
-    if kind == "hair":
-        settings.type = "HAIR"
-        assert export()[1] == ["1 hair object is not rendered by DR-GS: Furry"]
-    else:
-        other = mesh_object("Leaf", CUBE, QUADS)
-        settings.render_type, settings.instance_object = "OBJECT", other
-        settings.frame_end = settings.frame_start = 1
-        scene.frame_set(2)
-        frame, warnings = export()
-        assert {s.name: len(s.matrices) for s in frame.meshes} == {"Furry": 1, "Leaf": 6} and not warnings
+    other = mesh_object("Leaf", CUBE, QUADS)
+    settings.render_type, settings.instance_object = "OBJECT", other
+    settings.frame_end = settings.frame_start = 1
+    scene.frame_set(2)
+    frame, warnings = export()
+    assert {s.name: len(s.matrices) for s in frame.meshes} == {"Furry": 1, "Leaf": 6} and not warnings
