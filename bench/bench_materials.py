@@ -63,6 +63,7 @@ SCENES = {
     "painted_light": "DR-GS object, painted opacity and emission",
     "painted_lobes": "DR-GS object, painted coat and specular",
     "terminator": "coarse smooth meshes with Blender's own shadow terminator offset",
+    "hair": "particle hair with children, hair curves, captured object",
 }
 _LOBES = ("Diffuse", "Glossy", "Transmission")
 #: Scenes of which passes are compared; the worst one is in the table.

@@ -254,10 +254,43 @@ def terminator(job: dict) -> None:
     camera((0.2, -3.6, 1.4), (0, 0, 0.5), lens=62)
 
 
+def hair(job: dict) -> None:
+    """The DR-GS object beside a head of brown particle hair, with children, and a tuft of fair hair curves."""
+    subject(job["asset"], 0.5).location.x -= 0.55
+    look("Brown", Base_Color=(0.2, 0.09, 0.035, 1), Roughness=0.4)
+    look("Fair", Base_Color=(0.75, 0.6, 0.35, 1), Roughness=0.5)
+    head = ball(bpy.data.materials["Brown"], 0.36, (0.62, -0.1, 0.75))
+    group = head.vertex_groups.new(name="Scalp")
+    group.add([v.index for v in head.data.vertices if v.co.z > 0.02 or v.co.y > 0.1], 1.0, "REPLACE")
+    with bpy.context.temp_override(object=head, active_object=head):
+        bpy.ops.object.particle_system_add()
+    system = head.particle_systems[0]
+    system.vertex_group_density = "Scalp"
+    strands = system.settings
+    strands.type, strands.count, strands.hair_length, strands.radius_scale = "HAIR", 250, 0.5, 0.006
+    strands.use_advanced_hair, strands.normal_factor, strands.object_align_factor = True, 0.03, (0.0, 0.0, -0.025)
+    strands.child_type, strands.rendered_child_count, strands.clump_factor = "INTERPOLATED", 20, 0.5
+    strands.kink, strands.kink_amplitude, strands.tip_radius = "WAVE", 0.02, 0.3
+    random, count, points = np.random.default_rng(0), 1500, 5
+    roots = random.uniform(-0.25, 0.25, (count, 1, 3)) * (1, 1, 0)
+    along = np.linspace(0, 1, points)[:, None]
+    lean = random.normal(0, 0.08, (count, 1, 3)) + 0.8 * roots
+    places = roots + along * (0, 0, 0.35) + along**2 * lean + (0.1, -0.9, 0)
+    data = bpy.data.hair_curves.new("Tuft")
+    data.add_curves([points] * count)
+    data.attributes["position"].data.foreach_set("vector", places.astype(np.float32).ravel())
+    radius = data.attributes.new("radius", "FLOAT", "POINT").data
+    radius.foreach_set("value", np.tile(0.003 * (1 - 0.8 * along[:, 0]), count).astype(np.float32))
+    data.materials.append(bpy.data.materials["Fair"])
+    bpy.context.collection.objects.link(bpy.data.objects.new("Tuft", data))
+    stage()
+
+
 FEATURES: dict[str, Callable[[dict], None]] = {
     made.__name__: made
     for made in (
         light_linking, shadow_linking, light_groups, light_passes, equirectangular, equidistant, equisolid, motion_blur,
         deform_blur, depth_of_field, subsurface, painted_light, painted_lobes, terminator,
+        hair,
     )
 }  # fmt: skip
