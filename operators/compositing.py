@@ -33,7 +33,7 @@ class DRGS_OT_set_up_compositing(DrgsOperator, bpy.types.Operator):
     )
     compare: BoolProperty(
         name="Compare Depths",
-        description="Also hide DR-GS objects behind what only the other engine renders: hair, volumes, displacement. "
+        description="Also hide DR-GS objects behind what only the other engine renders: volumes, displacement. "
         "Their edges are not smooth",
         default=False,
     )
