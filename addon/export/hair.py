@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 from mathutils.bvhtree import BVHTree
 
-from ...drgs_blender.core.strands import MOST_TRIANGLES, SIDES, Tubes, triangle_count, tubes
+from ...drgs_blender.core.strands import MOST_TRIANGLES, SEGMENTS, SIDES, Tubes, triangle_count, tubes
 from .. import mesh_arrays
 from .layers import HAIR_INFO, LayerRef, attribute_values
 
@@ -50,15 +50,16 @@ class Strands:
 
     def tubes(self, name: str = "", warn: Warn = lambda text: None) -> Tubes:
         """As a mesh; coarser where it would be too large, which is told of the object `name`."""
-        count, wanted = len(self.slot), triangle_count(self.offsets)
-        coarse = not self.linear and wanted > MOST_TRIANGLES
-        detail = {"segments": 1, "sides": 3} if coarse else {"sides": SIDES}
-        made = tubes(self.points, self.offsets, self.radii, linear=self.linear, **detail)
-        if coarse or len(made.faces) > MOST_TRIANGLES:
-            what = f"would be {wanted:,} triangles; with three sides and no more pieces than they have they are"
+        count, details = len(self.slot), [(1 if self.linear else SEGMENTS, SIDES), (1, SIDES), (1, 3)]
+        wanted = [triangle_count(self.offsets, *detail) for detail in details]
+        best = next((i for i, triangles in enumerate(wanted) if triangles <= MOST_TRIANGLES), len(details) - 1)
+        segments, sides = details[best]
+        made = tubes(self.points, self.offsets, self.radii, linear=self.linear, segments=segments, sides=sides)
+        if wanted[0] > MOST_TRIANGLES:
             warn(
-                f'"{name}": its {count:,} strands {what if coarse else "are"} {len(made.faces):,}. Fewer strands, or '
-                "fewer points on each (of particles: Render > Steps), take less memory and time"
+                f'"{name}": its {count:,} strands would be {wanted[0]:,} triangles; with {sides} sides and as many '
+                f"pieces as they are given they are {len(made.faces):,}. Fewer strands, or fewer points on each (of "
+                "particles: Render > Steps), take less memory and time"
             )
         seen = np.zeros(count, bool)
         seen[made.strand[made.ring]] = True

@@ -126,11 +126,13 @@ class TextureWalker(Walker):
         return SocketValue(np.ones(3), texture)
 
     def node_hair_info(self, output: SocketRef) -> SocketValue:
-        is_hair = not isinstance(self.mesh, bpy.types.Mesh)
-        if output.socket.name == "Is Strand":
-            return uniform(float(is_hair))
-        name = f"Hair Info: {output.socket.name}"
-        return self.attribute(output, name) if is_hair and name in HAIR_INFO else self.nearest(output, output)
+        self.uses_mesh, name = True, output.socket.name
+        if isinstance(self.mesh, bpy.types.Mesh):
+            return uniform(0)  # as in Cycles
+        if name == "Is Strand":
+            return uniform(1)
+        name = f"Hair Info: {name}"
+        return self.attribute(output, name) if name in HAIR_INFO else self.nearest(output, output)
 
     def node_ambient_occlusion(self, output: SocketRef) -> SocketValue:
         if output.socket.type == "RGBA":

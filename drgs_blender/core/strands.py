@@ -19,7 +19,7 @@ Array = np.ndarray
 #: Pieces that a strand has at least, if it is curved.
 SEGMENTS = 12
 SIDES = 4
-#: Of more triangles than that, strands are as coarse as they are given, with three sides.
+#: Of more triangles than that, strands are as coarse as they are given, then with three sides.
 MOST_TRIANGLES = 4_000_000
 #: Turns a strand is rotated about itself more than the one before, so that corners of neighbours do not face one way.
 _GOLDEN = (math.sqrt(5) - 1) / 2

@@ -282,14 +282,39 @@ def test_materials_and_textures_of_hair(scene, export):
     assert any('"Fur"' in text and "UV" in text for text in export()[1])
 
 
+def test_materials_that_are_not_on_hair_are_not_told_of(scene, export):
+    tree, principled = material("Skin")
+    tree.links.new(add(tree, "TexNoise"), principled.inputs["Roughness"])
+    material("Hair")
+    obj = furry(material=2)
+    for name in ("Skin", "Hair"):
+        obj.data.materials.append(bpy.data.materials[name])
+    told = len(export()[1])
+    obj.particle_systems[0].settings.render_type = "NONE"
+    assert len(export()[1]) == told
+
+
+def test_holdouts_of_hair_are_its_own(scene, export):
+    material("Skin")
+    tree, _ = material("Hole")
+    shaded(tree, add(tree, "Holdout"))
+    obj = furry(material=2)
+    for name in ("Skin", "Hole"):
+        obj.data.materials.append(bpy.data.materials[name])
+    frame, warnings = export()
+    hair = hair_of(frame, "Furry")
+    assert hair.visibility.holdout and not warnings
+    assert [m.visibility.holdout for m in frame.meshes if m is not hair] == [False]
+
+
 def test_hair_info_along_the_strand(scene, export):
     tree, principled = material("Ombre")
     node = tree.nodes.new("ShaderNodeHairInfo")
     tree.links.new(node.outputs["Intercept"], principled.inputs["Metallic"])
-    obj = curves()
-    obj.data.materials.append(bpy.data.materials["Ombre"])
+    for obj in (mesh_object("Ball", *sphere()), curves()):
+        obj.data.materials.append(bpy.data.materials["Ombre"])
     frame, warnings = export()
-    (mesh,) = frame.meshes
+    mesh = hair_of(frame, "Fur")
     (layer,) = mesh.layers
     assert not warnings
     # The strand bends, so that its length is not quite its height.
@@ -327,13 +352,15 @@ def test_absorption_and_colour_are_one(scene, export):
 
 def test_too_much_hair_is_coarser_and_told(scene, export, monkeypatch):
     hair = part("addon.export.hair")
-    obj = curves(count=50, points=9)
-    whole = export()[0].meshes[0]
-    monkeypatch.setattr(hair, "MOST_TRIANGLES", 3000)
-    obj.data.update_tag()
-    frame, warnings = export()
-    assert len(frame.meshes[0].faces) < len(whole.faces) / 2
-    assert len(warnings) == 1 and '"Fur"' in warnings[0] and f"{len(frame.meshes[0].faces):,}" in warnings[0]
+    curves(count=50, points=9)
+    faces = []
+    for most in (10**6, 4000, 3000, 100):
+        monkeypatch.setattr(hair, "MOST_TRIANGLES", most)
+        frame, warnings = export()
+        faces.append(len(frame.meshes[0].faces))
+        assert len(warnings) == (most < 10**6)
+        assert all('"Fur"' in text and f"{faces[-1]:,}" in text and f"{faces[0]:,}" in text for text in warnings)
+    assert faces[0] > 1.9 * faces[1] > 1.9 * faces[2] == 1.9 * faces[3] and faces[1] < 4000 and faces[2] < 3000
 
 
 def stage(scene, kind: str) -> None:
