@@ -203,7 +203,7 @@ class Hair:
             uvs = self.corner_uvs(ref.name)
             return None if uvs is None else uvs.reshape(-1, 3, 2)
         if ref.source == "tangent":
-            return np.zeros((len(self.tubes.faces), 3, 4), np.float32)
+            return self._at_corners(self._directions(), "POINT")
         if ref.source == "attribute":
             values = self.attribute_values(ref.name)
             if values is None:
@@ -240,6 +240,14 @@ class Hair:
         along -= along[first]
         whole = along[np.repeat(offsets[1:] - 1, np.diff(offsets))]
         return along / np.maximum(whole, 1e-12)
+
+    def _directions(self) -> Array:
+        """(n, 4) float32: towards the tip at each point; the length says nothing."""
+        points, offsets = np.nan_to_num(self.strands.points), self.strands.offsets
+        first, last = (np.repeat(ends, np.diff(offsets)) for ends in (offsets[:-1], offsets[1:] - 1))
+        number = np.arange(len(points))
+        along = points[np.minimum(number + 1, last)] - points[np.maximum(number - 1, first)]
+        return np.column_stack((along, np.zeros(len(points), np.float32)))
 
     def _generated(self) -> Array:
         """(k, 3): of particles the root in the mesh's texture space, of Curves the root."""

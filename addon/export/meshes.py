@@ -74,12 +74,12 @@ class _Arrays:
         count = len(made.faces)
         index = hair.strands.slot[made.strand[made.ring]]
         return cls(
-            _shared(made.vertices, np.float32),
+            made.vertices,
             np.arange(3 * count, dtype=np.int32).reshape(-1, 3),
             np.arange(count, dtype=np.int32),
             made.faces.ravel(),
             index if index.any() else None,
-            _shared(made.normals, np.float32),
+            made.normals,
             None,
         )
 
@@ -177,7 +177,9 @@ class Meshes:
 
     def _strands(self, obj: bpy.types.Object) -> tuple[Strands, Tubes]:
         strands = read_strands(obj, self._depsgraph.mode)
-        return strands, strands.tubes(obj.name, self._warn)
+        made = strands.tubes(obj.name, self._warn)
+        vertices, normals = (_shared(values, np.float32) for values in (made.vertices, made.normals))
+        return strands, replace(made, vertices=vertices, normals=normals)
 
     def _state(
         self,
