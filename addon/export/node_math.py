@@ -157,6 +157,15 @@ def hair_colour(absorption: Array, rough: Array) -> Array:
     return np.exp(-np.sqrt(np.maximum(absorption, 0)) * _roughness_factor(rough))
 
 
+def strand_albedo(colour: Array) -> Array:
+    """Albedo of opaque strands, many of which have a colour together, as light that one reflects meets others.
+
+    For isotropic scatterers in a deep layer it is 1 - s^2 with s = (1 - colour) / (1 + colour); strands are not deep
+    everywhere. 1 - s is what gives tufts of brown hair the brightness that Cycles gives them.
+    """
+    return 2 * colour / (1 + colour)
+
+
 def melanin_colour(melanin: Array, redness: Array, tint: Array, rough: Array) -> Array:
     """Colour of many hairs together by their pigment, as Cycles' Principled Hair BSDF reads it."""
     amount = -np.log(np.maximum(1 - np.clip(melanin, 0, 1), 1e-4))

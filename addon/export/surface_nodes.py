@@ -10,7 +10,7 @@ import numpy as np
 from ..bakes.node_trees import COLOURS, SHADERS, leaf_of
 from .bsdfs import Bsdf, MixingWalker, Part, Surface
 from .layers import LayerRef
-from .node_math import conductor, hair_colour, melanin_colour
+from .node_math import conductor, hair_colour, melanin_colour, strand_albedo
 from .normal_nodes import DetailRef
 from .socket_value import SocketValue, constant, once, uniform
 from .sockets import SocketRef, hollow, surface_of
@@ -188,19 +188,21 @@ class SurfaceWalker(MixingWalker):
         return replace(surface, parts=(replace(part, bsdf=replace(part.bsdf, values=values)),))
 
     def shader_bsdf_hair_principled(self, output: SocketRef) -> Surface:
-        """A surface of its colour; where pigment says what that is, the colour that hair of it has as a whole."""
+        """A surface of its colour, which is that of many hairs together."""
         node = output.node
         surface, kind = self.other_shader(output), node.parametrization
-        if kind == "COLOR":
-            return surface
+        part = surface.parts[0]
         radial = output.input("Radial Roughness") if getattr(node, "model", "CHIANG") == "CHIANG" else None
         rough = uniform(0.3) if radial is None else self.number(radial)
-        if kind == "ABSORPTION":
+        if kind == "COLOR":
+            base = part.bsdf.values["base_colour"]
+        elif kind == "ABSORPTION":
             base = self.combine(node, hair_colour, self.colour(output.input("Absorption Coefficient")), rough)
         else:
             inputs = [self.number(output.input(name)) for name in ("Melanin", "Melanin Redness")]
             base = self.combine(node, melanin_colour, *inputs, self.colour(output.input("Tint")), rough)
-        part = surface.parts[0]
+        if not isinstance(self.mesh, bpy.types.Mesh):
+            base = self.combine(node, strand_albedo, base)
         bsdf = replace(part.bsdf, values=part.bsdf.values | {"base_colour": base})
         return replace(surface, parts=(replace(part, bsdf=bsdf),))
 
