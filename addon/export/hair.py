@@ -128,7 +128,7 @@ def _of_particles(obj: bpy.types.Object, mode: str) -> Strands:
         points = np.array(found, np.float32).reshape(-1, steps, 3)
         for step in range(1, steps):  # past the end of a strand that is cut Blender says 0
             np.copyto(points[:, step], points[:, step - 1], where=~points[:, step].any(axis=1, keepdims=True))
-        inverse = np.linalg.pinv(np.array(obj.matrix_world, np.float64))
+        inverse = np.linalg.pinv(np.nan_to_num(np.array(obj.matrix_world, np.float64)))
         points = (points @ inverse[:3, :3].T + inverse[:3, 3]).astype(np.float32)
         places.append(points.reshape(-1, 3))
         radii.append(_profile(points, settings).reshape(-1))

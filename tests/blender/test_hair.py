@@ -110,6 +110,14 @@ def test_bad_curves_are_left_out_and_counted(scene, export):
     assert len(warnings) == 2
 
 
+@pytest.mark.parametrize("scale", [0.0, float("nan")])
+def test_an_emitter_without_a_size_breaks_nothing(scene, export, scale):
+    furry().scale = (scale, 1, 1)
+    bpy.context.view_layer.update()
+    frame, _ = export()
+    assert frame.meshes and all(np.isfinite(mesh.vertices).all() for mesh in frame.meshes)
+
+
 def test_particle_hair_is_there_beside_its_object(scene, export):
     obj = furry()
     frame, warnings = export()
