@@ -648,7 +648,7 @@ def test_discs_of_an_object_in_edit_mode_are_what_is_left_of_it(ball, ball_file)
 
     def shown():
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        left, vertices = surfels.shown_asset(ball.evaluated_get(depsgraph), asset, depsgraph)
+        left, vertices, _ = surfels.shown_asset(ball.evaluated_get(depsgraph), asset, depsgraph)
         return surfels.posed_centres(left, vertices)
 
     def delete(obj, chosen):
