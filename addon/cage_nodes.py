@@ -11,10 +11,9 @@ from collections.abc import Callable
 
 import bpy
 import numpy as np
-from mathutils.kdtree import KDTree
 
 from ..drgs_blender.core.errors import UsageError
-from . import mesh_arrays
+from . import lookups, mesh_arrays
 
 Array = np.ndarray
 
@@ -26,6 +25,8 @@ CORNERS, WEIGHTS, HEIGHT = (f"drgs_cage_{what}_{{}}" for what in ("corners", "we
 COUNT = "drgs_cage_points"
 #: Name of the node that knows the cage.
 SOURCE = "DR-GS Cage"
+#: Gives the place of the point of an index.
+Place = Callable[[bpy.types.NodeSocket], bpy.types.NodeSocket]
 
 
 def cage_of(modifier: bpy.types.Modifier) -> bpy.types.Object | None:
@@ -45,7 +46,7 @@ def check(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, warn: Callable[
                 f'"{obj.name}": what carried it by modifier "{modifier.name}" is deleted. Remove the modifier, or undo'
             )
             continue
-        found = count_of(cage.evaluated_get(depsgraph))
+        found = len(points_of(cage.evaluated_get(depsgraph)))
         if found != bound:
             warn(
                 f'"{obj.name}": "{cage.name}", which carries it, has {found} points and had {bound} when it was bound, '
@@ -76,9 +77,9 @@ def note_count(mesh: bpy.types.Mesh, count: int) -> None:
     write(mesh, COUNT, "FLOAT", np.full(len(mesh.vertices), count))
 
 
-def count_of(cage: bpy.types.Object) -> int:
+def points_of(cage: bpy.types.Object) -> bpy.types.bpy_prop_collection:
     """Points of an evaluated mesh or point cloud."""
-    return len(cage.data.points if cage.type == "POINTCLOUD" else cage.data.vertices)
+    return cage.data.points if cage.type == "POINTCLOUD" else cage.data.vertices
 
 
 def _known(tree: bpy.types.NodeTree) -> bpy.types.Object | None:
@@ -99,8 +100,7 @@ def carry(obj: bpy.types.Object, cage: bpy.types.Object, modifier: bpy.types.Mod
         write(obj.data, WEIGHTS.format(i), "FLOAT_VECTOR", weights[:, i])
         write(obj.data, HEIGHT.format(i), "FLOAT", heights[:, i])
     note_count(obj.data, len(vertices))
-    trees = (t for t in bpy.data.node_groups if t.library is None and t.name.startswith(SOURCE) and _known(t) == cage)
-    modifier.node_group = next(trees, None) or _tree(cage)
+    modifier.node_group = tree_of(SOURCE, cage, _places)
 
 
 def frames(points: Array, vertices: Array, triangles: Array) -> tuple[Array, Array, Array]:
@@ -122,16 +122,11 @@ def frames(points: Array, vertices: Array, triangles: Array) -> tuple[Array, Arr
     cross = np.cross(edges[..., 0], edges[..., 1])
     area = np.linalg.norm(cross, axis=1)
     sound = np.flatnonzero(area > 1e-9 * area.max())
-    tree = KDTree(len(sound))
-    for number, centre in enumerate(((first + second + third) / 3)[sound].tolist()):
-        tree.insert(centre, number)
-    tree.balance()
     # The next face ends the reach of the others, so that vertices do not jump where the nearest change.
-    found = [tree.find_n(p, min(FACES + 1, len(sound))) for p in points.tolist()]
-    distance = np.array([[hit[2] for hit in hits] for hits in found])
+    index, distance = lookups.nearest(((first + second + third) / 3)[sound], points, FACES + 1)
     reach = np.maximum(distance[:, -1:] * (1.0 if len(sound) > FACES else 1.5), 1e-30)
     count = min(FACES, len(sound))
-    face = sound[np.array([[hit[1] for hit in hits[:count]] for hits in found])]
+    face = sound[index[:, :count]]
     share = np.maximum(1 - (distance[:, :count] / reach) ** 2, 1e-6) ** 3
     share /= share.sum(axis=1, keepdims=True)
     away = points[:, None] - first[face]
@@ -145,6 +140,7 @@ def frames(points: Array, vertices: Array, triangles: Array) -> tuple[Array, Arr
 
 
 def write(mesh: bpy.types.Mesh, name: str, kind: str, values: Array) -> None:
+    """Give a mesh a point attribute, FLOAT or FLOAT_VECTOR, in place of one of that name."""
     if (old := mesh.attributes.get(name)) is not None:
         mesh.attributes.remove(old)
     attribute = mesh.attributes.new(name, kind, "POINT")
@@ -155,16 +151,16 @@ class Builder:
     """Adds nodes to a tree; what is linked to an input is a socket or a value."""
 
     def __init__(self, tree: bpy.types.NodeTree) -> None:
-        self.tree = tree
+        self._tree = tree
 
     def node(self, kind: str, *inputs: object, **values: object) -> bpy.types.Node:
         """A node with `values` whose inputs, in their order, are linked or set."""
-        node = self.tree.nodes.new(kind)
+        node = self._tree.nodes.new(kind)
         for name, value in values.items():
             setattr(node, name, value)
         for socket, given in zip([s for s in node.inputs if s.enabled], inputs):
             if isinstance(given, bpy.types.NodeSocket):
-                self.tree.links.new(given, socket)
+                self._tree.links.new(given, socket)
             elif given is not None:
                 socket.default_value = given
         return node
@@ -180,7 +176,7 @@ class Builder:
     def scaled(self, vector: bpy.types.NodeSocket, factor: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """`vector` times the number `factor`."""
         node = self.node("ShaderNodeVectorMath", vector, operation="SCALE")
-        self.tree.links.new(factor, node.inputs["Scale"])
+        self._tree.links.new(factor, node.inputs["Scale"])
         return node.outputs["Vector"]
 
     def attribute(self, name: str, kind: str) -> bpy.types.NodeSocket:
@@ -192,9 +188,8 @@ class Builder:
         return list(self.node("ShaderNodeSeparateXYZ", vector).outputs)
 
 
-def _tree(cage: bpy.types.Object) -> bpy.types.NodeTree:
-    """Nodes that bring each vertex to the mean of where its faces are on `cage` now."""
-    build, place, same = begin(f"{SOURCE} {cage.name}", cage)
+def _places(build: Builder, place: Place) -> bpy.types.NodeSocket:
+    """The mean of where the faces of each vertex are on the cage now."""
     total = None
     for i in range(FACES):
         corners = [place(index) for index in build.parts(build.attribute(CORNERS.format(i), "FLOAT_VECTOR"))]
@@ -208,16 +203,20 @@ def _tree(cage: bpy.types.Object) -> bpy.types.NodeTree:
         for term in terms:
             total = term if total is None else build.vector("ADD", total, term)
     assert total is not None
-    return end(build, total, same)
+    return total
 
 
-#: Gives the place of the point of an index.
-Place = Callable[[bpy.types.NodeSocket], bpy.types.NodeSocket]
+def tree_of(
+    kind: str, carrier: bpy.types.Object, places: Callable[[Builder, Place], bpy.types.NodeSocket]
+) -> bpy.types.NodeTree:
+    """The nodes of a `kind` for modifiers that follow `carrier`, made where there are none.
 
-
-def begin(name: str, carrier: bpy.types.Object) -> tuple[Builder, Place, bpy.types.NodeSocket]:
-    """A new tree of nodes for a modifier, how it asks where points of `carrier` are, whether it has as many as then."""
-    tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
+    They bring each vertex to one of `places`, as long as the carrier has as many points as when it was bound.
+    """
+    for known in bpy.data.node_groups:
+        if known.library is None and known.name.startswith(kind) and _known(known) == carrier:
+            return known
+    tree = bpy.data.node_groups.new(f"{kind} {carrier.name}", "GeometryNodeTree")
     tree.is_modifier = True
     for direction in ("INPUT", "OUTPUT"):
         tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
@@ -231,16 +230,11 @@ def begin(name: str, carrier: bpy.types.Object) -> tuple[Builder, Place, bpy.typ
     bound = build.attribute(COUNT, "FLOAT")
     found = [build.out("GeometryNodeAttributeDomainSize", shape, component=kind) for kind in ("MESH", "POINTCLOUD")]
     same = [build.out("FunctionNodeCompare", n, bound, 0.5, data_type="FLOAT", operation="EQUAL") for n in found]
-    return build, place, build.out("FunctionNodeBooleanMath", *same, operation="OR")
-
-
-def end(build: Builder, places: bpy.types.NodeSocket, chosen: bpy.types.NodeSocket) -> bpy.types.NodeTree:
-    """The tree, which brings each vertex that is `chosen` to one of `places`."""
-    tree = build.tree
+    chosen = build.out("FunctionNodeBooleanMath", *same, operation="OR")
     given, result = tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
     moved = tree.nodes.new("GeometryNodeSetPosition")
     tree.links.new(given.outputs[0], moved.inputs["Geometry"])
     tree.links.new(chosen, moved.inputs["Selection"])
-    tree.links.new(places, moved.inputs["Position"])
+    tree.links.new(places(build, place), moved.inputs["Position"])
     tree.links.new(moved.outputs["Geometry"], result.inputs[0])
     return tree

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import bpy
 import numpy as np
-from mathutils.kdtree import KDTree
 
 from ..drgs_blender.core.errors import UsageError
-from . import cage_nodes, mesh_arrays
+from . import cage_nodes, lookups, mesh_arrays
 
 Array = np.ndarray
 
@@ -33,7 +32,7 @@ def read_points(carrier: bpy.types.Object) -> Array:
     UsageError
         There are none, or one is not finite.
     """
-    data = carrier.data.points if carrier.type == "POINTCLOUD" else carrier.data.vertices
+    data = cage_nodes.points_of(carrier)
     points = np.empty((len(data), 3), np.float32)
     data.foreach_get("co", points.ravel())
     if not len(points) or not np.isfinite(points).all():
@@ -62,7 +61,7 @@ def carry(obj: bpy.types.Object, carrier: bpy.types.Object, modifier: bpy.types.
         cage_nodes.write(obj.data, WEIGHTS.format(i), "FLOAT_VECTOR", weight[:, three])
     cage_nodes.write(obj.data, LEFT, "FLOAT_VECTOR", left)
     cage_nodes.note_count(obj.data, len(points))
-    modifier.node_group = _tree(carrier)
+    modifier.node_group = cage_nodes.tree_of(NAME, carrier, _places)
 
 
 def shares(vertices: Array, points: Array) -> tuple[Array, Array, Array]:
@@ -76,15 +75,7 @@ def shares(vertices: Array, points: Array) -> tuple[Array, Array, Array]:
     -------
     (n, 12) int; (n, 12), which sum to one and are 0 where there are fewer points; (n, 3)
     """
-    tree = KDTree(len(points))
-    for number, point in enumerate(points.tolist()):
-        tree.insert(point, number)
-    tree.balance()
-    most = 3 * _THREES
-    count = min(most, len(points))
-    found = [tree.find_n(vertex, count) for vertex in vertices.tolist()]
-    index = np.array([[hit[1] for hit in hits] for hits in found], int).reshape(-1, count)
-    distance = np.array([[hit[2] for hit in hits] for hits in found]).reshape(-1, count)
+    index, distance = lookups.nearest(points, vertices, 3 * _THREES)
     weight = np.exp(-2.0 * (distance / np.maximum(distance[:, -1:], 1e-30)) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
     middle = np.einsum("nk,nkc->nc", weight, points[index])
@@ -94,22 +85,16 @@ def shares(vertices: Array, points: Array) -> tuple[Array, Array, Array]:
     towards = np.linalg.solve(moments + ridge[:, None, None] * np.eye(3), (vertices - middle)[..., None])
     weight = weight * (1.0 + np.einsum("nkc,nc->nk", offset, towards[..., 0]))
     left = vertices - np.einsum("nk,nkc->nc", weight, points[index])
-    missing = ((0, 0), (0, most - count))
+    missing = ((0, 0), (0, 3 * _THREES - index.shape[1]))
     return np.pad(index, missing), np.pad(weight, missing), left
 
 
-def _tree(carrier: bpy.types.Object) -> bpy.types.NodeTree:
-    """Nodes that bring each vertex to the sum of where its points are now."""
-    name = f"{NAME} {carrier.name}"
-    for tree in bpy.data.node_groups:
-        source = tree.nodes.get(cage_nodes.SOURCE) if tree.library is None and tree.name.startswith(NAME) else None
-        if source is not None and source.inputs["Object"].default_value == carrier:
-            return tree
-    build, place, same = cage_nodes.begin(name, carrier)
+def _places(build: cage_nodes.Builder, place: cage_nodes.Place) -> bpy.types.NodeSocket:
+    """The sum of where the points of each vertex are now."""
     total = build.attribute(LEFT, "FLOAT_VECTOR")
     for i in range(_THREES):
         indices = build.parts(build.attribute(INDICES.format(i), "FLOAT_VECTOR"))
         weights = build.parts(build.attribute(WEIGHTS.format(i), "FLOAT_VECTOR"))
         for index, weight in zip(indices, weights):
             total = build.vector("ADD", total, build.scaled(place(index), weight))
-    return cage_nodes.end(build, total, same)
+    return total

@@ -11,11 +11,10 @@ from typing import NamedTuple
 
 import bpy
 import numpy as np
-from mathutils.kdtree import KDTree
 
 from ..drgs_blender.core.asset import Asset
 from ..drgs_blender.core.frame import ProxyMesh
-from . import mesh_arrays
+from . import lookups, mesh_arrays
 
 Array = np.ndarray
 
@@ -23,7 +22,7 @@ Array = np.ndarray
 REST = "drgs_rest"
 #: Modifiers that copy or thicken a mesh.
 _COPYING = {"ARRAY", "MIRROR", "SOLIDIFY", "BEVEL", "WIREFRAME", "SCREW"}
-#: Viewports show surfels by the rigid maps of so many parts of a proxy's length, each of its nearest vertices.
+#: Parts along the longest side of the surfels, each of which viewports move rigidly, and vertices that move each.
 _PARTS, _NEAREST = 32, 12
 #: Divisions that are kept.
 _KEPT = 8
@@ -124,14 +123,12 @@ def carried(centre: Array, proxy: ProxyMesh, rows: Array | slice = slice(None)) 
     rows : (k,) int array or slice
         Chooses surfels.
     """
-    for i, parts in enumerate(_parts):
-        if _same(parts.centre, centre) and _same(parts.rest, proxy.rest):
-            del _parts[i]
-            break
-    else:
-        parts = _divided(centre, proxy.rest)
-    _parts.insert(0, parts)
-    del _parts[_KEPT:]
+    parts = lookups.recall(
+        _parts,
+        lambda known: _same(known.centre, centre) and _same(known.rest, proxy.rest),
+        lambda: _divided(centre, proxy.rest),
+        _KEPT,
+    )
     now = proxy.vertices.astype(np.float64)[parts.nearest]
     middle = np.einsum("pk,pkc->pc", parts.weight, now)
     moved = np.nan_to_num(now - middle[:, None])
@@ -151,13 +148,8 @@ def _same(a: Array, b: Array) -> bool:
 def _divided(centre: Array, rest: Array) -> _Parts:
     side = max(float(np.ptp(centre, axis=0).max()) / _PARTS, 1e-9)
     cells, part = np.unique(np.floor(centre / side).astype(np.int32), axis=0, return_inverse=True)
-    tree = KDTree(len(rest))
-    for number, vertex in enumerate(rest.tolist()):
-        tree.insert(vertex, number)
-    tree.balance()
-    found = [tree.find_n(place, min(_NEAREST, len(rest))) for place in ((cells + 0.5) * side).tolist()]
-    nearest = np.array([[hit[1] for hit in hits] for hits in found])
-    weight = 1.0 / (np.array([[hit[2] for hit in hits] for hits in found]) ** 2 + (0.25 * side) ** 2)
+    nearest, distance = lookups.nearest(rest, (cells + 0.5) * side, _NEAREST)
+    weight = 1.0 / (distance**2 + (0.25 * side) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
     places = rest.astype(np.float64)[nearest]
     middle = np.einsum("pk,pkc->pc", weight, places)

@@ -48,7 +48,8 @@ def simulated(name: str, mesh: Mesh, settings: dict[str, Any], last: int) -> Par
 
 def picture(state: ObjectState, floor: float, camera: dict[str, Any], samples: int, **settings: Any) -> Array:
     """(h, w, 4) linear: an object over the ground."""
-    plane = replace(ground(), matrices=np.eye(4)[None] + np.array([[0, 0, 0, 0]] * 2 + [[0, 0, 0, floor], [0] * 4]))
+    plane = ground()
+    plane.vertices[:, 2] = floor
     world = World(read_environment(environments() / "city.exr").radiance, strength=STRENGTH)
     how = RenderSettings(samples, bounces=BOUNCES, subpixel_samples=8, denoise="svgf", **settings)
     found: Array = SESSION.render(Frame(1, pinhole(camera), [state], world, how, ("Combined",), [plane]))["Combined"]

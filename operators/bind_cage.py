@@ -122,19 +122,23 @@ def new_cage(context: bpy.types.Context, objects: list[bpy.types.Object], faces:
         ):
             selection.add_modifier(cage, kind, kind, **values)
         apply_modifiers(context, cage)
-        count = len(mesh_arrays.loop_triangles(cage.data))
-        if not count:
+        if not len(cage.data.polygons):
             raise UsageError(
                 "Cage", "nothing is left of the objects at this size", "Make the cage by hand and select it"
             )
-        ratio = min(1.0, faces / count)
-        selection.add_modifier(cage, "DECIMATE", "DECIMATE", ratio=ratio, use_collapse_triangulate=True)
-        apply_modifiers(context, cage)
-        clean(cage.data, 1e-4 * size)
+        thin_out(context, cage, faces, 1e-4 * size)
     except UsageError:
         bpy.data.meshes.remove(cage.data)
         raise
     return cage
+
+
+def thin_out(context: bpy.types.Context, obj: bpy.types.Object, faces: int, distance: float) -> None:
+    """Leave about `faces` triangles of a mesh, without what is smaller than `distance`."""
+    ratio = min(1.0, faces / max(len(mesh_arrays.loop_triangles(obj.data)), 1))
+    selection.add_modifier(obj, "DECIMATE", "DECIMATE", ratio=ratio, use_collapse_triangulate=True)
+    apply_modifiers(context, obj)
+    clean(obj.data, distance)
 
 
 def clean(mesh: bpy.types.Mesh, distance: float) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bpy
-import numpy as np
 
 from ..addon import assets, cage_nodes, point_nodes
 from ..drgs_blender.core.errors import UsageError
@@ -120,7 +119,7 @@ def particles_of(context: bpy.types.Context, emitter: bpy.types.Object) -> bpy.t
     mesh.from_pydata([(0.0, 0.0, 0.0)], [], [])
     points = bpy.data.objects.new(mesh.name, mesh)
     assets.collection(context).objects.link(points)
-    index = int(np.flatnonzero([s == system for s in emitter.particle_systems])[0]) + 1
+    index = emitter.particle_systems.active_index + 1
     selection.add_modifier(
         points, "PARTICLE_INSTANCE", "Particles", object=emitter, particle_system_index=index, use_normal=True,
         show_unborn=True, show_alive=True, show_dead=True, use_path=False, space="WORLD",

@@ -13,7 +13,7 @@ from ..drgs_blender.core.asset import Surfels
 from ..drgs_blender.core.errors import UsageError
 from . import selection
 from .base import DrgsOperator
-from .bind_cage import apply_modifiers, clean
+from .bind_cage import apply_modifiers, thin_out
 
 Array = np.ndarray
 
@@ -105,12 +105,7 @@ def hull_of(context: bpy.types.Context, obj: bpy.types.Object, faces: int) -> tu
         selection.add_modifier(made, "REMESH", "REMESH", mode="VOXEL", voxel_size=side)
         selection.add_modifier(made, "SMOOTH", "SMOOTH", factor=0.5, iterations=4)
         apply_modifiers(context, made)
-        count = max(len(mesh_arrays.loop_triangles(made.data)), 1)
-        selection.add_modifier(
-            made, "DECIMATE", "DECIMATE", ratio=min(1.0, faces / count), use_collapse_triangulate=True
-        )
-        apply_modifiers(context, made)
-        clean(made.data, 1e-4 * side)
+        thin_out(context, made, faces, 1e-4 * side)
         found = mesh_arrays.read_vertices(made.data).astype(np.float64), mesh_arrays.loop_triangles(made.data)
     finally:
         bpy.data.meshes.remove(made.data)  # and the object

@@ -49,7 +49,7 @@ class Strands:
     linear: bool = False
 
     def tubes(self, name: str = "", warn: Warn = lambda text: None) -> Tubes:
-        """As a mesh; coarser where it would be too large, which is told of the object `name`."""
+        """As a mesh; coarser where it would be too large, with a warning that has the object's `name`."""
         count, details = len(self.slot), [(1 if self.linear else SEGMENTS, SIDES), (1, SIDES), (1, 3)]
         wanted = [triangle_count(self.offsets, *detail) for detail in details]
         best = next((i for i, triangles in enumerate(wanted) if triangles <= MOST_TRIANGLES), len(details) - 1)

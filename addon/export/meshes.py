@@ -207,7 +207,7 @@ class Meshes:
     ) -> MeshState | None:
         if len(mesh.polygons) == 0:
             return None
-        if isinstance(mesh, Hair):  # nothing is told of materials that are not on it
+        if isinstance(mesh, Hair):  # no warnings of materials that are not on it
             slots = [slot if number in mesh.strands.slot else None for number, slot in enumerate(slots)]
         known: dict[bpy.types.Material | None, ExportedMaterial] = {}
         for material in slots or [None]:

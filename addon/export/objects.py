@@ -102,7 +102,7 @@ class DrgsObjects:
         if (lack := _lack(obj, shape.part, self._depsgraph.scene.drgs)) is not None:
             self._warn(f'"{obj.name}": {lack}; it is left out')
             return
-        if not len(assets.load(assets.file_of(obj)).mesh.faces):
+        if shape.vertices is None or not len(shape.vertices):
             self.without_mesh.add(obj.name)
         material = obj.material_slots[0].material if obj.material_slots else None
         visibility = self._holdouts.cut_out(item, [material], lambda: None).visibility
@@ -169,7 +169,7 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
         if proxies.is_proxy(mesh, asset):
             fit = _without_removed(Fit(), obj, asset, depsgraph)
             state = ObjectState(obj.name, key_of(path), part=fit.part, proxy=proxies.read(mesh))
-            state.adjustment = None if captured else _adjustment_of_all(obj, warn)
+            state.adjustment = None if captured else _adjustment(obj, mesh, None, warn)
             given = mesh_arrays.read_vertices(mesh), proxies.read_rest(mesh)
             proxies.check(obj, given[1], warn, final=depsgraph.mode == "RENDER")
             if state.proxy is not None and (particles := particles_of(obj, depsgraph, *given, warn)) is not None:
@@ -237,7 +237,7 @@ def appearance_of(
         if proxies.is_proxy(mesh, asset):
             part = _without_removed(Fit(), obj, asset, depsgraph).part
             own = asset if part is None else part_of(asset, part, f'Object "{obj.name}"')
-            return Appearance(own, asset.mesh.vertices, {}, _adjustment_of_all(obj, warn), proxies.read(mesh))
+            return Appearance(own, asset.mesh.vertices, {}, _adjustment(obj, mesh, None, warn), proxies.read(mesh))
         fit = _without_removed(check_topology(obj, mesh, asset.mesh, warn), obj, asset, depsgraph)
         painted = {channel: _edited(obj, mesh, asset, channel, fit, warn) for channel in MATERIAL_CHANNELS}
         return Appearance(
@@ -258,13 +258,17 @@ def _corner_normals(obj: bpy.types.Object, mesh: bpy.types.Mesh, fit: Fit, warn:
     return normals
 
 
-def _adjustment(obj: bpy.types.Object, mesh: bpy.types.Mesh, fit: Fit, warn: Warn) -> Adjustment | None:
-    """The adjustments of an object; None where they change nothing."""
+def _adjustment(obj: bpy.types.Object, mesh: bpy.types.Mesh, fit: Fit | None, warn: Warn) -> Adjustment | None:
+    """The adjustments of an object; None where they change nothing, or are masked on a proxy, which `fit`s nothing."""
     settings = obj.drgs.adjustment
     if not settings.values():
         return None
+    if settings.mask and fit is None:
+        warn(f'"{obj.name}": its adjustments want the mask "{settings.mask}" of a proxy, not of surfels; they are not '
+             "applied. Clear the mask")  # fmt: skip
+        return None
     mask = None
-    if settings.mask:
+    if fit is not None and settings.mask:
         mask = mesh_arrays.read_mask(obj, mesh, settings.mask)
         if mask is None:
             warn(
@@ -277,18 +281,6 @@ def _adjustment(obj: bpy.types.Object, mesh: bpy.types.Mesh, fit: Fit, warn: War
             warn(f'"{obj.name}": {lost} values of the mask "{settings.mask}" are not finite; 0 is used there')
             mask = np.nan_to_num(mask, posinf=0.0, neginf=0.0)
     return settings.to_frame(mask, warn)
-
-
-def _adjustment_of_all(obj: bpy.types.Object, warn: Warn) -> Adjustment | None:
-    """The adjustments of an object whose mesh is a proxy; None where they change nothing, or go by a mask."""
-    settings = obj.drgs.adjustment
-    if not settings.values():
-        return None
-    if settings.mask:
-        warn(f'"{obj.name}": its adjustments want the mask "{settings.mask}" of a proxy, not of surfels; they are not '
-             "applied. Clear the mask")  # fmt: skip
-        return None
-    return settings.to_frame(None, warn)
 
 
 def _edited(

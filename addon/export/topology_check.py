@@ -11,7 +11,7 @@ import numpy as np
 from ...drgs_blender.core.asset import Mesh
 from ...drgs_blender.core.asset.part import Part
 from ...drgs_blender.core.errors import AssetError
-from .. import mesh_arrays, proxies
+from .. import lookups, mesh_arrays, proxies
 from .face_match import Matched, match_faces
 
 Array = np.ndarray
@@ -165,14 +165,12 @@ def _kept_match(mesh: bpy.types.Mesh, rows: Array, rest: Mesh) -> tuple[Matched,
     joined = mesh_arrays.read_corner_vertices(mesh)
     start = np.zeros(0, np.int32) if len(joined) == 3 * len(mesh.polygons) else mesh_arrays.read_polygons(mesh)[0]
     state = rows, joined, start
-    for i, entry in enumerate(_matches):
-        if entry.faces is rest.faces and all(map(np.array_equal, entry.state, state)):
-            del _matches[i]
-            break
-    else:
-        entry = _Kept(rest.faces, state, *_match(mesh, rows, joined, rest))
-    _matches.insert(0, entry)
-    del _matches[_KEPT:]
+    entry = lookups.recall(
+        _matches,
+        lambda known: known.faces is rest.faces and all(map(np.array_equal, known.state, state)),
+        lambda: _Kept(rest.faces, state, *_match(mesh, rows, joined, rest)),
+        _KEPT,
+    )
     return entry.matched, entry.part
 
 

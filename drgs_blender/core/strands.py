@@ -63,9 +63,7 @@ class Tubes:
 
     def blend(self, values: Array) -> Array:
         """(r, c) values at the rings, of (n, c) at the points."""
-        part = self.part[:, None]
-        after = np.minimum(self.point + 1, len(values) - 1)
-        return values[self.point] * (1 - part) + values[after] * part
+        return _linear(values, self.point, self.part)
 
 
 def triangle_count(offsets: Array, segments: int = SEGMENTS, sides: int = SIDES) -> int:

@@ -16,6 +16,8 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import splu
 
 from ..core.errors import UsageError
 from ..core.frame import Particles
@@ -28,6 +30,8 @@ _CELLS, _MOST = 40, 6_000
 #: s and a; sums over points are those of the cells that have any.
 _SMOOTH, _ASIDE = 1e-2, 1e-6
 _CORNERS = np.array(list(product((0, 1), repeat=3)))
+#: One along each axis, and none.
+_STEPS = np.eye(4, 3, dtype=int)
 
 
 class LatticeFit:
@@ -54,9 +58,6 @@ class LatticeFit:
     """
 
     def __init__(self, rest: Array, faces: Array, carried: Array) -> None:
-        from scipy import sparse  # an engine starts without
-        from scipy.sparse.linalg import splu
-
         self._rest = np.asarray(rest, np.float64)
         if not len(self._rest):
             raise UsageError("the proxy", "has no vertices", "Give it some")
@@ -96,8 +97,6 @@ class LatticeFit:
 
     def _lay_out(self, rest: Array, carried: Array) -> None:
         """Choose cells, and number their corners."""
-        from scipy import ndimage
-
         every = np.concatenate([rest, carried])
         low, extent = every.min(axis=0), np.ptp(every, axis=0)
         self._side = max(float(extent.max()) / _CELLS, 1e-9)
@@ -119,12 +118,9 @@ class LatticeFit:
                 break
             self._side *= 1.1
         self._cells = cells
-        number = np.zeros(self._shape + 1, bool)
-        for corner in _CORNERS:
-            number[tuple(slice(c, c + n) for c, n in zip(corner, self._shape))] |= cells
-        self._place = np.argwhere(number)
-        self._number = np.full(number.shape, -1)
-        self._number[number] = np.arange(len(self._place))
+        self._place = self._firsts()
+        self._number = np.full(self._shape + 1, -1)
+        self._number[tuple(self._place.T)] = np.arange(len(self._place))
 
     def _cell(self, points: Array) -> Array:
         found = np.floor((points - self._origin) / self._side).astype(int)
@@ -132,8 +128,6 @@ class LatticeFit:
 
     def _trilinear(self, points: Array):  # type: ignore[no-untyped-def]
         """Sparse (n, s): values at points of a field that has values at the nodes; the field ends with its cells."""
-        from scipy import sparse
-
         cell = self._cell(points)
         inside = self._cells[tuple(cell.T)]
         rows = np.flatnonzero(inside)
@@ -143,17 +137,23 @@ class LatticeFit:
         places = np.concatenate(columns), np.tile(rows, len(_CORNERS))
         return sparse.csr_matrix((np.concatenate(weights), places[::-1]), (len(points), len(self._place)))
 
+    def _firsts(self, *axes: int) -> Array:
+        """(k, 3) the first corners of what of the cells extends along `axes`: none are nodes, one edges, two faces."""
+        there = np.zeros(self._shape + 1, bool)
+        for corner in _CORNERS[(_CORNERS[:, axes] == 0).all(axis=1)]:
+            there[tuple(slice(c, c + n) for c, n in zip(corner, self._shape))] |= self._cells
+        return np.argwhere(there)
+
+    def _nodes_at(self, first: Array, *steps: Array) -> Array:
+        """(k, n) numbers of the nodes that are n `steps` from first ones."""
+        return np.stack([self._number[tuple((first + step).T)] for step in steps], axis=1)
+
     def _edges(self, axis: int) -> Array:
         """(k, 2) nodes that an edge of a cell along `axis` joins."""
-        there = np.zeros(self._shape + 1, bool)
-        for corner in _CORNERS[_CORNERS[:, axis] == 0]:
-            there[tuple(slice(c, c + n) for c, n in zip(corner, self._shape))] |= self._cells
-        first = np.argwhere(there)
-        return np.stack([self._number[tuple((first + step).T)] for step in (0, np.eye(3, dtype=int)[axis])], axis=1)
+        return self._nodes_at(self._firsts(axis), *_STEPS[[3, axis]])
 
     def _second_differences(self):  # type: ignore[no-untyped-def]
         """Sparse (k, s): along each axis, and across each face of a cell."""
-        unit = np.eye(3, dtype=int)
         parts = []
         for axis in range(3):
             edges = self._edges(axis)
@@ -163,22 +163,12 @@ class LatticeFit:
             line = np.column_stack([edges, third])[third >= 0]
             parts.append(self._rows(line, (1.0, -2.0, 1.0)))
         for a, b in ((0, 1), (0, 2), (1, 2)):
-            other = 3 - a - b
-            there = np.zeros(self._shape + 1, bool)
-            for step in (0, 1):
-                into = [slice(0, n) for n in self._shape]
-                into[other] = slice(step, step + self._shape[other])
-                there[tuple(into)] |= self._cells
-            first = np.argwhere(there)
-            corners = [self._number[tuple((first + step).T)] for step in (0, unit[a], unit[b], unit[a] + unit[b])]
-            parts.append(self._rows(np.column_stack(corners), (1.0, -1.0, -1.0, 1.0)) * np.sqrt(2))
-        from scipy import sparse
-
+            across = _STEPS[[3, a, b]]
+            face = self._nodes_at(self._firsts(a, b), *across, across.sum(axis=0))
+            parts.append(self._rows(face, (1.0, -1.0, -1.0, 1.0)) * np.sqrt(2))
         return sparse.vstack(parts).tocsr()
 
     def _rows(self, nodes: Array, values: tuple[float, ...]):  # type: ignore[no-untyped-def]
-        from scipy import sparse
-
         rows = np.repeat(np.arange(len(nodes)), len(values))
         return sparse.csr_matrix(
             (np.tile(values, len(nodes)), (rows, nodes.reshape(-1))), (len(nodes), len(self._place))
@@ -186,8 +176,6 @@ class LatticeFit:
 
     def _mean_difference(self, axis: int):  # type: ignore[no-untyped-def]
         """Sparse (s, s): the mean slope of the edges along `axis` at each node."""
-        from scipy import sparse
-
         edges = self._edges(axis)
         count = np.bincount(edges.reshape(-1), minlength=len(self._place))
         rows = np.concatenate([edges[:, 0], edges[:, 0], edges[:, 1], edges[:, 1]])

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,10 @@ from ..core.arrays import Array, same_bits
 from ..core.asset.model import Asset
 from ..core.errors import AssetError
 from ..core.frame import ObjectState, ProxyMesh
-from ..deform.lattice_fit import LatticeFit
+from .loaded_assets import LoadedAsset
+
+if TYPE_CHECKING:
+    from ..deform.lattice_fit import LatticeFit
 
 _REMEDY = "Delete its vertices, then choose Add Proxy Mesh"
 
@@ -36,33 +39,30 @@ class ProxyMeshes:
     def __init__(self) -> None:
         self._known: list[_Known] = []
 
-    def carried(self, states: Iterable[ObjectState], asset_of: Callable[[str], Asset | None]) -> list[ObjectState]:
+    def carried(self, states: Iterable[ObjectState], assets: Mapping[str, LoadedAsset]) -> list[ObjectState]:
         """The objects of a frame, those with a proxy carried by particles in its place.
 
         Parameters
         ----------
         states : iterable of ObjectState
-        asset_of : callable
-            The asset of a key, None where it is not loaded.
+        assets : mapping of str to LoadedAsset
+            By their keys.
 
         Raises
         ------
         AssetError
             A proxy is no mesh, not finite at rest, or of an asset that has a mesh; names the object.
         """
-        used: list[_Known] = []
+        used: dict[int, _Known] = {}
         found = []
         for state in states:
-            proxy, asset = state.proxy, asset_of(state.asset)
-            if proxy is None or asset is None:
-                found.append(state)
-                continue
-            known = self._bound(state.name, proxy, asset)
-            if all(known is not other for other in used):
-                used.append(known)
-                self._known.append(known)  # for the next object that has it
-            found.append(replace(state, proxy=None, particles=known.fit.particles(proxy.vertices)))
-        self._known = used
+            proxy, loaded = state.proxy, assets.get(state.asset)
+            if proxy is not None and loaded is not None:
+                known = self._bound(state.name, proxy, loaded.asset)
+                used[id(known)] = known
+                state = replace(state, proxy=None, particles=known.fit.particles(proxy.vertices))
+            found.append(state)
+        self._known = list(used.values())
         return found
 
     def _bound(self, name: str, proxy: ProxyMesh, asset: Asset) -> _Known:
@@ -78,4 +78,8 @@ class ProxyMeshes:
             raise AssetError(subject, "its proxy is not finite at rest", _REMEDY)
         if faces.ndim != 2 or faces.shape[1] != 3 or (len(faces) and not 0 <= faces.min() <= faces.max() < len(rest)):
             raise AssetError(subject, f"its proxy has no faces of its {len(rest)} vertices", _REMEDY)
-        return _Known(proxy, asset.surfels.centre, LatticeFit(rest, faces, asset.surfels.centre))
+        from ..deform.lattice_fit import LatticeFit  # with SciPy, without which an engine starts
+
+        known = _Known(proxy, asset.surfels.centre, LatticeFit(rest, faces, asset.surfels.centre))
+        self._known.append(known)  # for the next object that has it
+        return known

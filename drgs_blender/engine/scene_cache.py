@@ -167,7 +167,7 @@ class SceneCache:
         objects: list[CachedObject] = []
         faults: list[str] = []
         self._parts.begin()
-        states = self._proxies.carried(frame.objects, lambda key: getattr(self._assets.get(key), "asset", None))
+        states = self._proxies.carried(frame.objects, self._assets)
         self._carriers.begin(states)
         for index, state in enumerate(states):
             loaded = self._assets.get(state.asset)
