@@ -68,7 +68,13 @@ def check(obj: bpy.types.Object, rest: Array, warn: Callable[[str], None], *, fi
 
 
 def read(mesh: bpy.types.Mesh) -> ProxyMesh | None:
-    """What an evaluated proxy does; None where it is as at rest.
+    """What an evaluated proxy does; None where it is as at rest."""
+    proxy = read_pose(mesh)
+    return None if np.array_equal(proxy.rest, proxy.vertices) else proxy
+
+
+def read_pose(mesh: bpy.types.Mesh) -> ProxyMesh:
+    """What an evaluated proxy does, also at rest.
 
     Vertices of no face are left out where there are faces, and those that do not know where they are at rest.
     """
@@ -81,8 +87,6 @@ def read(mesh: bpy.types.Mesh) -> ProxyMesh | None:
         used, faces = np.unique(faces, return_inverse=True)
     rest, vertices = np.ascontiguousarray(rest[used]), np.ascontiguousarray(vertices[used])
     faces = np.ascontiguousarray(faces.reshape(-1, 3), np.int32)
-    if np.array_equal(rest, vertices):
-        return None
     for array in (rest, vertices, faces):
         array.flags.writeable = False  # so that the engine's client need not copy it
     return ProxyMesh(rest, vertices, faces)

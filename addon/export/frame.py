@@ -8,7 +8,7 @@ from pathlib import Path
 
 import bpy
 
-from ...drgs_blender.core.errors import UsageError, first_of
+from ...drgs_blender.core.errors import UsageError
 from ...drgs_blender.core.frame import Camera, Frame, Mist
 from ...drgs_blender.core.passes import AOVS, pass_of
 from .. import assets, compositing, preferences
@@ -23,7 +23,7 @@ from .light_links import LightLinks
 from .lights import export_light
 from .materials import Materials
 from .meshes import Meshes
-from .motion_steps import AFTER, BEFORE, FrameSet, add_moments
+from .motion_steps import FrameSet, add_moments
 from .objects import DrgsObjects
 from .world import export_world
 
@@ -135,9 +135,6 @@ def export_frame(
     )
     if "UV" in passes and objects.states:
         warn("The pass UV is 0 on DR-GS objects: surfels have no texture coordinates")
-    if not (BEFORE | AFTER).isdisjoint(passes) and objects.without_mesh:
-        names = first_of(sorted(objects.without_mesh))
-        warn(f"The passes Vector and Previous Position take what has no mesh for at rest: {names}")
     cache.end(end_export())
     if wanted is not None:
         wanted.end()

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import bpy
 import numpy as np
 
 from ...drgs_blender.core.arrays import same_bits
 from ...drgs_blender.core.asset.part import Part
-from ...drgs_blender.core.frame import Frame, MotionStep, Pose
-from .. import assets, mesh_arrays
+from ...drgs_blender.core.frame import Frame, MotionStep, ObjectState, Particles, Pose, ProxyMesh
+from .. import assets, mesh_arrays, proxies
 from .camera import export_camera, picture_of
 from .hair import read_strands
 from .instances import Key, uncancelled, visible
+from .particles import particles_of
 
 Array = np.ndarray
 #: Evaluates the scene of the depsgraph at another frame, a whole number and a part in [0, 1).
 FrameSet = Callable[[int, float], None]
+
+#: What carries the surfels of an object without a mesh.
+Carriers = tuple[Particles | None, ProxyMesh | None]
 
 #: Passes that need another time, by which one.
 BEFORE, AFTER = frozenset({"Vector", "Previous Position"}), frozenset({"Vector"})
@@ -64,6 +69,18 @@ def _vertices(obj: bpy.types.Object, part: Part) -> Array:
     return vertices if rows is None or not np.array_equal(rows[rows >= 0], part.vertices) else vertices[rows >= 0]
 
 
+def _carrier(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, now: ObjectState) -> Carriers:
+    """What carries the surfels of a proxy as it is evaluated then; nothing where it is at rest, then and `now`."""
+    if now.particles is not None:
+        given = mesh_arrays.read_vertices(obj.data), proxies.read_rest(obj.data)
+        particles = particles_of(obj, depsgraph, *given, lambda text: None)  # which the frame itself has told
+        if particles is not None:
+            return replace(particles, all=True), None
+    pose = proxies.read_pose(obj.data)
+    still = now.proxy is None and now.particles is None and np.array_equal(pose.rest, pose.vertices)
+    return None, None if still else pose
+
+
 def _moment(
     frame: Frame,
     depsgraph: bpy.types.Depsgraph,
@@ -77,6 +94,7 @@ def _moment(
     shape_of |= {key: ("mesh", i) for i, keys in enumerate(mesh_keys) for key in keys}
     matrices: dict[Key, Array] = {}
     read: dict[tuple[int, bool], Array] = {}
+    carriers: dict[int, Carriers] = {}
     vertices: dict[tuple[str, int], Array] = {}
     for item in uncancelled(visible(depsgraph), cancelled):
         if item.key not in shape_of:
@@ -86,6 +104,9 @@ def _moment(
         # While a mesh is edited, its evaluated data has no arrays; nor does it move.
         if shape not in vertices and (item.is_hair or not mesh.is_editmode):
             which = mesh.as_pointer(), item.is_hair
+            if shape[0] == "object" and proxies.is_proxy(mesh, assets.load(assets.file_of(item.object))):
+                carriers[shape[1]] = _carrier(item.object, depsgraph, frame.objects[shape[1]])
+                continue
             if which not in read:
                 part = frame.objects[shape[1]].part if shape[0] == "object" else None
                 if item.is_hair:
@@ -101,8 +122,11 @@ def _moment(
 
     objects: list[Pose | None] = []
     for i, (key, state) in enumerate(zip(object_keys, frame.objects)):
-        known = key in matrices
-        objects.append(Pose(state.name, matrices[key][None], moved(("object", i), state.vertices)) if known else None)
+        pose = None
+        if key in matrices:
+            own = moved(("object", i), state.vertices)
+            pose = Pose(state.name, matrices[key][None], own, *carriers.get(i, (None, None)))
+        objects.append(pose)
     meshes: list[Pose | None] = []
     for i, (keys, mesh) in enumerate(zip(mesh_keys, frame.meshes)):
         places = np.stack([matrices.get(key, now) for key, now in zip(keys, mesh.matrices)])

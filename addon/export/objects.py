@@ -72,7 +72,6 @@ class DrgsObjects:
         self._holdouts = Holdouts(warn)
         self.states: list[ObjectState] = []
         self.keys: list[Key] = []
-        self.without_mesh: set[str] = set()
 
     def add(self, item: Visible) -> None:
         """Take in a visible instance.
@@ -102,8 +101,6 @@ class DrgsObjects:
         if (lack := _lack(obj, shape.part, self._depsgraph.scene.drgs)) is not None:
             self._warn(f'"{obj.name}": {lack}; it is left out')
             return
-        if shape.vertices is None or not len(shape.vertices):
-            self.without_mesh.add(obj.name)
         material = obj.material_slots[0].material if obj.material_slots else None
         visibility = self._holdouts.cut_out(item, [material], lambda: None).visibility
         self.states.append(

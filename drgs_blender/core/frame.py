@@ -506,11 +506,17 @@ class Pose:
         Object-to-world, one per instance; an `ObjectState` has one.
     vertices : (n, 3) float32 array, optional
         Object space; None: as in the frame itself.
+    particles : Particles, optional
+        What carries the surfels of an object without a mesh then; None: as in the frame itself.
+    proxy : ProxyMesh, optional
+        The same.
     """
 
     name: str
     matrices: Array
     vertices: Array | None = None
+    particles: Particles | None = None
+    proxy: ProxyMesh | None = None
 
 
 @dataclass(slots=True)

@@ -12,7 +12,7 @@ from ..render.camera import camera_parameters
 from ..render.denoise.svgf_temporal import History
 from ..render.film.light_passes import LIGHT_PASSES
 from ..render.film.motion_vectors import SceneState
-from ..render.scene.trace_scene import TraceScene
+from ..render.prepared_scene import PreparedScene
 
 #: Names of which the session keeps the history.
 MAX_HISTORIES = 4
@@ -49,18 +49,18 @@ class Histories:
     def __init__(self) -> None:
         self._known: dict[str, Sequence] = {}
 
-    def continued(self, frame: Frame, scene: TraceScene, static_state: tuple[Any, ...]) -> Sequence:
+    def continued(self, frame: Frame, prepared: PreparedScene, static_state: tuple[Any, ...]) -> Sequence:
         """The sequence that `frame` continues, with what of it is of use.
 
         Parameters
         ----------
         frame : Frame
-        scene : TraceScene
-            Brought up to date for the frame.
+        prepared : PreparedScene
+            The frame's.
         static_state : tuple
             Objects, meshes, images, world and lights of the frame, unchanged ones as the same objects.
         """
-        settings, camera = frame.settings, frame.camera
+        settings, camera, scene = frame.settings, frame.camera, prepared.scene
         old = self._known.get(frame.history, Sequence())
         # How many samples are drawn, and which, is a matter of noise.
         lasting = replace(
@@ -84,16 +84,18 @@ class Histories:
             scene.vertices if still or same_bits(old.past.vertices, scene.vertices) else old.past.vertices,
             scene.instances if still or same_bits(old.past.instances, scene.instances) else old.past.instances,
             old.past.parameters,
+            prepared.unmeshed if still else old.past.surfels,
         )
         return Sequence(History(old.history.signal, scene_state, still), old.past, fit, situation, old.pictures)
 
-    def store(self, frame: Frame, sequence: Sequence, scene: TraceScene) -> None:
+    def store(self, frame: Frame, sequence: Sequence, prepared: PreparedScene) -> None:
         """Remember `sequence` after its picture `frame` was made."""
-        before, past = sequence.history.scene_state, sequence.past
+        before, past, scene = sequence.history.scene_state, sequence.past, prepared.scene
         sequence.past = SceneState(
             past.vertices if past and before and before.vertices is scene.vertices else scene.vertices.copy(),
             past.instances if past and before and before.instances is scene.instances else scene.instances.copy(),
             camera_parameters(frame.camera, frame.settings, frame.noise_index),
+            prepared.unmeshed,
         )
         sequence.history.scene_state = None  # the scene's arrays are for this picture only
         sequence.pictures += 1

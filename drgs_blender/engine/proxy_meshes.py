@@ -11,7 +11,7 @@ import numpy as np
 from ..core.arrays import Array, same_bits
 from ..core.asset.model import Asset
 from ..core.errors import AssetError
-from ..core.frame import ObjectState, ProxyMesh
+from ..core.frame import ObjectState, Particles, ProxyMesh
 from .loaded_assets import LoadedAsset
 
 if TYPE_CHECKING:
@@ -64,6 +64,10 @@ class ProxyMeshes:
             found.append(state)
         self._known = list(used.values())
         return found
+
+    def particles(self, name: str, proxy: ProxyMesh, asset: Asset) -> Particles:
+        """What a proxy of the object `name` does at any time, as `carried`; it is known until the next frame."""
+        return self._bound(name, proxy, asset).fit.particles(proxy.vertices)
 
     def _bound(self, name: str, proxy: ProxyMesh, asset: Asset) -> _Known:
         rest, faces, subject = proxy.rest, proxy.faces, f"object {name}"

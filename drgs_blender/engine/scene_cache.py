@@ -24,6 +24,7 @@ from ..ipc.change_detection import reuse_equal
 from ..render.backend import CPU, RenderBackend
 from ..render.camera import camera_parameters
 from ..render.film.motion_vectors import SceneState
+from ..render.film.surfel_motion import SurfelState
 from ..render.lights.environment import EnvironmentLight
 from ..render.lights.light_groups import group, groups_of
 from ..render.lights.light_links import link
@@ -42,6 +43,7 @@ from .part_cache import PartCache
 from .proxy_meshes import ProxyMeshes
 from .scene_objects import check_surface, in_asset_order, join, moved_vertices, posed_surfels
 from .surfel_sheets import meets_sheets, sheet_mesh
+from .surfel_states import state_at, state_now
 from .surfel_trees import SurfelTree
 
 Array = np.ndarray
@@ -76,6 +78,8 @@ class SceneCache:
         Objects of the last frame that the camera sees in captured colours.
     emission : (n, 3) float32 array, optional
         Radiance of the surfels that the camera sees; see ``PreparedScene.emission``.
+    unmeshed : SurfelState, optional
+        Surfels of the last frame's objects without a mesh, as they are drawn.
     captured_faults : list of str
         What objects of the last frame lack to be shown as they should, in words for the user.
     """
@@ -102,6 +106,8 @@ class SceneCache:
         self.captured_faults: list[str] = []
         self._emitters = Emitters()
         self._deformer: Deformer | None = None
+        self._shown: list[CachedObject] = []  # those of the last frame, of which a budget leaves fewer surfels
+        self.unmeshed: SurfelState | None = None
 
     @property
     def static_state(self) -> tuple[object, ...]:
@@ -233,6 +239,7 @@ class SceneCache:
             if met or along_rays:
                 tree = self._trees[budget is not None].of(objects)
         self.tree, self.seen_tree = tree if met else None, tree if along_rays else None
+        self._shown, self.unmeshed = objects, state_now(objects)
         visible = [item for item in objects if item.state.visibility.camera] if seen else []
         self.captured = tuple(item.captured for item in visible if item.captured is not None)
         visible = [item for item in visible if item.captured is None and not item.seen_by_mesh]
@@ -305,7 +312,9 @@ class SceneCache:
         ]
         others = [part for item in self.objects for part in (item.glowing, item.sheet, item.mesh) if part is not None]
         vertices, instances = self.scene.at(moved, [*step.meshes, *[None] * len(others)])
-        return SceneState(vertices, instances, camera_parameters(step.camera, frame.settings, frame.noise_index))
+        parameters = camera_parameters(step.camera, frame.settings, frame.noise_index)
+        surfels = state_at(self._shown, step.objects, self._assets, self._proxies, self._carriers)
+        return SceneState(vertices, instances, parameters, surfels)
 
     def environment_of(self, world: World) -> EnvironmentLight:
         """The light of `world`, made again only when something about it changed; a rotation costs nothing."""

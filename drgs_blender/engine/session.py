@@ -289,14 +289,14 @@ class Session:
         if frame.history and frame.settings.denoise == "svgf":
             self._lights = reuse_equal(frame.lights, self._lights)
             static_state = *self._scene_cache.static_state, self._lights
-            sequence = self._histories.continued(frame, prepared.scene, static_state)
+            sequence = self._histories.continued(frame, prepared, static_state)
             statistics["history"] = float(sequence.pictures)
         state_at = self._scene_cache.scene_state
         prepared = replace(prepared, previous=state_at(frame, frame.previous), following=state_at(frame, frame.next))
         history = None if sequence is None else sequence.history
         pictures = render(prepared, frame, report, cancelled, history=history, backend=backend)
         if sequence is not None:
-            self._histories.store(frame, sequence, prepared.scene)
+            self._histories.store(frame, sequence, prepared)
         return Passes(pictures, [], statistics)
 
     def _compile(
@@ -331,7 +331,7 @@ class Session:
         seen, captured = cache.seen_tree, cache.captured
         return PreparedScene(
             cache.scene, environment, posed, lights, cache.tree, seen, captured=captured, background=background,
-            emission=cache.emission,
+            emission=cache.emission, unmeshed=cache.unmeshed,
         )  # fmt: skip
 
     def _warnings(self, frame: Frame) -> list[str]:

@@ -120,7 +120,7 @@ def render(
     if settings.denoise != "svgf":
         history = None
     left, top, right, bottom = camera.window
-    now = SceneState(scene.vertices, scene.instances, parameters)
+    now = SceneState(scene.vertices, scene.instances, parameters, prepared.unmeshed)
     past = None if history is None else history.scene_state
     moving = [
         None if then is None else MotionFilm((bottom - top, right - left), (left, top), now, then)

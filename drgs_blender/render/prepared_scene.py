@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from ..core.arrays import Array
 from ..core.asset.model import PosedSurfels
 from .film.motion_vectors import SceneState
+from .film.surfel_motion import SurfelState
 from .lights.environment import EnvironmentLight
 from .lights.light_sampler import Lights
 from .scene.trace_scene import TraceScene
@@ -36,6 +37,8 @@ class PreparedScene:
         What the camera sees of the world, where that differs from ``environment``.
     previous, following : SceneState, optional
         The scene one frame earlier and later, for motion vectors; None: nothing moves.
+    unmeshed : SurfelState, optional
+        Surfels of the objects without a mesh, for motion vectors.
     captured : tuple of CapturedObject
         Objects that the camera sees unlit, with the colours of their capture.
     emission : (n, 3) float32 array, optional
@@ -51,6 +54,7 @@ class PreparedScene:
     seen_surfels: SurfelBVH | None = None
     previous: SceneState | None = None
     following: SceneState | None = None
+    unmeshed: SurfelState | None = None
     captured: tuple[CapturedObject, ...] = ()
     emission: Array | None = None
     background: EnvironmentLight | None = None

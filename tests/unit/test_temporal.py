@@ -192,10 +192,10 @@ def test_samples_make_up_a_pixels_motion_as_they_make_up_its_position() -> None:
     previous = np.float32([[4, 0, 0], [0, 4, 0], [9, 9, 9], [7, 7, 7]])
     film = MotionFilm((H, W), (0, 0), scene_state(), scene_state())
     buffer.face[:] = 3
-    film.displace(buffer, previous)
+    film.displace(buffer, previous, buffer.face)
     assert np.allclose(film.displacement[7, 9], [1, 3, 0])
     buffer.face[1] = -1  # of a surfel off the mesh: it follows the others
-    film.displace(buffer, previous)
+    film.displace(buffer, previous, buffer.face)
     assert np.allclose(film.displacement[7, 9], [4, 0, 0])
     film.displacement[7, 9] = 0
     assert (film.displacement == 0).all()

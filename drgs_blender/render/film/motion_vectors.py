@@ -21,6 +21,7 @@ from ..scene.interaction import position_at
 from ..scene.trace_scene import TraceScene
 from ..shading_points import CATCHER
 from .film import SAME_SURFACE
+from .surfel_motion import SurfelState
 
 Array = np.ndarray
 
@@ -34,11 +35,14 @@ class SceneState(NamedTuple):
         Laid out as those of `scene.trace_scene.TraceScene`.
     parameters : array
         `camera.camera_parameters`.
+    surfels : SurfelState, optional
+        Of objects without a mesh.
     """
 
     vertices: Array
     instances: Array
     parameters: Array
+    surfels: SurfelState | None = None
 
 
 class Motion(NamedTuple):
@@ -81,7 +85,8 @@ def previous_positions(
     """
     out = np.empty((len(face), 3), np.float32)
     tied = face, instance, barycentric
-    over_range(_previous, len(face), faces, now, then, *tied, position, out, fewest=ELEMENTS)
+    shapes = (state._replace(surfels=None) for state in (now, then))  # compiled code knows arrays alone
+    over_range(_previous, len(face), faces, *shapes, *tied, position, out, fewest=ELEMENTS)
     return out
 
 
@@ -104,18 +109,27 @@ class MotionFilm:
 
     def add(self, buffer: GBuffer, scene: TraceScene) -> None:
         """Take the samples of the strip `buffer`."""
-        position = buffer.position
-        if self.then.vertices is not self.now.vertices or self.then.instances is not self.now.instances:
-            tied = buffer.face, buffer.instance, buffer.barycentric
-            self.displace(buffer, previous_positions(scene.faces, self.now, self.then, *tied, position))
+        position, face = buffer.position, buffer.face
+        moved = self.then.vertices is not self.now.vertices or self.then.instances is not self.now.instances
+        previous = position
+        if moved:
+            tied = face, buffer.instance, buffer.barycentric
+            previous = previous_positions(scene.faces, self.now, self.then, *tied, position)
+        if self.now.surfels is not None and self.then.surfels is not None:
+            previous = previous if moved else position.copy()
+            carried = self.now.surfels.displace(self.then.surfels, buffer.object_index, face, position, previous)
+            face = np.where(carried, np.int32(0), face)
+            moved = moved or bool(carried.any())
+        if moved:
+            self.displace(buffer, previous, face)
 
-    def displace(self, buffer: GBuffer, previous: Array) -> None:
-        """Take samples that are at `previous` (n, 3) at the other time."""
+    def displace(self, buffer: GBuffer, previous: Array, face: Array) -> None:
+        """Take samples that are at `previous` (n, 3) at the other time; those with a negative `face` follow others."""
         x0, top = self.origin
         y0, y1 = buffer.rows
         points = buffer.point_rows(x0, int(self.now.parameters[WIDTH]))
         out = self.displacement[y0 - top : y1 - top]
-        over_range(_displace, y1 - y0, points, self.now.parameters, buffer.face, previous, out, fewest=ROWS)
+        over_range(_displace, y1 - y0, points, self.now.parameters, face, previous, out, fewest=ROWS)
 
     def motion(self, position: Array, coverage: Array) -> Motion:
         """Motion of the picture whose passes are `position` and `coverage`."""
