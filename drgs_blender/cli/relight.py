@@ -21,8 +21,9 @@ import numpy as np
 
 from ..core import cryptomatte
 from ..core.asset import Asset
+from ..core.asset.model import Mesh
 from ..core.errors import UsageError
-from ..core.frame import Camera, Frame, ObjectState, Particles, RenderSettings, World
+from ..core.frame import Camera, Frame, ObjectState, Particles, ProxyMesh, RenderSettings, World
 from ..core.frame_sequences import frame_path
 from ..core.loading import many_imports
 from ..core.particle_cache import ParticleCache
@@ -34,6 +35,7 @@ from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_preview
 from .pose_file import add_vertex_order, check_vertex_order, in_asset_order, is_point_cache, read_poses, read_vertices
 from .progress import FractionBar
+from .proxy_file import add_proxy, read_proxy
 
 logger = logging.getLogger(__name__)
 
@@ -45,6 +47,7 @@ EXAMPLES = """examples:
       --passes all --transparent --out helmet.exr
   drgs relight robot.drgs --env city.exr --camera front.json --vertices pose.npy --out pose.png
   drgs relight robot.drgs --env city.exr --camera front.json --vertices walk.pc2 --frames 1-24 --out 'walk/####.exr'
+  drgs relight fern.drgs --env city.exr --proxy hull.ply --vertices wind.pc2 --out 'fern/####.exr'
   drgs relight cat.drgs --env city.exr --camera front.json --cache bake --frames 1-48 --out 'cat/####.exr'
   drgs relight room.drgs --captured --camera front.json --out room.png
 """
@@ -86,6 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="V",
         help="pose: the mesh's vertices in object space, metres: (n, 3) array (.npy), or of many frames (.pc2, .mdd)",
     )
+    add_proxy(parser, "--vertices are its own, moved")
     add_vertex_order(parser)
     parser.add_argument(
         "--driven-by", choices=("automatic", "surface", "particles"), default="automatic",
@@ -136,12 +140,13 @@ def run(args: argparse.Namespace) -> int:
     else:
         world = World(read_environment(args, asset), rotation_z(args.env_rotation), strength=args.env_strength)
     state = ObjectState(args.asset.stem, key, tear=tear, grain=grain, captured_colours=args.captured)
+    carrier = _carrier(args, asset)
     warned = False
     for number, give_pose in poses:
         vertices, particles = give_pose()
-        if vertices is not None and args.vertices:
-            vertices = in_asset_order(args, session.asset(key).mesh, vertices)
-        shape = session.asset(key).mesh.vertices if vertices is None else vertices
+        if vertices is not None and args.vertices and carrier is None:
+            vertices = in_asset_order(args, asset.mesh, vertices)
+        shape = asset.mesh.vertices if vertices is None else vertices
         shape = shape if len(shape) else asset.surfels.centre
         camera = given or framing_camera(shape, 360.0 * (number - 1) / (args.orbit or 1), args.size or SIZE)
         if not warned and not camera.panorama and not sees_any(camera, shape):
@@ -154,7 +159,7 @@ def run(args: argparse.Namespace) -> int:
         frame = Frame(
             noise_index=number,
             camera=camera,
-            objects=[replace(state, vertices=vertices, particles=particles)],
+            objects=[_posed(args, state, asset, carrier, vertices, particles)],
             world=world,
             settings=settings,
             passes=args.passes,
@@ -177,6 +182,46 @@ def run(args: argparse.Namespace) -> int:
         height, width = picture["Combined"].shape[:2]
         print(f"{path}: {width} x {height}, {settings.sample_count} samples")
     return 0
+
+
+def _carrier(args: argparse.Namespace, asset: Asset) -> Mesh | None:
+    """The proxy of an asset without a mesh; UsageError where something moves that carries nothing."""
+    subject = str(args.asset)
+    if args.proxy is not None:
+        if args.vertices is None:
+            raise UsageError(f"--proxy {args.proxy}", "carries nothing at rest", "Give its moved --vertices")
+        if args.vertex_order:
+            raise UsageError("--vertex-order", "is that of an asset's mesh, not of a proxy", "Leave it out")
+        return read_proxy(args.proxy, asset, subject)
+    if not len(asset.mesh.faces):
+        if args.vertices is not None:
+            problem = f"are of no mesh: {subject} has surfels alone"
+            raise UsageError(f"--vertices {args.vertices}", problem, "Give the mesh they move at rest, with --proxy")
+        if args.cache is not None and args.driven_by == "surface":
+            raise UsageError("--driven-by surface", f"wants a mesh: {subject} has surfels alone", "Leave it out")
+    return None
+
+
+def _posed(
+    args: argparse.Namespace,
+    state: ObjectState,
+    asset: Asset,
+    carrier: Mesh | None,
+    vertices: np.ndarray | None,
+    particles: Particles | None,
+) -> ObjectState:
+    """The object as its mesh, its proxy or particles have it; where it has no mesh, these carry all."""
+    if carrier is not None and vertices is not None:
+        if vertices.shape != carrier.vertices.shape:
+            problem = f"has {len(vertices)} vertices, --proxy {args.proxy} has {len(carrier.vertices)}"
+            raise UsageError(f"--vertices {args.vertices}", problem, "Pose this proxy")
+        return replace(state, proxy=ProxyMesh(carrier.vertices, vertices, carrier.faces))
+    if len(asset.mesh.faces) or vertices is None:
+        return replace(state, vertices=vertices, particles=particles)
+    if particles is None:
+        problem = "has no mesh that could follow matter that flows"
+        raise UsageError(str(args.asset), problem, "Simulate a material that keeps its shape")
+    return replace(state, particles=replace(particles, all=True))
 
 
 def place_of(vertices: np.ndarray) -> str:

@@ -22,6 +22,7 @@ from .interrupt import interruptible
 from .json_file import read_json
 from .output import check_suffix, check_writable
 from .progress import FractionBar, clock, prepare_engine
+from .proxy_file import add_proxy, read_proxy
 from .sampling import int_range
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ logger = logging.getLogger(__name__)
 EXAMPLES = """examples:
   drgs simulate cat.drgs --material jelly --youngs-modulus 1e5 --floor 0 --frames 48 --out bake
   drgs simulate cat.drgs --settings drop.json --out bake --vertices 'poses/####.npy' --export cat.pc2
+  drgs simulate fern.drgs --proxy hull.ply --settings wind.json --out bake
   drgs relight cat.drgs --env studio.hdr --camera front.json --cache bake --frames 24 --out 24.png
 """
 
@@ -50,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="CACHE", help="folder of the frames")
     parser.add_argument("--settings", type=Path, metavar="S.json", help="settings of the simulation")
     parser.add_argument("--overwrite", action="store_true", help="remove what the folder holds of other settings")
+    add_proxy(parser, "its inside is simulated")
     parser.add_argument("--threads", type=int_range(0, 1024), default=0, help="threads, 0 for all cores")
     group = parser.add_argument_group("settings, over those of the file")
     group.add_argument(
@@ -111,9 +114,13 @@ def run(args: argparse.Namespace) -> int:
     settings = _settings(args)
     use_threads(args.threads)
     asset = read_asset(args.asset)
+    if not len(asset.mesh.faces) and args.proxy is None:
+        remedy = "Give a closed mesh around them with --proxy (Add Proxy Mesh makes one in Blender)"
+        raise UsageError(str(args.asset), "has surfels alone, which say nothing of what they enclose", remedy)
+    mesh = asset.mesh if args.proxy is None else read_proxy(args.proxy, asset, str(args.asset))
     prepare_engine(args, "simulate")
     with clock(args, "filling"):
-        job = prepare(asset.mesh, settings, str(args.asset))
+        job = prepare(mesh, settings, str(args.asset if args.proxy is None else args.proxy))
     report = job.filling.report
     parts = f" in {report['parts']} parts" if report["parts"] > 1 else ""
     steps = job.solver.steps_of(1 / settings.fps)
@@ -138,7 +145,7 @@ def run(args: argparse.Namespace) -> int:
 
         done = bake(job, cache, overwrite=args.overwrite, cancelled=stopped, progress=progress)
     print(f"{args.out}: frames {settings.first} to {settings.last}, {done} of them computed now")
-    _write_exports(args, cache, asset.mesh, settings)
+    _write_exports(args, cache, mesh, settings)
     return 0
 
 
