@@ -77,13 +77,13 @@ def test_poses_of_a_proxy_move_the_surfels(folder, relight, tmp_path):
     found = relight("--proxy", folder / "hull.ply", "--vertices", tmp_path / "wind.pc2", name="f####.exr")
     rest = relight()[0]
     for number, picture in enumerate(found):
-        assert middle(picture) - middle(rest) == pytest.approx(
-            (0.2 * number, 0.0, 0.3), abs=0.03
-        )  # another side is seen
+        way = middle(picture) - middle(rest)  # another side is seen
+        assert way == pytest.approx((0.2 * number, 0.0, 0.3), abs=0.03)
     meshed = np.asarray(trimesh.creation.icosphere(subdivisions=3, radius=0.5).vertices, np.float32)
     np.save(tmp_path / "pose.npy", meshed @ turn.T + np.float32((0.4, 0, 0.3)))
-    want = relight("--vertices", tmp_path / "pose.npy", asset="meshed.drgs")[0]
-    assert np.abs(found[2]["Coverage"] - want["Coverage"]).mean() < 2e-3
+    posed = relight("--vertices", tmp_path / "pose.npy", asset="meshed.drgs")[0]
+    apart = np.abs(rest["Coverage"] - relight(asset="meshed.drgs")[0]["Coverage"]).mean()  # the rim is drawn otherwise
+    assert np.abs(found[2]["Coverage"] - posed["Coverage"]).mean() < 1.3 * apart < 0.2 * rest["Coverage"].mean()
 
 
 def test_what_is_in_a_proxy_is_simulated_and_its_particles_carry_the_surfels(folder, relight, tmp_path):
