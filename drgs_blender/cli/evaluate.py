@@ -225,14 +225,17 @@ def left_out_by(asset: Asset) -> int | None:
 
 def session_renderer(
     session: Session, key: str, settings: RenderSettings, visibility: Visibility | None = None,
-    driven_by: str = "automatic",
+    driven_by: str = "automatic", tear: float = 0.0,
 ) -> Renderer:  # fmt: skip
-    """Renders the loaded asset `key` for `evaluate.compare`, with `settings` on a transparent film."""
+    """Renders the loaded asset `key` for `evaluate.compare`, with `settings` on a transparent film.
+
+    Faces that have grown by more than `tear` metres (`ObjectState.tear`) are left out; 0: none are.
+    """
 
     def render(camera: Camera, light: World, pose: Posed | None) -> dict[str, np.ndarray]:
         state = ObjectState(Path(key).stem, key, visibility=visibility or Visibility())
         if pose is not None:
-            state.vertices = pose.vertices
+            state.vertices, state.tear = pose.vertices, tear
             if driven_by != "surface":
                 state.particles = replace(pose.particles, all=driven_by == "particles")
         return compared_passes(session, state, camera, light, settings)
