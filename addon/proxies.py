@@ -6,6 +6,7 @@ simulations and nodes move it as they move any mesh, and the surfels follow.
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -20,6 +21,8 @@ Array = np.ndarray
 
 #: Attribute with the place of each vertex at rest, object space, metres; 0, as Blender has it, of those added later.
 REST = "drgs_rest"
+#: Property of a proxy's mesh that its copies and parts share.
+_MADE = "drgs_proxy"
 #: Modifiers that copy or thicken a mesh.
 _COPYING = {"ARRAY", "MIRROR", "SOLIDIFY", "BEVEL", "WIREFRAME", "SCREW"}
 #: Parts along the longest side of the surfels, each of which viewports move rigidly, and vertices that move each.
@@ -40,6 +43,7 @@ def fill(mesh: bpy.types.Mesh, vertices: Array, triangles: Array) -> None:
     vertices = np.where(vertices.any(axis=1, keepdims=True), vertices, 1e-9)
     mesh.clear_geometry()
     mesh.from_pydata(vertices.tolist(), [], triangles.tolist())
+    mesh[_MADE] = uuid.uuid4().hex
     attribute = mesh.attributes.new(REST, "FLOAT_VECTOR", "POINT")
     attribute.data.foreach_set("vector", np.ascontiguousarray(vertices, np.float32).ravel())
     mesh.update()
@@ -98,6 +102,31 @@ def read_rest(mesh: bpy.types.Mesh) -> Array:
     mesh.attributes[REST].data.foreach_get("vector", rest.ravel())
     rest[~rest.any(axis=1)] = np.nan
     return rest
+
+
+class Separated:
+    """Tells of proxies that were one mesh once: each of them shows all surfels."""
+
+    def __init__(self, warn: Callable[[str], None]) -> None:
+        self._warn = warn
+        self._known: dict[str, dict[int, tuple[str, set[bytes]]]] = {}
+
+    def add(self, obj: bpy.types.Object) -> None:
+        """Take in an evaluated object that has a proxy."""
+        parts = self._known.setdefault(str(obj.original.data.get(_MADE, obj.name)), {})
+        key = obj.original.data.as_pointer()
+        if key in parts:  # as instances and linked copies have it
+            return
+        rest = read_rest(obj.original.data)
+        rows = {row.tobytes() for row in rest[np.isfinite(rest).all(axis=1)]}
+        for name, others in parts.values():
+            if 2 * len(rows & others) < min(len(rows), len(others)):  # both have the rim of the cut
+                self._warn(
+                    f'"{name}" and "{obj.name}": parts of one proxy, so the surfels are there twice. Take them away '
+                    "from each by Crop or Edit Surfels, or undo the separation"
+                )
+                break
+        parts[key] = obj.name, rows
 
 
 class _Parts(NamedTuple):

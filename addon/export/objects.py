@@ -69,7 +69,7 @@ class DrgsObjects:
         aovs: Sequence[Pass] = (),
     ) -> None:
         self._depsgraph, self._key_of, self._warn, self._cache, self._aovs = depsgraph, key_of, warn, cache, aovs
-        self._holdouts = Holdouts(warn)
+        self._holdouts, self._separated = Holdouts(warn), proxies.Separated(warn)
         self.states: list[ObjectState] = []
         self.keys: list[Key] = []
 
@@ -87,6 +87,8 @@ class DrgsObjects:
             return
         if obj.original.data.attributes.get(proxies.REST) is None:
             check_modifiers(obj, self._depsgraph)
+        elif obj.mode != "EDIT" and obj.original.drgs.surfel_points is None:
+            self._separated.add(obj)
         cage_nodes.check(obj, self._depsgraph, self._warn)
         cache_playback.check(obj, self._warn, final=self._depsgraph.mode == "RENDER")
         appearance = (

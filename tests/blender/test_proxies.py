@@ -284,6 +284,28 @@ def test_vertices_that_are_added_or_joined_carry_nothing_and_are_told(cloud, exp
     assert any(f"{added} vertices of its proxy do not know" in text for text in warnings)
 
 
+def test_parts_of_one_proxy_are_told(cloud, export):
+    """Both have all surfels; a copy and the same capture with a proxy of its own do not count."""
+    select(cloud)
+    add_proxy()
+    bpy.ops.object.duplicate()
+    bpy.ops.import_scene.drgs(filepath=str(part("addon.assets").file_of(cloud)))
+    sheet = mesh_object("Sheet", [(-1, -1, 0), (1, -1, 0), (1, 1, 0)], [(0, 1, 2)])
+    select(sheet, bpy.context.object)
+    assert bpy.ops.drgs.add_proxy() == {"FINISHED"}
+    assert not export()[1]
+    select(cloud)
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="DESELECT")
+    bpy.ops.object.mode_set(mode="OBJECT")
+    for vertex in cloud.data.vertices:
+        vertex.select = vertex.co.z > 0
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.separate(type="SELECTED")
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert len([text for text in export()[1] if "parts of one proxy" in text and cloud.name in text]) == 1
+
+
 def test_a_vertex_in_the_origin_is_known(cloud, export):
     select(cloud)
     cage = mesh_object("Sheet", [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0), (0, 0, 0)], [(0, 1, 4), (2, 3, 4)])
