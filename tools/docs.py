@@ -33,7 +33,7 @@ NAVIGATION = {
     "Guides": (
         *("docs/rendering.md", "docs/simulation.md", "docs/deformation.md", "docs/decoupling.md", "docs/capture.md"),
         *("docs/reconstruct-settings.md", "docs/published-sets.md"),
-        *("docs/gpu.md", "docs/benchmarks.md"),
+        *("docs/gpu.md", "docs/benchmarks.md", "docs/paper.md"),
     ),
     "Formats and farm": (
         *("docs/formats.md", "docs/relightable-splats.md", "docs/asset-format.md"),
