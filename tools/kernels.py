@@ -63,6 +63,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[object]]]:
                            "--floor", "-1", "--out", folder / f"bake-{solver}"]  # fmt: skip
         yield "simulate", [*drgs, "simulate", asset, "--solver", solver, "--settings", folder / "settings.json",
                            "--out", folder / f"bake-{solver}-all"]  # fmt: skip
+    yield "coupled", [*drgs, "simulate", "--settings", folder / "bodies.json", "--out", folder / "bake-bodies"]
     yield "frame", [*relight[:-2], "--cache", folder / "bake-mpm", "--frames", "2", "--out", folder / "baked.exr"]
     for variant in ("p", "m"):
         yield "reconstruct", [*own, f"reconstruct-{variant}", folder]
@@ -86,6 +87,11 @@ def make_environment(folder: Path) -> None:
     ground = {"mesh": str(folder / "ground.obj")}
     settings = {"resolution": 12, "last": 3, "colliders": [ground], "pins": pins, "fields": fields}
     (folder / "settings.json").write_text(json.dumps(settings))
+    above = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
+    bodies = [{"asset": "spot.drgs", "matrix_world": above}, {"asset": "spot.drgs", "name": "pile", "material": "sand"}]
+    del settings["pins"]
+    bodies[1]["pins"] = pins
+    (folder / "bodies.json").write_text(json.dumps(settings | {"bodies": bodies}))
     camera = {"matrix_world": [[1, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0], [0, 0, 0, 1]], "width": 48, "height": 48}
     (folder / "camera.json").write_text(json.dumps(camera | {"fov_x": 40}))
 

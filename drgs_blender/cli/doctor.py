@@ -34,6 +34,7 @@ OPENEXR_MINIMUM = (3, 4, 10)
 #: Jobs of `compute.manifest` in words.
 _JOBS = {
     "frame": "rendering",
+    "coupled": "simulation of several bodies",
     "denoise": "denoising",
     "hdr": ".hdr environments",
     "lights": "lights",

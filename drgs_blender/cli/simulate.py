@@ -36,6 +36,7 @@ EXAMPLES = """examples:
   drgs simulate cat.drgs --settings drop.json --out bake --vertices 'poses/####.npy' --export cat.pc2
   drgs simulate fern.drgs --proxy hull.ply --settings wind.json --out bake
   drgs relight cat.drgs --env studio.hdr --camera front.json --cache bake --frames 24 --out 24.png
+  drgs simulate --settings bodies.json --out bake
 """
 
 #: Time steps a frame from which a bake is slower than its settings let expect.
@@ -48,8 +49,12 @@ _MATTER = ("youngs_modulus", "poisson", "density")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs simulate``."""
-    parser.add_argument("asset", type=Path, metavar="ASSET", help=".drgs file")
-    parser.add_argument("--out", type=Path, required=True, metavar="CACHE", help="folder of the frames")
+    parser.add_argument(
+        "asset", type=Path, nargs="?", metavar="ASSET", help=".drgs file; settings with bodies name theirs"
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="CACHE", help="folder of the frames; of several bodies, of a folder for each"
+    )
     parser.add_argument("--settings", type=Path, metavar="S.json", help="settings of the simulation")
     parser.add_argument("--overwrite", action="store_true", help="remove what the folder holds of other settings")
     add_proxy(parser, "its inside is simulated")
@@ -94,6 +99,7 @@ def run(args: argparse.Namespace) -> int:
     """Simulate."""
     from ..formats.point_cache import SUFFIXES
     from ..formats.usd_splats import check_usd
+    from .simulate_coupled import is_coupled, run_coupled
 
     if args.export:
         check_suffix(args.export, (*SUFFIXES, *USD_SUFFIXES))
@@ -104,6 +110,12 @@ def run(args: argparse.Namespace) -> int:
         if "#" not in Path(args.vertices).name:
             raise UsageError(f"--vertices {args.vertices}", "has no # for the frame's number", "Write it as v/####.npy")
         check_writable(frame_path(args.vertices, 1))
+    data, folder = _given(args)
+    if is_coupled(data):
+        return run_coupled(args, data, folder)
+    if args.asset is None or args.out is None:
+        what = "ASSET" if args.asset is None else "--out"
+        raise UsageError(what, "is not given", "Only settings with several bodies (--settings) go without")
     check_writable(args.out / "cache.json")
 
     from ..compute.threads import use_threads
@@ -111,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
     from ..simulation.bake import bake
     from ..simulation.job import prepare
 
-    settings = _settings(args)
+    settings = _settings(args, data, folder)
     use_threads(args.threads)
     asset = read_asset(args.asset)
     if not len(asset.mesh.faces) and args.proxy is None:
@@ -127,15 +139,7 @@ def run(args: argparse.Namespace) -> int:
     print(
         f"{report['particles']} particles{parts} ({report['method']}), at least {steps} time steps a frame", flush=True
     )
-    if steps > _WARN_STEPS:
-        logger.warning(
-            "%s: %d time steps a frame take long; a lower stiffness or resolution, or a larger body, needs fewer",
-            args.asset, steps,
-        )  # fmt: skip
-    if report["dropped_parts"]:
-        logger.warning("%d small parts of the mesh's interior are left out", report["dropped_parts"])
-    if report["bare_vertices"]:
-        logger.warning("%d vertices are on walls too thin to fill; they follow near particles", report["bare_vertices"])
+    warn(str(args.asset), report, steps)
     cache = ParticleCache(args.out)
     count = settings.last - settings.first + 1
     with FractionBar(args, "simulating") as bar, interruptible() as stopped:
@@ -149,15 +153,31 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _settings(args: argparse.Namespace) -> Settings:
+def warn(name: str, report: dict[str, Any], steps: int) -> None:
+    """Say what a body's filling leaves out, and whether its bake takes long."""
+    if steps > _WARN_STEPS:
+        logger.warning(
+            "%s: %d time steps a frame take long; a lower stiffness or resolution, or a larger body, needs fewer",
+            name, steps,
+        )  # fmt: skip
+    if report["dropped_parts"]:
+        logger.warning("%s: %d small parts of the mesh's interior are left out", name, report["dropped_parts"])
+    if bare := report["bare_vertices"]:
+        logger.warning("%s: %d vertices are on walls too thin to fill; they follow near particles", name, bare)
+
+
+def _given(args: argparse.Namespace) -> tuple[Any, Path]:
+    """What the file of settings holds, and the folder that its paths start from."""
+    if not args.settings:
+        return {}, Path()
+    data = read_json(args.settings, str(args.settings), _LARGEST_SETTINGS, "the settings of a simulation")
+    return data, args.settings.parent
+
+
+def _settings(args: argparse.Namespace, data: Any, folder: Path) -> Settings:
     """Settings of the file with those of the options."""
     from ..simulation.settings import parse_settings
 
-    data: dict[str, Any] = {}
-    folder = Path()
-    if args.settings:
-        data = read_json(args.settings, str(args.settings), _LARGEST_SETTINGS, "the settings of a simulation")
-        folder = args.settings.parent
     if isinstance(data, dict):
         data = dict(data)
         changes = {name: getattr(args, name) for name in _MATTER if getattr(args, name) is not None}
@@ -182,28 +202,45 @@ def _settings(args: argparse.Namespace) -> Settings:
 
 def _write_exports(args: argparse.Namespace, cache: ParticleCache, mesh: Mesh, settings: Settings) -> None:
     """Poses as arrays and a file for other programs, from the cache."""
+    if args.vertices:
+        write_vertices(args.vertices, cache, settings)
+    if args.export is not None and args.export.suffix.lower() in USD_SUFFIXES:
+        write_usd(args.export, [(args.asset.stem, mesh, cache, settings)])
+    elif args.export is not None:
+        write_points(args.export, cache, settings)
+
+
+def write_vertices(pattern: str, cache: ParticleCache, settings: Settings) -> None:
+    """The mesh of each frame as an array."""
     from ..core.asset.archive import replace_file
-    from ..formats.point_cache import write_point_cache
+
+    for frame in range(settings.first, settings.last + 1):
+        encoded = io.BytesIO()
+        np.save(encoded, cache.read(frame).vertices)
+        replace_file(frame_path(pattern, frame), [encoded.getvalue()])
+
+
+def write_usd(path: Path, bodies: list[tuple[str, Mesh, ParticleCache, Settings]]) -> None:
+    """Bodies, each with its name, moving in one USD file."""
     from ..formats.usd_sequence import MovingObject, write_usd_sequence
     from .convert_source import posed_mesh
 
-    first, fps = settings.first, settings.fps
-    frames = range(first, settings.last + 1)
-    if args.vertices:
-        for frame in frames:
-            encoded = io.BytesIO()
-            np.save(encoded, cache.read(frame).vertices)
-            replace_file(frame_path(args.vertices, frame), [encoded.getvalue()])
-    if args.export is None:
-        return
-    if args.export.suffix.lower() in USD_SUFFIXES:
-        name, matrix = args.asset.stem, np.array(settings.matrix_world)
-        states = ((n, cache.read(n)) for n in frames)
-        write_usd_sequence(
-            args.export,
-            ((n, [MovingObject(name, posed_mesh(mesh, s.vertices), matrix, points=s.points)]) for n, s in states),
-            fps,
-        )
-    else:
-        moving = (cache.read(frame).vertices for frame in frames)
-        write_point_cache(args.export, moving, len(frames), len(cache.rest().vertices), first, fps)
+    def moving(frame: int) -> list[MovingObject]:
+        found = []
+        for name, mesh, cache, settings in bodies:
+            state, matrix = cache.read(frame), np.array(settings.matrix_world)
+            found.append(MovingObject(name, posed_mesh(mesh, state.vertices), matrix, points=state.points))
+        return found
+
+    settings = bodies[0][3]
+    frames = range(settings.first, settings.last + 1)
+    write_usd_sequence(path, ((frame, moving(frame)) for frame in frames), settings.fps)
+
+
+def write_points(path: Path, cache: ParticleCache, settings: Settings) -> None:
+    """The mesh of all frames as a point cache."""
+    from ..formats.point_cache import write_point_cache
+
+    frames = range(settings.first, settings.last + 1)
+    moving = (cache.read(frame).vertices for frame in frames)
+    write_point_cache(path, moving, len(frames), len(cache.rest().vertices), settings.first, settings.fps)

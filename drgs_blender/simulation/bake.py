@@ -15,7 +15,7 @@ from .job import Job
 log = logging.getLogger(__name__)
 
 #: Seconds of computing that an interruption may cost.
-_SAVE_EVERY = 5.0
+SAVE_EVERY = 5.0
 
 
 def bake(
@@ -71,27 +71,27 @@ def bake(
         for frame in range(start + 1, settings.last + 1):
             report = None if progress is None else (lambda part, f=frame: progress(f, part))
             solver.advance(1 / settings.fps, job.pin_targets(frame - settings.first), cancelled, report)
-            _check_owner(cache, job)
+            check_owner(cache, job)
             cache.write(frame, job.now())
             done += 1
-            if time.monotonic() - kept_at > _SAVE_EVERY:
+            if time.monotonic() - kept_at > SAVE_EVERY:
                 cache.write_state(frame, solver.arrays())
                 kept, kept_at = frame, time.monotonic()
     finally:
         now = settings.first + solver.frame
-        if now > kept and cache.path(now).exists() and _owned(cache, job):
+        if now > kept and cache.path(now).exists() and owned(cache, job):
             cache.write_state(now, solver.arrays())
     return done
 
 
-def _owned(cache: ParticleCache, job: Job) -> bool:
+def owned(cache: ParticleCache, job: Job) -> bool:
     header = cache.header()
     return header is not None and (header.digest, header.moves) == (job.digest, job.moves)
 
 
-def _check_owner(cache: ParticleCache, job: Job) -> None:
+def check_owner(cache: ParticleCache, job: Job) -> None:
     """Frames of two simulations must never lie in one folder."""
-    if not _owned(cache, job):
+    if not owned(cache, job):
         raise UsageError(
             str(cache.folder), "was given to another simulation, or emptied, meanwhile", "Bake again, one at a time"
         )

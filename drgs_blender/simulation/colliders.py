@@ -28,8 +28,8 @@ _MOST_CELLS = 1 << 23
 _CLEARANCE = 0.02
 #: Part of the depth from which on particles are said to be inside, and share of them that is refused where it is all.
 _SUNK, _REFUSED = 0.25, 0.01
-_OVERLAP = "overlaps the body at the start: {} of {} particles are inside it"
-_THROUGH = "passes through the body at the start: {} of {} particles have it between them and the next"
+_OVERLAP = "overlaps {} at the start: {} of {} particles are inside it"
+_THROUGH = "passes through {} at the start: {} of {} particles have it between them and the next"
 #: Distance of neighbours in a body, in that of the nearest.
 _NEIGHBOURS = 1.5
 
@@ -284,7 +284,9 @@ class MovingCollider:
         return self._field, Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
 
 
-def check_apart(points: Array, depth: float, colliders: Sequence[MovingCollider], planes: Array) -> None:
+def check_apart(
+    points: Array, depth: float, colliders: Sequence[MovingCollider], planes: Array, body: str = "the body"
+) -> None:
     """Refuse a body that is inside of what it should meet, and warn of one that is a little, before anything moves.
 
     What is thinner than a cell is not seen in the field of a collider: there the neighbours on its two sides decide.
@@ -298,6 +300,8 @@ def check_apart(points: Array, depth: float, colliders: Sequence[MovingCollider]
     colliders : sequence of MovingCollider
     planes : array
         Rows of `contact.plane_rows`.
+    body : str
+        Of the points, in messages.
 
     Raises
     ------
@@ -316,11 +320,11 @@ def check_apart(points: Array, depth: float, colliders: Sequence[MovingCollider]
         count, deep = (int(np.count_nonzero(depths > part * depth)) for part in (_SUNK, 1.0))
         if deep > _REFUSED * len(points):
             remedy = "Move one of the two apart, or simulate from a frame in which they are apart"
-            raise UsageError(name, _OVERLAP.format(deep, len(points)), remedy)
+            raise UsageError(name, _OVERLAP.format(body, deep, len(points)), remedy)
         if count:
-            log.warning("%s: %s, and begin there; move the two apart", name, _OVERLAP.format(count, len(points)))
+            log.warning("%s: %s, and begin there; move the two apart", name, _OVERLAP.format(body, count, len(points)))
         elif divided := through.get(name, 0):
-            log.warning("%s: %s; move the two apart", name, _THROUGH.format(divided, len(points)))
+            log.warning("%s: %s; move the two apart", name, _THROUGH.format(body, divided, len(points)))
 
 
 def lift_surface(points: Array, spacing: float, colliders: Sequence[MovingCollider], planes: Array) -> Array:

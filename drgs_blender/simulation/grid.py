@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..compute.warp.kernels import Launcher
+from .body_contact import Side
 from .colliders import MovingCollider
 from .contact import bound, collide
 from .fields import FieldRows, ForceField, blow_nodes
@@ -17,6 +18,8 @@ from .p2g_g2p import SCRATCH, advance_nodes, g2p, hold_pins, p2g
 from .particles import Particles, Properties, taken
 
 Array = np.ndarray
+
+_NO_MARKS = np.zeros((0, 64), np.bool_)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +44,9 @@ class Scene:
         Particles that are kinematic.
     least : float
         kg, below which a node is empty.
+    rim : (n, 4) float32 array
+        Of particles: the unit normal of the surface that they lie at, at rest, 0 for none, and cells to it. Contact
+        with other bodies needs it.
     """
 
     domain: Domain
@@ -51,6 +57,7 @@ class Scene:
     properties: Properties
     pins: Array
     least: np.float32
+    rim: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +147,7 @@ class HostGrid(Grid):
             return False
         self._state, self._order = taken(self._state, self._a.order), self._order[self._a.order]
         self._properties = taken(scene.properties, self._order)
+        self._rim = scene.rim[self._order]
         self._pins = _inverse(self._order)[scene.pins]
         values = np.empty((len(self._a.active), 64, 4), np.float32)
         self._nodes = Nodes(values, self._a.active, scene.domain.origin, scene.domain.spacing)
@@ -149,14 +157,23 @@ class HostGrid(Grid):
         return True
 
     def step(self, times: Sequence[tuple[float, float]], limits: Limits) -> list[float]:
-        scene, forces, s, a, nodes = self._scene, self._scene.forces, self._state, self._a, self._nodes
         (done, dt), *_ = times
-        part = (done + 0.5 * dt) / self._seconds
-        p2g(s, self._properties, a, nodes, dt, self._scratch)
+        self.to_nodes(done, dt)
+        return [self.from_nodes(done, dt)]
+
+    def to_nodes(self, done: float, dt: float) -> None:
+        """The first half of a step of `dt` that begins at `done`: velocities of the nodes, which met nothing yet."""
+        scene, forces, nodes = self._scene, self._scene.forces, self._nodes
+        p2g(self._state, self._properties, self._a, nodes, dt, self._scratch)
         gravity, wind = np.asarray(forces.gravity, np.float64), np.asarray(forces.wind, np.float64)
         advance_nodes(nodes.values, scene.least, dt, gravity, wind, forces.drag, forces.damping)
         if len(scene.fields):
-            blow_nodes(nodes, scene.fields.at(self._frame, part), dt)
+            blow_nodes(nodes, scene.fields.at(self._frame, (done + 0.5 * dt) / self._seconds), dt)
+
+    def from_nodes(self, done: float, dt: float) -> float:
+        """The second half: obstacles and pins, then the particles; the highest speed as `step` gives it."""
+        scene, s, a, nodes = self._scene, self._state, self._a, self._nodes
+        part = (done + 0.5 * dt) / self._seconds
         for moving in scene.colliders:
             field, motion = moving.at(part)
             if field is not None:
@@ -164,12 +181,32 @@ class HostGrid(Grid):
         if len(scene.planes):
             bound(nodes, scene.planes)
         if len(self._pins):
-            hold_pins(s.x, self._properties.mass, self._pins, self._pin_velocity, a.slot, nodes, self._held)
+            self._hold(_NO_MARKS)
             kept = s.x[self._pins] + dt * self._pin_velocity
         g2p(s, self._properties, a, nodes, dt, self._fastest)
         if len(self._pins):
             s.x[self._pins], s.v[self._pins] = kept, self._pin_velocity
-        return [float(self._fastest.max())]
+        return float(self._fastest.max())
+
+    @property
+    def places(self) -> Arrangement:
+        """Blocks of particles and nodes, until the next sort."""
+        return self._a
+
+    def _hold(self, marks: Array) -> None:
+        given = self._state.x, self._properties.mass, self._pins, self._pin_velocity
+        hold_pins(*given, self._a.slot, self._nodes, self._held, marks)
+
+    def side(self) -> Side:
+        """What other bodies meet, between the halves of a step; nodes that pins hold move as these do."""
+        marks = np.zeros((len(self._a.active) if len(self._pins) else 0, 64), np.bool_)
+        if len(marks):
+            self._hold(marks)
+        a = self._a
+        s = self._state
+        gradient = s.total if len(s.total) else s.elastic
+        given = s.x, self._properties.mass, self._properties.volume, self._rim, gradient
+        return Side(*given, a.start, a.source, a.source_start, a.active, a.slot, self._nodes.values, marks)
 
     def state(self) -> Particles:
         return taken(self._state, _inverse(self._order))

@@ -146,7 +146,26 @@ class _PinMotion:
         return carry(self._weights, now, self._source.gradients(now))[0]
 
 
-def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
+def placed(mesh: Mesh, settings: Settings, name: str = "mesh") -> tuple[Array, float]:
+    """Vertices of a mesh in the world, (n, 3) float64, and its longest side, metres.
+
+    Raises
+    ------
+    AssetError
+        There is nothing that could be filled.
+    """
+    matrix = np.asarray(settings.matrix_world, np.float64)
+    vertices = mesh.vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    used = vertices[np.unique(mesh.faces)] if len(mesh.faces) else vertices[:0]
+    if not len(used) or not np.isfinite(used).all():
+        raise AssetError(name, "has no faces, or vertices that are not finite", "Clean the mesh up")
+    size = float(np.ptp(used, axis=0).max())
+    if size <= 0:
+        raise AssetError(name, "has no size", "Choose a mesh with an interior")
+    return vertices, size
+
+
+def prepare(mesh: Mesh, settings: Settings, name: str = "mesh", domain: Domain | None = None) -> Job:
     """Fill the mesh and set its simulation up.
 
     Parameters
@@ -156,6 +175,8 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
     settings : Settings
     name : str
         Of it, in messages.
+    domain : Domain, optional
+        The grid, which bodies that push each other share; by default the settings say which.
 
     Raises
     ------
@@ -163,14 +184,9 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
         With what to do about it.
     """
     matrix = np.asarray(settings.matrix_world, np.float64)
-    vertices = mesh.vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    vertices, size = placed(mesh, settings, name)
     faces = mesh.faces if np.linalg.det(matrix[:3, :3]) > 0 else mesh.faces[:, ::-1]
-    used = vertices[np.unique(faces)] if len(faces) else vertices[:0]
-    if not len(used) or not np.isfinite(used).all():
-        raise AssetError(name, "has no faces, or vertices that are not finite", "Clean the mesh up")
-    spacing = float(np.ptp(used, axis=0).max()) / settings.resolution
-    if spacing <= 0:
-        raise AssetError(name, "has no size", "Choose a mesh with an interior")
+    spacing = size / settings.resolution if domain is None else domain.spacing
     materials = [settings.material, *(material for _, material in settings.regions)]
     loose = [not m.keeps_shape for m in materials]
     colliders, motion = _colliders(settings), _motion(settings, mesh)
@@ -212,11 +228,14 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
         vertices if rides else np.empty((0, 3)),
         pinned,
         velocity,
+        None if domain is None else _way_out(points, vertices, faces),
     )
     carried = None
     if not rides:
         carried = _Carried(bind_points(vertices, points, space=filling.space, parts=filling.part))
-    solver = _solver(settings, body, spacing, vertices, colliders)
+    if domain is None:
+        domain = domain_of(*extent(settings, np.concatenate([points, vertices]), spacing), spacing, settings.floor)
+    solver = _solver(settings, body, domain, colliders)
     solver.first = settings.first
     pins = None if motion is None or not pinned.any() else _PinMotion(mesh, motion, points[pinned], matrix)
     log.info("%d particles, %d time steps a frame at least", len(points), solver.steps_of(1 / settings.fps))
@@ -227,13 +246,20 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
     return Job(settings, filling, solver, digest, moves, tear, grain, spacing, vertices, carried, pins)
 
 
+def _way_out(points: Array, vertices: Array, faces: Array) -> Array:
+    """(n, 3) from points to the nearest place of a surface, metres."""
+    import igl
+
+    found: Array = igl.point_mesh_squared_distance(points, vertices, np.ascontiguousarray(faces, np.int64))[2] - points
+    return found
+
+
 def _has(names: Sequence[str]) -> str:
     return f"There are {', '.join(names)}" if names else "It has no vertex groups; use a box"
 
 
-def _solver(settings: Settings, body: Body, spacing: float, vertices: Array, colliders: list[Collider]) -> Stepper:
+def _solver(settings: Settings, body: Body, domain: Domain, colliders: list[Collider]) -> Stepper:
     forces = Forces(settings.gravity, settings.wind, settings.drag, settings.damping, settings.fields)
-    domain = _domain(settings, np.concatenate([body.points, vertices]), spacing, colliders)
     planes = []
     if settings.floor is not None:
         planes.append(Plane((0, 0, settings.floor), (0, 0, 1), settings.floor_contact, settings.floor_friction))
@@ -251,8 +277,11 @@ def _solver(settings: Settings, body: Body, spacing: float, vertices: Array, col
     return Solver(body, domain, forces, colliders, planes, settings.courant, settings.device)
 
 
-def _domain(settings: Settings, points: Array, spacing: float, colliders: list[Collider]) -> Domain:
-    """What the settings say, else the body and three times its size around it, no deeper than what stops a fall."""
+def extent(settings: Settings, points: Array, spacing: float) -> tuple[Array, Array]:
+    """Corners of the space simulated: what the settings say, else the body and three times its size around it.
+
+    It goes no deeper than what stops a fall.
+    """
     low, high = points.min(axis=0), points.max(axis=0)
     if settings.domain is not None:
         given = np.asarray(settings.domain)
@@ -262,15 +291,17 @@ def _domain(settings: Settings, points: Array, spacing: float, colliders: list[C
                 "does not contain the body at the start",
                 f"It must reach from {np.round(low, 3).tolist()} to {np.round(high, 3).tolist()} at least",
             )
-        low, high = given
-    else:
-        size = float((high - low).max())
-        low, high = low - 3 * size, high + 3 * size
-        if settings.floor is not None:
-            low[2] = min(settings.floor, points[:, 2].min()) - 6 * spacing
-    if settings.floor is not None:
-        # A layer of nodes on the floor itself.
-        low[2] = settings.floor - (np.ceil((settings.floor - low[2]) / spacing) + 0.5) * spacing
+        return given[0], given[1]
+    size = float((high - low).max())
+    floor = settings.floor
+    bottom = low[2] - 3 * size if floor is None else min(floor, points[:, 2].min()) - 6 * spacing
+    return np.array([*(low[:2] - 3 * size), bottom]), high + 3 * size
+
+
+def domain_of(low: Array, high: Array, spacing: float, floor: float | None = None) -> Domain:
+    """The grid between two corners; with a layer of nodes on the floor itself."""
+    if floor is not None:
+        low = np.array([*low[:2], floor - (np.ceil((floor - low[2]) / spacing) + 0.5) * spacing])
     domain = Domain.around(low, high, spacing)
     if np.prod(domain.blocks, dtype=float) > _MOST_BLOCKS:
         sides = " x ".join(f"{length:.3g}" for length in high - low)

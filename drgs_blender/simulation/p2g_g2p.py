@@ -441,7 +441,9 @@ def _move_particles(first, last, particles, properties, places, grid, dt, fastes
 
 
 @njit
-def hold_pins(x: Array, mass: Array, pinned: Array, pin_velocity: Array, slot: Array, grid: Nodes, held: Array) -> None:
+def hold_pins(
+    x: Array, mass: Array, pinned: Array, pin_velocity: Array, slot: Array, grid: Nodes, held: Array, marks: Array
+) -> None:
     """Nodes with pinned matter move as the pins do.
 
     Parameters
@@ -460,6 +462,8 @@ def hold_pins(x: Array, mass: Array, pinned: Array, pin_velocity: Array, slot: A
         Velocities; changed.
     held : (a, 64, 4) float32 array
         Zero before and after: pinned momentum and mass.
+    marks : (a, 64) bool array
+        Set where a node moves as the pins do; without rows nothing is said.
     """
     nodes, origin, spacing = grid.values, grid.origin, grid.spacing
     scale = 1.0 / spacing
@@ -483,4 +487,6 @@ def hold_pins(x: Array, mass: Array, pinned: Array, pin_velocity: Array, slot: A
                             if m > PINNED * nodes[s, n, 3]:
                                 for c in range(3):
                                     nodes[s, n, c] = held[s, n, c] / m
+                                if len(marks):
+                                    marks[s, n] = True
                             held[s, n] = np.float32(0.0)

@@ -124,17 +124,17 @@ class Settings:
 
 def parse_settings(data: Any, subject: str = "settings", folder: Path | None = None) -> Settings:
     """Settings of a JSON object, see `Settings` and docs/simulation.md."""
-    reader = _Reader(data, subject, folder or Path())
+    reader = Reader(data, subject, folder or Path())
     given: dict[str, Any] = {}
-    for key in reader.keys(_KEYS):
-        given[key] = _KEYS[key](reader, key)
+    for key in reader.keys(KEYS):
+        given[key] = KEYS[key](reader, key)
     settings = Settings(**given)
     if settings.last < settings.first:
         raise UsageError(subject, f"ends at frame {settings.last}, before its first, {settings.first}", "Change frames")
     return settings
 
 
-class _Reader:
+class Reader:
     """Checked access to one JSON object."""
 
     def __init__(self, data: Any, subject: str, folder: Path) -> None:
@@ -208,11 +208,11 @@ class _Reader:
     def optional(self, key: str, read: Any) -> Any:
         return None if self.data[key] is None else read(key)
 
-    def items(self, key: str) -> list[_Reader]:
+    def items(self, key: str) -> list[Reader]:
         value = self.data[key]
         if not isinstance(value, list):
             raise self.fail(key, "a list")
-        return [_Reader(item, f"{self.subject}, {key} {i + 1}", self.folder) for i, item in enumerate(value)]
+        return [Reader(item, f"{self.subject}, {key} {i + 1}", self.folder) for i, item in enumerate(value)]
 
     def material(self, key: str) -> Material:
         value = self.data[key]
@@ -270,7 +270,8 @@ class _Reader:
         return Obstacle(**given)
 
 
-_KEYS: dict[str, Any] = {
+#: Name of a setting -> how it is read.
+KEYS: dict[str, Any] = {
     "material": lambda r, k: r.material(k),
     "regions": lambda r, k: tuple(i.region_of_matter() for i in r.items(k)),
     "resolution": lambda r, k: r.integer(k, 4, 400),

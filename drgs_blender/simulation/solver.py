@@ -17,6 +17,7 @@ from ..compute.warp.kernels import Launcher
 from ..compute.warp.runtime import DEVICES, name_of
 from ..core.errors import Cancelled, DeviceError, UsageError
 from ..core.sim_materials import FLUID, SNOW, ParticleMaterials
+from .body_contact import DEEPEST_RIM, RIM
 from .colliders import Collider, MovingCollider, check_apart
 from .contact import Plane, plane_rows
 from .fields import FieldRows
@@ -29,11 +30,11 @@ Array = np.ndarray
 log = logging.getLogger(__name__)
 
 #: Cells that particles may have moved since they were sorted; they may be one cell off at most.
-_DRIFT = 0.85
+DRIFT = 0.85
 #: Cells that matter or a collider moves at most in a step.
-_FASTEST = 0.5
+FASTEST = 0.5
 #: A step this many times shorter than the stiffness asks for means that the motion has run away.
-_RUNAWAY = 200.0
+RUNAWAY = 200.0
 
 
 @dataclass(slots=True)
@@ -54,6 +55,8 @@ class Body:
         Points that are kinematic.
     velocity : (3,) or (n, 3) array or sequence of float
         m/s, at the start.
+    way_out : (n, 3) array, optional
+        From points to the nearest place of the body's surface, metres, for its contact with others.
     """
 
     points: Array
@@ -62,6 +65,7 @@ class Body:
     markers: Array = field(default_factory=lambda: np.empty((0, 3)))
     pinned: Array | None = None
     velocity: Array | Sequence[float] = (0.0, 0.0, 0.0)
+    way_out: Array | None = None
 
 
 class Solver(Stepper):
@@ -88,6 +92,8 @@ class Solver(Stepper):
     ----------
     state : Particles
         In the order of ``body.points`` and then ``body.markers``.
+    scene : Scene
+        What its grid needs to know.
     """
 
     def __init__(
@@ -115,9 +121,9 @@ class Solver(Stepper):
         self._reach = np.maximum(self._nearest(body.points, body.markers)[0], domain.spacing)
         self._pins = np.flatnonzero(body.pinned) if body.pinned is not None else np.empty(0, np.int64)
         properties = Properties(mass, volume, self._model, padded(matter.parameters), padded(matter.keeps_shape))
-        self._scene = Scene(
+        self.scene = Scene(
             domain, self.forces, self._fields, self.colliders, self.planes, properties, self._pins,
-            np.float32(1e-9 * mass[:n].min(initial=np.inf)),
+            np.float32(1e-9 * mass[:n].min(initial=np.inf)), padded(self._rim()),
         )  # fmt: skip
         self.grid = self._grid_on(device)
         still = bool(len(self._pins) == n)
@@ -127,6 +133,19 @@ class Solver(Stepper):
         self.state = self._at_rest()
         self._check_start()
 
+    def _rim(self) -> Array:
+        """`Scene.rim`; of matter that flows nothing is known."""
+        way, matter = self.body.way_out, self.body.matter
+        rim = np.zeros((len(self.body.points), 4), np.float32)
+        rim[:, 3] = RIM
+        if way is not None:
+            depth = np.linalg.norm(way, axis=1)
+            cells = depth / self.domain.spacing
+            rim[matter.keeps_shape, 3] = np.minimum(cells, DEEPEST_RIM)[matter.keeps_shape]
+            near = matter.keeps_shape & (cells < DEEPEST_RIM) & (cells > 1e-6)
+            rim[near, :3] = way[near] / depth[near, None]
+        return rim
+
     def _grid_on(self, device: str) -> Grid:
         if device not in DEVICES:
             raise UsageError(f"device {device!r}", "is unknown", f"Choose from {', '.join(DEVICES)}")
@@ -134,10 +153,10 @@ class Solver(Stepper):
             from .gpu.grid import DeviceGrid
 
             try:
-                return DeviceGrid(self._scene, Launcher(name_of(device)))
+                return DeviceGrid(self.scene, Launcher(name_of(device)))
             except DeviceError as error:
                 log.warning("%s Simulated on the CPU", error)
-        return HostGrid(self._scene)
+        return HostGrid(self.scene)
 
     def _at_rest(self) -> Particles:
         body, n = self.body, len(self.body.points)
@@ -157,7 +176,7 @@ class Solver(Stepper):
         """Refuse what cannot go well, with what to do about it."""
         if not len(self.body.points):
             raise UsageError("simulation", "has no particles", "Fill the mesh first")
-        self._check_inside(self.state.x)
+        self.check_inside(self.state.x)
         check_apart(self.body.points, self.domain.spacing, self.colliders, self.planes)
 
     @property
@@ -195,7 +214,7 @@ class Solver(Stepper):
             self._advance_on(self.grid, seconds, pin_targets, cancelled, progress)
         except DeviceError as error:  # the state is still that at the beginning of the frame
             log.warning("%s Simulated on the CPU from frame %d on", error, self.first + self.frame + 1)
-            self.grid, self.steps = HostGrid(self._scene), steps
+            self.grid, self.steps = HostGrid(self.scene), steps
             self._advance_on(self.grid, seconds, pin_targets, cancelled, progress)
 
     def _advance_on(
@@ -207,6 +226,45 @@ class Solver(Stepper):
         progress: Callable[[float], None] | None,
     ) -> None:
         h = self.domain.spacing
+        speed, outside, push = self.enter(grid, seconds, pin_targets)
+        usual = min(1 / self.rate if self.rate else np.inf, seconds)
+
+        done, drift = 0.0, np.inf
+        while done < seconds * (1 - 1e-9):
+            if cancelled is not None and cancelled():
+                raise Cancelled
+            if drift > DRIFT:
+                if not grid.sort():
+                    self.check_inside(grid.state().x)
+                drift = 0.0
+            longest = min(usual, FASTEST * h / max(speed + push * usual, 1e-12))
+            if longest < usual / RUNAWAY and speed > outside:
+                raise self.ran_away(speed)
+            # As many as particles, as fast as they are now, need until they must be sorted again.
+            most = min(grid.most, int((DRIFT - drift) * h / max(speed * longest, 1e-12)) + 2)
+            times = self._times(seconds, done, longest, most if longest == usual else 1)
+            limits = Limits(DRIFT - drift, FASTEST * h / usual - push * usual, outside)
+            for (_, dt), top in zip(times, grid.step(times, limits)):
+                if not np.isfinite(top):
+                    raise self.became_infinite()
+                speed = max(top, outside)
+                drift += speed * dt / h
+                done += dt
+                self.steps += 1
+            if progress is not None:
+                progress(done / seconds)
+        self.leave(grid)
+
+    def enter(self, grid: Grid, seconds: float, pin_targets: Array | None) -> tuple[float, float, float]:
+        """Begin a frame on a grid.
+
+        Returns
+        -------
+        speed, outside : float
+            m/s, the highest now, and that of what has a given motion.
+        push : float
+            m/s^2, of gravity and fields at most.
+        """
         n = len(self.body.points)
         pin_velocity = np.zeros((len(self._pins), 3), np.float32)
         if pin_targets is not None:
@@ -222,40 +280,23 @@ class Solver(Stepper):
         speed = float(np.sqrt((self.state.v.astype(np.float64) ** 2).sum(axis=1).max(initial=0)))
         if not np.isfinite(speed):
             raise self._error("has velocities that are not finite", "Bake again from the start")
-        speed = max(speed, outside)
-        usual = min(1 / self.rate if self.rate else np.inf, seconds)
-
-        done, drift = 0.0, np.inf
         grid.enter(self.state, self.frame, seconds, pin_velocity)
-        while done < seconds * (1 - 1e-9):
-            if cancelled is not None and cancelled():
-                raise Cancelled
-            if drift > _DRIFT:
-                if not grid.sort():
-                    self._check_inside(grid.state().x)
-                drift = 0.0
-            longest = min(usual, _FASTEST * h / max(speed + push * usual, 1e-12))
-            if longest < usual / _RUNAWAY and speed > outside:
-                raise self._error(
-                    f"ran away: matter moves at {speed:.3g} m/s",
-                    "Make the material stiffer or the particles finer, or slow down what hits it",
-                )
-            # As many as particles, as fast as they are now, need until they must be sorted again.
-            most = min(grid.most, int((_DRIFT - drift) * h / max(speed * longest, 1e-12)) + 2)
-            times = self._times(seconds, done, longest, most if longest == usual else 1)
-            limits = Limits(_DRIFT - drift, _FASTEST * h / usual - push * usual, outside)
-            for (_, dt), top in zip(times, grid.step(times, limits)):
-                if not np.isfinite(top):
-                    raise self._error("became infinite", "Use a lower Courant number (0.3) or finer particles")
-                speed = max(top, outside)
-                drift += speed * dt / h
-                done += dt
-                self.steps += 1
-            if progress is not None:
-                progress(done / seconds)
+        return max(speed, outside), outside, push
+
+    def leave(self, grid: Grid) -> None:
+        """End the frame: what is on the grid is the state."""
         self.state = grid.state()
         self._rejoin()
-        self._check_inside(self.state.x)
+        self.check_inside(self.state.x)
+
+    def ran_away(self, speed: float) -> UsageError:
+        """The error of matter that is too fast, m/s."""
+        remedy = "Make the material stiffer or the particles finer, or slow down what hits it"
+        return self._error(f"ran away: matter moves at {speed:.3g} m/s", remedy)
+
+    def became_infinite(self) -> UsageError:
+        """The error of matter that is not finite."""
+        return self._error("became infinite", "Use a lower Courant number (0.3) or finer particles")
 
     @staticmethod
     def _times(seconds: float, done: float, longest: float, most: int) -> list[tuple[float, float]]:
@@ -285,7 +326,7 @@ class Solver(Stepper):
             state.x[n + lost] = at + (state.x[n + lost] - at) * (self._reach[lost] / distance[lost])[:, None]
             state.v[n + lost] = state.v[nearest[lost]]
 
-    def _check_inside(self, x: Array) -> None:
+    def check_inside(self, x: Array) -> None:
         """Refuse particles outside of the domain."""
         lost = outside(x, self.domain)
         if len(lost):

@@ -23,6 +23,8 @@ class Stepper(ABC):
         Frames done.
     first : int
         Number of the frame in which all is at rest, in messages.
+    subject : str
+        What is simulated, in messages.
     steps : int
         Time steps taken in all.
     rate : float
@@ -37,6 +39,7 @@ class Stepper(ABC):
 
     frame = 0
     first = 0
+    subject = "simulation"
     steps = 0
     rate: float
     colliders: list[MovingCollider]
@@ -130,4 +133,4 @@ class Stepper(ABC):
         self.frame += 1
 
     def _error(self, problem: str, remedy: str) -> UsageError:
-        return UsageError(f"simulation, frame {self.first + self.frame + 1}", problem, remedy)
+        return UsageError(f"{self.subject}, frame {self.first + self.frame + 1}", problem, remedy)

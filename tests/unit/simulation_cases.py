@@ -39,6 +39,7 @@ def solver_of(
     planes: Any = (),
     courant: float = 0.5,
     domain: Domain | None = None,
+    way_out: np.ndarray | None = None,
     **numbers: float,
 ) -> Solver:
     """A body of two particles a cell and axis."""
@@ -46,7 +47,7 @@ def solver_of(
     low = points.min(axis=0) - 8 * h if low is None else low
     high = points.max(axis=0) + 8 * h if high is None else high
     volume = np.full(len(points), (h / 2) ** 3, np.float32)
-    body = Body(points, volume, matter, np.reshape(markers, (-1, 3)), pinned, velocity)
+    body = Body(points, volume, matter, np.reshape(markers, (-1, 3)), pinned, velocity, way_out)
     forces = Forces(gravity=gravity, damping=damping)
     return Solver(body, domain or aligned(low, high, h), forces, colliders, planes, courant)
 

@@ -111,7 +111,7 @@ _there: list[tuple[Solver, DeviceGrid]] = []
 
 def on(solver: Solver, launcher: Launcher) -> Solver:
     """The same on a device."""
-    solver.grid = grid = DeviceGrid(solver._scene, launcher)
+    solver.grid = grid = DeviceGrid(solver.scene, launcher)
     _there.append((solver, grid))
     return solver
 
@@ -304,7 +304,7 @@ def test_a_device_that_fails_within_a_frame_loses_nothing(
     for each in (solver, alike):
         each.advance(FRAME)
     failing(launcher, monkeypatch, after=1)
-    alike.grid = HostGrid(alike._scene)
+    alike.grid = HostGrid(alike.scene)
     for _ in range(2):
         for each in (solver, alike):
             each.advance(FRAME)

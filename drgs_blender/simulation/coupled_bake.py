@@ -1,0 +1,129 @@
+"""Bakes bodies that push each other: a cache each, which belong together.
+
+What is needed to go on lies in the cache of the first body alone, so that it is of one frame whatever ends the bake.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+
+from ..core.errors import UsageError
+from ..core.particle_cache import Header, ParticleCache
+from .bake import SAVE_EVERY, check_owner, owned
+from .coupled_job import CoupledJob, about_others
+from .input_digest import same_until
+
+log = logging.getLogger(__name__)
+
+_ANOTHER = "Choose another folder, or overwrite it (--overwrite)"
+
+
+def bake_coupled(
+    job: CoupledJob,
+    caches: Sequence[ParticleCache],
+    *,
+    overwrite: bool = False,
+    cancelled: Callable[[], bool] | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> int:
+    """Simulate the frames of several bodies that are not in their caches.
+
+    Parameters
+    ----------
+    job : CoupledJob
+        At its beginning.
+    caches : sequence of ParticleCache
+        Of the bodies.
+    overwrite : bool
+        As of `bake.bake`.
+    cancelled, progress : callable, optional
+        As of `bake.bake`.
+
+    Returns
+    -------
+    int
+        Frames computed.
+
+    Raises
+    ------
+    UsageError
+        A cache holds another simulation, or one of those that belong together is missing; or the simulation ran into
+        trouble: frames up to there stay.
+    Cancelled, WriteError
+        What was done stays.
+    """
+    settings, solver, jobs = job.settings, job.solver, job.jobs
+    rests = [one.rest() for one in jobs]
+    headers = [
+        Header(
+            one.digest, len(rest.points), len(rest.vertices), settings.first, settings.fps, about_others(job, i),
+            tear=one.tear, grain=one.grain, moves=one.moves,
+        )
+        for i, (one, rest) in enumerate(zip(jobs, rests, strict=True))
+    ]  # fmt: skip
+    start = _resume(job, caches, headers, overwrite)
+    if start is None:
+        for cache in caches:
+            cache.clear()  # all before any: none of them is left with frames of before
+        for cache, header, rest in zip(caches, headers, rests, strict=True):
+            cache.create(header, rest)
+            cache.write(settings.first, rest)
+        start = settings.first
+    done, kept, kept_at = 0, start, time.monotonic()
+    try:
+        for frame in range(start + 1, settings.last + 1):
+            report = None if progress is None else (lambda part, f=frame: progress(f, part))
+            solver.advance(1 / settings.fps, job.pin_targets(frame - settings.first), cancelled, report)
+            for cache, one in zip(caches, jobs, strict=True):
+                check_owner(cache, one)
+                cache.write(frame, one.now())
+            done += 1
+            if time.monotonic() - kept_at > SAVE_EVERY:
+                caches[0].write_state(frame, solver.arrays())
+                kept, kept_at = frame, time.monotonic()
+    finally:
+        now = settings.first + solver.frame
+        there = all(cache.path(now).exists() and owned(cache, one) for cache, one in zip(caches, jobs, strict=True))
+        if now > kept and there:
+            caches[0].write_state(now, solver.arrays())
+    return done
+
+
+def _resume(job: CoupledJob, caches: Sequence[ParticleCache], headers: Sequence[Header], overwrite: bool) -> int | None:
+    """The last frame of this simulation in all caches, with the solver put there; None to start over."""
+    first, last = job.settings.first, job.settings.last
+    found = [cache.header() for cache in caches]
+    state = caches[0].read_state()
+    frame, arrays = state or (first, {})
+    needed = min(frame, last) - first
+    for body, cache, there, header in zip(job.bodies, caches, found, headers, strict=True):
+        if there is None or (there.digest == header.digest and same_until(needed, there.moves, header.moves)):
+            continue
+        if not overwrite:
+            raise UsageError(f'body "{body.name}", {cache.folder}', "holds another simulation", _ANOTHER)
+        return None
+    missing = [i for i, there in enumerate(found) if there is None]
+    begun = [i for i, cache in enumerate(caches) if i not in missing and len(cache.frames()) > 1]
+    if missing and begun and not overwrite:
+        names = ", ".join(f'"{job.bodies[i].name}"' for i in begun)
+        raise UsageError(
+            f'body "{job.bodies[missing[0]].name}", {caches[missing[0]].folder}',
+            f"is missing: it belongs to the frames that are there of {names}",
+            "Put the folder back, or bake all again (--overwrite)",
+        )
+    if missing or state is None:
+        return None
+    wanted = set(range(first, frame + 1))
+    for body, cache in zip(job.bodies, caches, strict=True):
+        if not wanted <= set(cache.frames()):
+            log.info('body "%s", %s: does not hold all that is needed to go on; begins again', body.name, cache.folder)
+            return None
+    if not job.solver.restore(frame - first, arrays):
+        log.info("%s: does not hold all that is needed to go on; begins again", caches[0].folder)
+        return None
+    for cache, there, header in zip(caches, found, headers, strict=True):
+        if frame < last and there is not None and there.moves != header.moves:
+            cache.extend(header, frame)
+    return frame
