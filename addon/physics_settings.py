@@ -216,6 +216,24 @@ class DrgsPhysicsSettings(_MaterialNumbers, bpy.types.PropertyGroup):
     colliders: CollectionProperty(
         type=DrgsPhysicsCollider, name="Colliders", description="Meshes with which the simulated object collides"
     )
+    coupling: PointerProperty(
+        type=bpy.types.Collection,
+        name="Coupled With",
+        description="Objects of this collection with DR-GS Physics are baked with this one, and all push each other",
+    )
+    contact: EnumProperty(
+        name="Contact",
+        description="How it moves along the other bodies. Of two the one that holds more counts: Sticky, then Slip",
+        items=CONTACT_ITEMS,
+    )
+    friction: FloatProperty(
+        name="Friction",
+        description="Coulomb friction on other bodies: 0 is ice. Of two the geometric mean counts",
+        min=0.0,
+        soft_max=2.0,
+        max=1e6,
+        default=0.5,
+    )
     solver: EnumProperty(
         name="Solver",
         description="Method by which the motion is computed",

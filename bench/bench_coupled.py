@@ -33,7 +33,7 @@ Rows = list[list[object]]
 def impact(options: argparse.Namespace) -> Rows:
     """Two equal balls, head on and one beside the other's way: momentum, velocities and distance."""
     rows: Rows = []
-    for h in (0.06,) if options.short else (0.06, 0.03):
+    for h in (0.06,) if options.short else (0.06, 0.04):
         for aside in (0.0, 0.2):
             coupled = balls(h, aside=aside)
             one, other = coupled.bodies
@@ -100,7 +100,7 @@ def pair(resolution: int, last: int = 4) -> tuple[list[Mesh], CoupledJob]:
 def cost(options: argparse.Namespace) -> Rows:
     """Seconds of two bodies that touch, against the sum of the two alone with the same time step."""
     pair(8)[1].solver.advance(FRAME)
-    frames, fits = (2, 16) if options.short else (6, 40)
+    frames, fits = (2, 16) if options.short else (4, 28)
     meshes, job = pair(fits)
     begin = time.perf_counter()
     for _ in range(frames):

@@ -11,7 +11,7 @@ from bpy.props import EnumProperty, IntProperty
 
 from ..addon import assets, messages
 from ..addon.export.export_cache import uid
-from ..addon.physics import bake_job, particle_display, settings_export
+from ..addon.physics import bake_job, cache_state, coupling, particle_display, settings_export
 from . import selection
 from .base import DrgsOperator
 
@@ -182,12 +182,13 @@ class _JobOperator(DrgsOperator):
 
 
 class DRGS_OT_bake_physics(_JobOperator, bpy.types.Operator):
-    """Simulate all frames of the selected objects with the engine"""
+    """Simulate all frames of the selected objects, and of those coupled with them, with the engine"""
 
     bl_idname = "drgs.bake_physics"
     bl_label = "Bake"
     bl_description = (
-        "Simulate all frames of the selected objects with the engine, one object after another, the active one last. "
+        "Simulate all frames of the selected objects with the engine, one object after another, the active one last; "
+        "objects that are coupled together. "
         "Frames that are baked with these settings stay, others are replaced. Esc cancels, and the next bake goes on"
     )
     bl_options = {"UNDO"}  # noqa: RUF012 - read by Blender
@@ -214,7 +215,8 @@ class DRGS_OT_bake_physics(_JobOperator, bpy.types.Operator):
 
     def done(self, context: bpy.types.Context) -> str:
         assert isinstance(self._job, bake_job.Bake), self._job
-        return f"{self._job.subject}: {self._job.frames} frames baked in {self._job.folder}"
+        folders = ", ".join(str(member.folder) for member in self._job.members)
+        return f"{self._job.subject}: {self._job.frames} frames baked in {folders}"
 
 
 class DRGS_OT_show_particles(_JobOperator, bpy.types.Operator):
@@ -272,8 +274,8 @@ class DRGS_OT_cancel_physics(DrgsOperator, bpy.types.Operator):
 
 
 class DRGS_OT_free_physics(DrgsOperator, bpy.types.Operator):
-    """Remove the active object's baked frames from the disk; it is as it was before. Files cannot be brought back by
-    undo"""
+    """Remove the active object's baked frames from the disk, and those of objects that are coupled with it; they are as
+    they were before. Files cannot be brought back by undo"""
 
     bl_idname = "drgs.free_physics"
     bl_label = "Delete Bake"
@@ -287,8 +289,8 @@ class DRGS_OT_free_physics(DrgsOperator, bpy.types.Operator):
         return context.window_manager.invoke_confirm(self, event)
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        selection.editable([context.object], vertices=False)
-        bake_job.free(context.object)
+        selection.editable(coupling.members(context.object), vertices=False)
+        cache_state.free(context.object)
         return {"FINISHED"}
 
 

@@ -88,9 +88,8 @@ def make_environment(folder: Path) -> None:
     settings = {"resolution": 12, "last": 3, "colliders": [ground], "pins": pins, "fields": fields}
     (folder / "settings.json").write_text(json.dumps(settings))
     above = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
-    bodies = [{"asset": "spot.drgs", "matrix_world": above}, {"asset": "spot.drgs", "name": "pile", "material": "sand"}]
-    del settings["pins"]
-    bodies[1]["pins"] = pins
+    pile = {"asset": "spot.drgs", "name": "pile", "material": "sand", "pins": pins}
+    bodies = [{"asset": "spot.drgs", "matrix_world": above, "pins": []}, pile]
     (folder / "bodies.json").write_text(json.dumps(settings | {"bodies": bodies}))
     camera = {"matrix_world": [[1, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0], [0, 0, 0, 1]], "width": 48, "height": 48}
     (folder / "camera.json").write_text(json.dumps(camera | {"fov_x": 40}))

@@ -9,7 +9,7 @@ import bpy
 from ...drgs_blender.core.errors import DrgsError
 from ...drgs_blender.core.sim_materials import MATERIALS
 from .. import assets
-from ..physics import bake_job, particle_display
+from ..physics import bake_job, bake_time, cache_state, coupling, particle_display
 from ..physics_settings import DrgsPhysicsRegion, DrgsPhysicsSettings, numbers_of
 from .text_layout import bar_text
 
@@ -94,7 +94,7 @@ class DRGS_PT_physics(_Physics, bpy.types.Panel):
             row.operator("drgs.hide_particles", text="", icon="X")
             render = context.scene.render
             cores = render.threads if render.threads_mode == "FIXED" else os.cpu_count() or 1
-            least = bake_job.clock(bake_job.estimate(physics, fill.counts, cores))
+            least = bake_time.clock(bake_time.estimate(physics, fill.counts, cores))
             column = self.layout.column(align=True)
             column.label(text=f"{fill.counts[0]:,} particles, {fill.counts[1]} steps per frame")
             column.label(text=f"At least {least} to bake")
@@ -124,18 +124,24 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
             layout.progress(factor=part, text=text)
         return
     try:
-        found = bake_job.cached(obj, context.scene)
+        found = cache_state.cached(obj, context.scene)
+        together = coupling.members(obj)[1:]
     except DrgsError as error:
         layout.label(text=str(error), icon="ERROR")
         return
+    if together and (problem := coupling.problem_of(obj)):
+        layout.label(text=problem, icon="ERROR")
+    for name in found.missing:
+        layout.label(text=f'"{name}" has no frames', icon="ERROR")
     row = layout.row(align=True)
-    count = len(bake_job.chosen(context))
+    count = sum(coupling.count_of(other) for other in bake_job.chosen(context))
     more = f" {count} Objects" if count > 1 else ""
-    if not found.frames:
+    if not found.frames and not found.missing:
         row.operator("drgs.bake_physics", text=f"Bake{more}", icon="REC")
         return
     if found.changed:
         layout.label(text="Settings have changed since", icon="INFO")
+    if found.changed or found.missing:
         text = "Rebake"
     else:
         text = "Bake" if found.frames >= found.expected else f"Resume ({found.frames} of {found.expected})"
@@ -198,6 +204,32 @@ class DRGS_PT_physics_colliders(_Part, bpy.types.Panel):
             friction.prop(physics, "floor_friction")
 
 
+class DRGS_PT_physics_coupling(_Part, bpy.types.Panel):
+    bl_label = "Coupled Bodies"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        obj = context.object
+        physics = obj.drgs.physics
+        column = _column(self.layout)
+        column.prop(physics, "coupling")
+        column.prop(physics, "contact")
+        friction = column.column()
+        friction.active = physics.contact == "separate"
+        friction.prop(physics, "friction")
+        try:
+            others = [other for other in coupling.members(obj) if other != obj]
+        except DrgsError as error:
+            self.layout.label(text=str(error), icon="ERROR")
+            return
+        column = self.layout.column(align=True)
+        if others:
+            column.label(text="Baked together with:")
+        for other in others:
+            column.label(text=other.name, icon="PHYSICS")
+        for other in coupling.idle(obj):
+            column.label(text=f"{other.name} has no DR-GS Physics; it can be a collider", icon="INFO")
+
+
 class DRGS_PT_physics_cache(_Part, bpy.types.Panel):
     bl_label = "Domain and Cache"
 
@@ -213,5 +245,6 @@ CLASSES = (
     DRGS_PT_physics_regions,
     DRGS_PT_physics_forces,
     DRGS_PT_physics_colliders,
+    DRGS_PT_physics_coupling,
     DRGS_PT_physics_cache,
 )

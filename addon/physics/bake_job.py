@@ -6,10 +6,10 @@ What runs is known to this module alone; nothing of it is stored in the .blend.
 from __future__ import annotations
 
 import atexit
-import os
 import shutil
 import tempfile
 import time
+from collections.abc import Generator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,21 +20,11 @@ import numpy as np
 
 from ...drgs_blender.core.errors import DrgsError, EngineError, UsageError
 from ...drgs_blender.core.particle_cache import ParticleCache
-from ...drgs_blender.core.sim_materials import MATERIALS
 from .. import assets, cache_playback, messages, output_check
 from ..export.export_cache import uid
-from ..physics_settings import DrgsPhysicsSettings
-from . import particle_display, scene_export
-from .settings_export import Removed, check, describe, exclusive_folder, folder_of, subject_of
+from . import bake_time, coupling, particle_display, scene_export
+from .settings_export import INPUT, Removed, exclusive_folder, subject_of
 from .simulate_process import SimulateProcess, ending
-
-#: Where a capture lies inside the cache.
-INPUT = "drgs_input"
-#: Steps of particles that a core makes in a second at best, by material model (bench/bench_simulate.py measures it);
-#: models that need singular values, and the preview (XPBD).
-_RATES, _SLOW, _QUICK = {"elastic": 1.2e7, "fluid": 1e7}, 2.7e6, 1.5e8
-#: Seconds that the start takes, a frame besides, and a particle in it.
-_START, _FRAME, _KEEP = 3.0, 0.02, 5e-7
 
 #: What is being done, by the `uid` of its object.
 running: dict[int, Job] = {}
@@ -42,13 +32,55 @@ running: dict[int, Job] = {}
 waiting: set[int] = set()
 
 
+@dataclass(slots=True)
+class Member:
+    """An object of a job: `uid`, names, folders of cache and capture, and how many frames can be played."""
+
+    key: int
+    name: str
+    subject: str
+    folder: Path
+    inputs: Path
+    playback: cache_playback.Playback | None = None
+    count: int = 0
+
+    def object(self) -> bpy.types.Object:
+        """The object; undo makes new ones, so none is kept.
+
+        Raises
+        ------
+        Removed
+            There is none any more.
+        """
+        found = object_of(self.key)
+        if found is None:
+            raise Removed(self.subject, "was removed while it was simulated", "Undo or redo, and bake again")
+        return found
+
+    def read_frames(self, seconds: float) -> None:
+        """Read new frames for about `seconds`."""
+        if self.playback is None:
+            path = self.inputs / scene_export.MATRICES
+            self.playback = cache_playback.Playback(self.folder, np.load(path) if path.exists() else None)
+        self.count = self.playback.follow(seconds)
+
+    def show(self, first: int, renew: bool) -> None:
+        """Have the object play what there is."""
+        if not self.count or self.playback is None:
+            return
+        obj = self.object()
+        if renew or cache_playback.modifier_of(obj) is None:
+            cache_playback.attach(obj, self.playback.path, first)
+        obj.update_tag(refresh={"DATA"})
+
+
 class Job:
-    """A run of the engine's program for one object.
+    """A run of the engine's program for an object, or for several that push each other.
 
     Parameters
     ----------
-    inputs : folder for what is captured
-    folder : of the cache
+    objects : the one that is asked for and those that are baked with it
+    folders : of their caches
     still : only the first frame counts
 
     Attributes
@@ -64,19 +96,42 @@ class Job:
     #: Whether the program needs time at its end to keep what it has done.
     _saves = True
 
-    def __init__(self, obj: bpy.types.Object, scene: bpy.types.Scene, inputs: Path, folder: Path, still: bool) -> None:
-        self.key, self.subject = uid(obj), subject_of(obj)
-        if self.key in running:
-            raise UsageError(self.subject, "is being baked already", "Wait until it is done, or cancel it")
-        check(obj)
-        self.folder, self.cancelled = folder, False
-        self._inputs = inputs
+    def __init__(
+        self, objects: list[bpy.types.Object], scene: bpy.types.Scene, folders: list[Path], *, still: bool
+    ) -> None:
+        self.members = [
+            Member(uid(obj), obj.name, subject_of(obj), folder, folder / INPUT) for obj, folder in zip(objects, folders)
+        ]
+        for member in self.members:
+            if member.key in running:
+                raise UsageError(member.subject, "is being baked already", "Wait until it is done, or cancel it")
+        coupling.check_together(objects)
+        self.key, self.folder, self._inputs = self.members[0].key, self.members[0].folder, self.members[0].inputs
+        alone = len(objects) == 1
+        self.subject = subject_of(objects[0]) if alone else "Objects " + ", ".join(f'"{obj.name}"' for obj in objects)
+        self.cancelled = False
         self._threads = scene.render.threads if scene.render.threads_mode == "FIXED" else 0
-        self._device = scene.drgs.device.lower() if obj.drgs.physics.solver == "mpm" else "cpu"
-        self._capture = scene_export.export_scene(obj, scene, inputs, still=still)
+        self._device = scene.drgs.device.lower() if objects[0].drgs.physics.solver == "mpm" else "cpu"
+        self._capture = self._captured_scene(scene, still)
         self._captured = 0.0
         self._process: SimulateProcess | None = None
-        running[self.key] = self
+        running.update((member.key, self) for member in self.members)
+
+    def _captured_scene(self, scene: bpy.types.Scene, still: bool) -> Generator[float, None, None]:
+        """Capture the bodies one after the other; yields the part that is done."""
+        count = len(self.members)
+        for i, member in enumerate(self.members):
+            obj = member.object()
+            bodies = [other.object() for other in self.members]
+            coupled = coupling.describe(obj) if count > 1 else {}
+            for part in scene_export.export_scene(
+                obj, scene, member.inputs, still=still, coupled=coupled, bodies=bodies
+            ):
+                yield (i + part) / count
+        if count > 1:
+            bodies_file = self._inputs / scene_export.BODIES
+            named = [(member.name, member.inputs, member.folder) for member in self.members]
+            coupling.write_bodies(bodies_file, named, self._device)
 
     @property
     def process(self) -> SimulateProcess:
@@ -97,7 +152,8 @@ class Job:
         DrgsError
             Whatever went wrong; `close` it then.
         """
-        self.target()
+        for member in self.members:
+            member.object()
         if self._process is None:
             until = time.monotonic() + seconds
             for part in self._capture:
@@ -106,7 +162,8 @@ class Job:
                     return False
             if ending():
                 return False
-            self._process = SimulateProcess(self._inputs, self.folder, self._threads, self._device)
+            others = [member.inputs for member in self.members[1:]]
+            self._process = SimulateProcess(self._inputs, self.folder, self._threads, self._device, others)
             return False
         alive = self._process.alive
         if self._read_frames(seconds) or alive:
@@ -120,25 +177,13 @@ class Job:
         """End whatever runs. What is done stays."""
         self._capture.close()
         self.end_process()
-        running.pop(self.key, None)
+        for member in self.members:
+            running.pop(member.key, None)
 
     def end_process(self) -> None:
         """End the engine's program if it runs."""
         if self._process is not None:
             self._process.end(self._saves)
-
-    def target(self) -> bpy.types.Object:
-        """The object; undo makes new ones, so none is kept.
-
-        Raises
-        ------
-        Removed
-            There is none any more.
-        """
-        found = object_of(self.key)
-        if found is None:
-            raise Removed(self.subject, "was removed while it was simulated", "Undo or redo, and bake again")
-        return found
 
     def progress(self) -> tuple[float, str]:
         """The part that is done, and words for it."""
@@ -178,13 +223,13 @@ class Bake(Job):
     """
 
     def __init__(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> None:
-        folder = exclusive_folder(obj)
-        super().__init__(obj, scene, folder / INPUT, folder, still=False)
+        objects = coupling.members(obj)
+        super().__init__(objects, scene, [exclusive_folder(other) for other in objects], still=False)
         physics = obj.drgs.physics
         self.first, self.frames, self.count = physics.frame_start, physics.frame_end - physics.frame_start + 1, 0
-        self._playback: cache_playback.Playback | None = None
         self._begun = 0, time.monotonic()
-        particle_display.hide(obj)
+        for other in objects:
+            particle_display.hide(other)
 
     def progress(self) -> tuple[float, str]:
         """The part that is done, and words for it."""
@@ -193,7 +238,7 @@ class Bake(Job):
         text = f"Frame {min(self.count, self.frames)} of {self.frames}"
         fresh, spent = self.count - self._begun[0], time.monotonic() - self._begun[1]
         if fresh > 0 and self.count < self.frames:
-            text += f", {clock(spent / fresh * (self.frames - self.count))} left"
+            text += f", {bake_time.clock(spent / fresh * (self.frames - self.count))} left"
         return min(1.0, self.count / self.frames), text
 
     def cancel(self) -> bool:
@@ -202,39 +247,36 @@ class Bake(Job):
         with suppress(DrgsError):  # whatever it is, the next bake says it
             if self._process is not None and not self.count:
                 self._read_frames(0.0)
-            self._show(renew=True)  # what played them may be undone
+            self._show()  # what played them may be undone
             return self.count > 0
         return False
 
     def _read_frames(self, seconds: float) -> bool:
         if self.process.counts is None:
             return False  # until then the folder holds what was there before
-        if self._playback is None:
-            path = self._inputs / scene_export.MATRICES
-            self._playback = cache_playback.Playback(self.folder, np.load(path) if path.exists() else None)
-        before, self.count = self.count, self._playback.follow(seconds)
-        if self.count == before:
+        before, counts = self.count, [member.count for member in self.members]
+        for member in self.members:
+            member.read_frames(seconds / len(self.members))
+        self.count = min(member.count for member in self.members)
+        if counts == [member.count for member in self.members]:
             return False
-        if not before or self.count < before:
+        if self.count and (not before or self.count < before):
             self._begun = self.count, time.monotonic()
-        self._show(renew=not before)
+        for member, count in zip(self.members, counts):
+            member.show(self.first, renew=not count)
         return True
 
     def _kept_results(self) -> str:
         return f"The first {self.count} frames can be played" if self.count else ""
 
     def _finish(self) -> None:
-        self._show(renew=True)
+        self._show()
         if self.count < self.frames:
             self._raise_missing(f"frames {self.first + self.count} to {self.first + self.frames - 1}")
 
-    def _show(self, renew: bool) -> None:
-        if not self.count or self._playback is None:
-            return
-        obj = self.target()
-        if renew or cache_playback.modifier_of(obj) is None:
-            cache_playback.attach(obj, self._playback.path, self.first)
-        obj.update_tag(refresh={"DATA"})
+    def _show(self) -> None:
+        for member in self.members:
+            member.show(self.first, renew=True)
 
 
 class Preview(Job):
@@ -251,7 +293,7 @@ class Preview(Job):
         self._temporary = Path(tempfile.mkdtemp(prefix="drgs-fill-"))
         self.counts = (0, 0)
         try:
-            super().__init__(obj, scene, self._temporary / INPUT, self._temporary, still=True)
+            super().__init__([obj], scene, [self._temporary], still=True)
         except DrgsError:
             shutil.rmtree(self._temporary, ignore_errors=True)
             raise
@@ -267,73 +309,20 @@ class Preview(Job):
         if counts is None or cache.header() is None:
             self._raise_missing("the particles")
         self.counts = counts
-        particle_display.show(self.target(), cache.rest().points, self.counts)
-
-
-@dataclass(frozen=True, slots=True)
-class Cached:
-    """Content of an object's particle cache.
-
-    Attributes
-    ----------
-    frames : how many, from the first on
-    expected : frames that a bake makes
-    changed : settings are not those of the frames, so that a bake starts over
-    """
-
-    frames: int
-    expected: int
-    changed: bool
-
-
-def cached(obj: bpy.types.Object, scene: bpy.types.Scene) -> Cached:
-    """Content of the object's cache: baked frames, expected frames, changed settings.
-
-    Raises
-    ------
-    DrgsError
-        The folder is unknown or cannot be read.
-    """
-    folder, physics = folder_of(obj), obj.drgs.physics
-    frames = ParticleCache(folder).frames()
-    known = scene_export.stored(folder / INPUT)
-    changed = False
-    # Values that are animated are those of the first frame, so that only there a change of them shows.
-    if frames and known is not None and (obj.animation_data is None or scene.frame_current == physics.frame_start):
-        now = describe(obj, scene)
-        changed = any(known.get(key) != now.get(key) for key in (set(now) | {"floor", "domain"}) - {"last"})
-        before = [{k: v for k, v in row.items() if k not in ("mesh", "vertices")} for row in known.get("colliders", [])]
-        changed |= before != scene_export.contacts(obj)
-    return Cached(len(frames), physics.frame_end - physics.frame_start + 1, changed)
-
-
-def free(obj: bpy.types.Object) -> None:
-    """Remove all files of an object's cache, the folder if nothing else is in it, and what plays them.
-
-    Raises
-    ------
-    DrgsError
-        Naming the file that stays, or why the folder is unknown.
-    """
-    folder = folder_of(obj)
-    while ending():
-        time.sleep(0.02)
-    ParticleCache(folder).clear()
-    scene_export.clear(folder / INPUT)
-    cache_playback.detach(obj)
-    with suppress(OSError):
-        (folder / cache_playback.FILE).unlink(missing_ok=True)
-        os.rmdir(folder)
+        particle_display.show(self.members[0].object(), cache.rest().points, self.counts)
 
 
 def chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Objects to bake: the selected objects with physics, the active one last, or the one an editor is pinned to."""
+    """Objects to bake: the selected ones with physics, the active one last, or the one an editor is pinned to.
+
+    Of those that are baked together, one.
+    """
     active = context.active_object
     if context.object != active:
         found = [context.object]
     else:
         found = [*(obj for obj in context.selected_objects if obj != active), active]
-    return [obj for obj in found if assets.is_drgs(obj) and obj.drgs.physics.use]
+    return coupling.apart(obj for obj in found if assets.is_drgs(obj) and obj.drgs.physics.use)
 
 
 def is_waiting(obj: bpy.types.Object | None) -> bool:
@@ -349,25 +338,6 @@ def of(obj: bpy.types.Object | None) -> Job | None:
 def object_of(key: int) -> bpy.types.Object | None:
     """The object that has this `uid`."""
     return next((obj for obj in bpy.data.objects if obj.session_uid == key), None)
-
-
-def estimate(physics: DrgsPhysicsSettings, counts: tuple[int, int], cores: int) -> float:
-    """Seconds that a bake takes at least, from particles and time steps a frame."""
-    particles, steps = counts
-    rate = max(_RATES.get(MATERIALS[part.material].model, _SLOW) for part in (physics, *physics.regions))
-    if physics.solver != "mpm":
-        rate = _QUICK
-    frame = _FRAME + _KEEP * particles + particles * steps / (rate * max(1, cores) ** 0.85)
-    return _START + (physics.frame_end - physics.frame_start) * frame
-
-
-def clock(seconds: float) -> str:
-    """A duration in words."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes:02d} min"
-    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
 def end_all() -> None:

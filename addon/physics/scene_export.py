@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,8 @@ from .settings_export import PANEL, describe, subject_of
 Array = np.ndarray
 
 BODY, SETTINGS, MATRICES, MOTION = "body.drgs", "settings.json", "matrices.npy", "motion.npy"
+#: Settings of all bodies that are baked together.
+BODIES = "bodies.json"
 _COLLIDER = "collider_"
 #: A file of a collider, as `_capture_motion` calls it after the object, its name as in URLs.
 COLLIDER_FILE = re.compile(_COLLIDER + r"\d{3}_(.*?)\.(?:ply|npy)")
@@ -44,7 +46,13 @@ _KINDS = {"BOOLEAN": bool, "FLOAT": np.float32, "INT": np.int32}
 
 
 def export_scene(
-    obj: bpy.types.Object, scene: bpy.types.Scene, folder: Path, *, still: bool = False
+    obj: bpy.types.Object,
+    scene: bpy.types.Scene,
+    folder: Path,
+    *,
+    still: bool = False,
+    coupled: dict[str, Any] | None = None,
+    bodies: Sequence[bpy.types.Object] = (),
 ) -> Generator[float, None, None]:
     """Write body, settings and all that moves into `folder`, which is emptied before.
 
@@ -55,6 +63,8 @@ def export_scene(
     ----------
     obj : DR-GS object; what it was baked to before plays no part
     still : only the body, at the first frame
+    coupled : settings of one that is baked with others
+    bodies : those others, which are no colliders
 
     Yields
     ------
@@ -76,7 +86,7 @@ def export_scene(
         folder.mkdir(parents=True, exist_ok=True)
         try:
             scene.frame_set(frames[0])
-            data = describe(obj, scene)
+            data = describe(obj, scene) | (coupled or {})
             vertices, faces, matrix = _read(obj, fits=True)
             if not (np.isfinite(vertices).all() and np.isfinite(matrix).all()):
                 problem = "has vertices or a transform that are not finite in the first frame"
@@ -88,7 +98,8 @@ def export_scene(
             if still:
                 data |= {"pins": [], "last": frames[0]}
             else:
-                yield from _capture_motion(obj, scene, frames, folder, data, (vertices, matrix))
+                obstacles = list(_obstacles(obj, bodies))
+                yield from _capture_motion(obj, scene, frames, folder, data, (vertices, matrix), obstacles)
             text = json.dumps(data, indent=1, sort_keys=True)
             replace_file(folder / SETTINGS, [text.encode()])
         except ReferenceError as error:
@@ -114,7 +125,7 @@ def clear(folder: Path) -> None:
     """Remove what `export_scene` wrote and the folder, as far as nothing else is in it."""
     with suppress(OSError):
         for path in folder.iterdir():
-            written = path.name in (BODY, SETTINGS, MATRICES, MOTION, STDOUT, _OLD_STDOUT, LOG)
+            written = path.name in (BODY, SETTINGS, BODIES, MATRICES, MOTION, STDOUT, _OLD_STDOUT, LOG)
             if written or path.name.startswith(_COLLIDER):
                 path.unlink(missing_ok=True)
         os.rmdir(folder)
@@ -138,10 +149,11 @@ def _capture_motion(
     folder: Path,
     data: dict[str, Any],
     rest: tuple[Array, Array],
+    obstacles: list[tuple[bpy.types.Object, DrgsPhysicsCollider]],
 ) -> Iterator[float]:
     """Where colliders, fields, pinned parts and the object itself are in every frame; completes `data`."""
     vertices, matrix = rest
-    obstacles, pushing = list(_obstacles(obj)), fields_on(obj, scene)
+    pushing = fields_on(obj, scene)
     rows = [[row_of(other, obj.drgs.physics.fields, _depsgraph())] for other in pushing]
     motion = _Track(folder / MOTION, vertices, len(frames)) if data["pins"] else None
     matrices, tracks = [matrix], []
@@ -186,9 +198,9 @@ def _capture_motion(
         np.save(folder / MATRICES, np.stack(matrices))
 
 
-def contacts(obj: bpy.types.Object) -> list[dict[str, Any]]:
+def contacts(obj: bpy.types.Object, bodies: Sequence[bpy.types.Object]) -> list[dict[str, Any]]:
     """Contact settings of each collider, as `export_scene` writes it."""
-    return [_contact(settings) for _, settings in _obstacles(obj)]
+    return [_contact(settings) for _, settings in _obstacles(obj, bodies)]
 
 
 def _contact(settings: DrgsPhysicsCollider) -> dict[str, Any]:
@@ -274,9 +286,11 @@ def _may_move(obj: bpy.types.Object) -> bool:
     return False
 
 
-def _obstacles(obj: bpy.types.Object) -> Iterator[tuple[bpy.types.Object, DrgsPhysicsCollider]]:
-    """Every collider once, with its settings; a row without anything chosen is none."""
-    seen = {obj.name_full}
+def _obstacles(
+    obj: bpy.types.Object, bodies: Sequence[bpy.types.Object]
+) -> Iterator[tuple[bpy.types.Object, DrgsPhysicsCollider]]:
+    """Every collider once, with its settings; a row without anything chosen is none, nor is one of `bodies`."""
+    seen = {obj.name_full, *(other.name_full for other in bodies)}
     for settings in obj.drgs.physics.colliders:
         chosen = [settings.object] if settings.object else []
         if settings.collection:

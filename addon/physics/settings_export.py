@@ -18,6 +18,8 @@ from ..physics_settings import ANGLES, DrgsPhysicsSettings, numbers_of
 
 #: Where to look for the settings, in messages.
 PANEL = "Physics > DR-GS Physics"
+#: Where a capture lies inside the cache.
+INPUT = "drgs_input"
 #: Where caches lie that the artist has chosen no folder for.
 _CACHES = "//drgs_cache"
 

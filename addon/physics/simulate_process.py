@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from urllib.parse import unquote
@@ -62,6 +63,7 @@ class SimulateProcess:
     folder : the cache; what it holds of other settings is removed
     threads : 0 for all cores
     device : "cpu" or "cuda"
+    others : folders of the captures of the other bodies that are simulated with this one
 
     Attributes
     ----------
@@ -73,15 +75,20 @@ class SimulateProcess:
         There is no engine, or it cannot be started.
     """
 
-    def __init__(self, inputs: Path, folder: Path, threads: int = 0, device: str = "cpu") -> None:
+    def __init__(
+        self, inputs: Path, folder: Path, threads: int = 0, device: str = "cpu", others: Sequence[Path] = ()
+    ) -> None:
         self._counts: tuple[int, int] | None = None
-        self._inputs, self._folder = inputs, folder
+        self._captures, self._folder = [inputs, *others], folder
         self._stdout, self._log = inputs / scene_export.STDOUT, inputs / scene_export.LOG
         command = engine_link.drgs_command()
         self._python = command[0]
         self.name = f"drgs simulate of {command[0]}"
         arguments = [inputs / scene_export.BODY, "--settings", inputs / scene_export.SETTINGS, "--out", folder]
-        arguments += ["--overwrite", "--threads", str(threads), "--device", device]
+        arguments += ["--device", device]
+        if others:
+            arguments = ["--settings", inputs / scene_export.BODIES]
+        arguments += ["--overwrite", "--threads", str(threads)]
         try:
             with open(self._stdout, "wb") as output, open(self._log, "wb") as log:
                 self._process = subprocess.Popen(
@@ -163,5 +170,6 @@ class SimulateProcess:
 
     def _in_words(self, line: str) -> str:
         """A line of the engine's program without the files that `scene_export` wrote: the artist knows objects."""
-        line = line.replace(f"{self._inputs / scene_export.BODY}: ", "").replace(f"{self._inputs}{os.sep}", "")
+        for inputs in self._captures:
+            line = line.replace(f"{inputs / scene_export.BODY}: ", "").replace(f"{inputs}{os.sep}", "")
         return scene_export.COLLIDER_FILE.sub(lambda found: f'collider "{unquote(found[1])}"', line)

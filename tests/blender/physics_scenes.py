@@ -9,8 +9,9 @@ import bpy
 import numpy as np
 from scenes import mesh_object, part
 
-bake_job, settings_export, scene_export = (
-    part(f"addon.physics.{name}") for name in ("bake_job", "settings_export", "scene_export")
+bake_job, bake_time, cache_state, settings_export, scene_export = (
+    part(f"addon.physics.{name}")
+    for name in ("bake_job", "bake_time", "cache_state", "settings_export", "scene_export")
 )
 particle_cache = part("drgs_blender.core.particle_cache")
 FRAMES = 6

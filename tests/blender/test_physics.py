@@ -20,6 +20,7 @@ from physics_scenes import (
     begin_of,
     box_object,
     cache_of,
+    cache_state,
     computed_last,
     particle_cache,
     scene_export,
@@ -125,7 +126,7 @@ def test_a_bake_is_stopped_at_once_and_goes_on(body, scene):
     assert cache_of(body).read_state()[0] >= done, "what it needs to go on is saved"
     np.testing.assert_array_equal(vertices(body, 3), cache_of(body).read(3).vertices)
     assert np.abs(vertices(body, 3) - vertices(body, 1)).max() > 0.1, "it spins"
-    found = bake_job.cached(body, scene)
+    found = cache_state.cached(body, scene)
     assert done <= found.frames < found.expected == wanted and not found.changed
     # So does one whose Blender dies: the pipe that it holds is closed then.
     again = bake_job.Bake(body, scene)
@@ -135,13 +136,13 @@ def test_a_bake_is_stopped_at_once_and_goes_on(body, scene):
         while not again.step():
             time.sleep(0.01)
     again.close()
-    found = bake_job.cached(body, scene)
+    found = cache_state.cached(body, scene)
     physics.frame_end = found.frames + 2
     bpy.ops.drgs.bake_physics()
     assert computed_last(body) < physics.frame_end - 1, "it goes on where it was"
     np.testing.assert_array_equal(vertices(body, physics.frame_end), cache_of(body).read(physics.frame_end).vertices)
     physics.density = 900
-    assert bake_job.cached(body, scene).changed
+    assert cache_state.cached(body, scene).changed
     # Freeing takes away what is ours and nothing else.
     folder = settings_export.folder_of(body)
     (folder / "notes.txt").write_text("mine")
@@ -184,13 +185,13 @@ def test_pins_regions_and_colliders_take_part(body, scene):
     assert data["regions"] == [{"group": "stiff", "material": {"name": "rubber", "youngs_modulus": 4e4}}]
     assert "motion" in data and "vertices" in data["colliders"][0] and "Table" in data["colliders"][0]["mesh"]
     np.testing.assert_allclose(world(body, 1), sphere()[0], atol=1e-5)
-    assert not bake_job.cached(body, scene).changed
+    assert not cache_state.cached(body, scene).changed
     for name, value in (("friction", 0.7), ("contact", "slip"), ("object", None)):
         before = getattr(physics.colliders[0], name)
         setattr(physics.colliders[0], name, value)
-        assert bake_job.cached(body, scene).changed, name
+        assert cache_state.cached(body, scene).changed, name
         setattr(physics.colliders[0], name, before)
-    assert not bake_job.cached(body, scene).changed
+    assert not cache_state.cached(body, scene).changed
     now = world(body, FRAMES)
     np.testing.assert_allclose(now[height == 1], [[0.5, 0, 1]], atol=0.02)
     assert -0.8 < now[:, 2].min() < -0.4, "the table, at -0.6, has pushed it in"
@@ -339,10 +340,10 @@ def test_it_is_baked_on_the_device_of_the_scene(body, scene):
         arguments = bake._process._process.args
         asked.append(arguments[arguments.index("--device") + 1])
         bake.close()
-        assert not bake_job.cached(body, scene).changed
+        assert not cache_state.cached(body, scene).changed
     assert asked == ["cpu", "cpu", "cuda"]
     scene.drgs.device = "CPU"
-    assert not bake_job.cached(body, scene).changed
+    assert not cache_state.cached(body, scene).changed
 
 
 def test_the_played_file_is_never_of_two_bakes(tmp_path):

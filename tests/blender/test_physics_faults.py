@@ -8,7 +8,7 @@ import time
 import bpy
 import numpy as np
 import pytest
-from physics_scenes import bake_job, begin_of, cache_of, computed_last, vertices
+from physics_scenes import bake_job, bake_time, begin_of, cache_of, computed_last, vertices
 from scenes import mesh_object, part, sphere
 
 errors = part("drgs_blender.core.errors")
@@ -112,11 +112,11 @@ def test_the_time_told_before_a_bake_is_that_of_its_material(body):
     told = {}
     for material in ("jelly", "water", "metal", "sand"):
         physics.material = material
-        told[material] = bake_job.estimate(physics, counts, 2)
+        told[material] = bake_time.estimate(physics, counts, 2)
     assert 40 < told["jelly"] < 100, "bench/bench_simulate.py --part body takes longer"
     assert told["jelly"] < told["water"] < told["metal"] == told["sand"] and told["sand"] > 3 * told["jelly"]
     physics.material, physics.solver = "jelly", "xpbd"
-    assert bake_job.estimate(physics, counts, 2) < 0.5 * told["jelly"]
+    assert bake_time.estimate(physics, counts, 2) < 0.5 * told["jelly"]
     physics.solver = "mpm"
     physics.frame_end = 126
-    assert bake_job.estimate(physics, counts, 2) == pytest.approx(told["jelly"] / 2, abs=2)
+    assert bake_time.estimate(physics, counts, 2) == pytest.approx(told["jelly"] / 2, abs=2)
