@@ -11,7 +11,7 @@ from ...drgs_blender.core.sim_materials import MATERIALS
 from .. import assets
 from ..physics import bake_job, bake_time, cache_state, coupling, particle_display
 from ..physics_settings import DrgsPhysicsRegion, DrgsPhysicsSettings, numbers_of
-from .text_layout import bar_text
+from .text_layout import bar_text, wrapped
 
 
 class _Physics:
@@ -130,7 +130,7 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         layout.label(text=str(error), icon="ERROR")
         return
     if together and (problem := coupling.problem_of(obj)):
-        layout.label(text=problem, icon="ERROR")
+        wrapped(layout, context, problem, "ERROR")
     for name in found.missing:
         layout.label(text=f'"{name}" has no frames', icon="ERROR")
     row = layout.row(align=True)
@@ -219,7 +219,7 @@ class DRGS_PT_physics_coupling(_Part, bpy.types.Panel):
         try:
             others = [other for other in coupling.members(obj) if other != obj]
         except DrgsError as error:
-            self.layout.label(text=str(error), icon="ERROR")
+            wrapped(self.layout, context, str(error), "ERROR")
             return
         column = self.layout.column(align=True)
         if others:
@@ -227,7 +227,7 @@ class DRGS_PT_physics_coupling(_Part, bpy.types.Panel):
         for other in others:
             column.label(text=other.name, icon="PHYSICS")
         for other in coupling.idle(obj):
-            column.label(text=f"{other.name} has no DR-GS Physics; it can be a collider", icon="INFO")
+            wrapped(column, context, f"{other.name} has no DR-GS Physics; it can be a collider", "INFO")
 
 
 class DRGS_PT_physics_cache(_Part, bpy.types.Panel):

@@ -120,13 +120,13 @@ def count_of(obj: bpy.types.Object) -> int:
 
 
 def describe(obj: bpy.types.Object) -> dict[str, Any]:
-    """Settings of an object that is baked with others: the folders of all, contact, friction; {} alone."""
+    """Settings of an object that is baked with others: names of the folders of all, contact, friction; {} alone."""
     together = members(obj)
     if len(together) == 1:
         return {}
     physics = obj.drgs.physics
     return {
-        "coupled": [str(folder_of(other)) for other in together],
+        "coupled": [folder_of(other).name for other in together],
         "contact": physics.contact,
         "friction": float(f"{physics.friction:.6g}"),
     }

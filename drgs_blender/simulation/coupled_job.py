@@ -101,7 +101,7 @@ def _about(body: BodySettings) -> Iterator[None]:
     try:
         yield
     except (AssetError, UsageError) as error:
-        if body.name in error.subject:
+        if error.subject == body.name or f'"{body.name}"' in error.subject:
             raise
         raise type(error)(f'body "{body.name}", {error.subject}', error.problem, error.remedy) from error
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -21,6 +22,7 @@ from physics_scenes import (
     world,
 )
 from scenes import part, select
+from test_panels import Layout
 
 coupling = part("addon.physics.coupling")
 errors = part("drgs_blender.core.errors")
@@ -183,3 +185,35 @@ def test_what_the_engine_refuses_names_the_body(pair, scene):
         RuntimeError, match=r'body "Upper": is .* cells long.*Raise the resolution of the largest, "Lower"'
     ):
         bpy.ops.drgs.bake_physics()
+
+
+def test_panels_name_who_is_baked_together_and_what_is_in_the_way(pair, scene):
+    lower, upper = pair
+    texts: list[str] = []
+
+    class Recorder(Layout):
+        def check(self, name, named):
+            texts.append(named.get("text") or "")
+            return super().check(name, named)
+
+    panels = part("addon.panels.physics")
+
+    def drawn():
+        texts.clear()
+        panels._draw_bake(Recorder([]), bpy.context)
+        panels.DRGS_PT_physics_coupling.draw(SimpleNamespace(layout=Recorder([])), bpy.context)
+        return " ".join(filter(None, texts))
+
+    plain = box_object("Plain", (5, 5, 5), (6, 6, 6))
+    lower.drgs.physics.coupling.objects.link(plain)
+    for own, other in ((lower, "Upper"), (upper, "Lower")):
+        select(own)
+        text = drawn()
+        assert "Bake 2 Objects" in text and f"Baked together with: {other} Plain has no DR-GS Physics" in text
+    upper.hide_set(True)
+    select(lower)
+    assert 'Object "Upper": is hidden' in drawn()
+    upper.drgs.physics.coupling = bpy.data.collections.new("Other")
+    assert 'Object "Upper": is coupled with two collections' in drawn()
+    lower.drgs.physics.coupling = None
+    assert "Bake 2" not in drawn() and "Baked together" not in drawn(), "alone again"
