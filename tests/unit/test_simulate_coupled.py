@@ -341,3 +341,42 @@ def test_errors_of_a_frame_name_the_body():
     job.solver.bodies[1].state.x[:, 2] -= 50
     with pytest.raises(UsageError, match=r'body "pile", frame 2: has \d+ particles outside the domain'):
         job.solver.advance(FRAME)
+
+
+def test_three_bodies_of_other_matter_keep_their_momentum():
+    h = 0.1
+    domain = aligned((-0.6, -0.6, -0.6), (2.2, 1, 1), h)
+    made = []
+    for i, (material, speed) in enumerate((("metal", 2.0), ("water", 0.0), ("sand", -2.0))):
+        points = np.add(lattice((0.4, 0.4, 0.4), h / 2), [0.5 * i, 0, 0])
+        numbers = {"youngs_modulus": 1e5} if material != "water" else {}
+        made.append(solver_of(points, h, material, domain=domain, velocity=(speed, 0, 0), **numbers))
+    coupled = Coupled(made, {(0, 2): Touch("sticky")})
+    scale = 2 * sum(masses(body).sum() for body in made)
+    before = momentum(coupled)[0]
+    for _ in range(4):
+        coupled.advance(FRAME)
+    after = momentum(coupled)[0]
+    assert abs(mean_velocity(made[1])[0]) > 0.05 or mean_velocity(made[0])[0] < 1.5, "they have met"
+    assert np.linalg.norm(after - before) < 1e-6 * scale
+    assert made[0].points[:, 0].mean() < made[1].points[:, 0].mean() < made[2].points[:, 0].mean()
+
+
+def test_what_moves_one_body_is_part_of_what_all_depend_on(tmp_path):
+    """Pins that move otherwise later: frames before stay, those after are another simulation."""
+    group = np.flatnonzero(MESHES[0].vertices[:, 2] > 0.45).astype(np.int32)
+    MESHES[0].groups["up"] = group
+    rise = np.arange(6)[:, None, None] * np.array([0, 0, 0.02])
+
+    def moving(last, far=0.0):
+        np.save(tmp_path / "m.npy", (MESHES[0].vertices + rise + far * (np.arange(6) == 5)[:, None, None])[:last])
+        scene = bodies({"pins": [{"group": "up"}], "motion": "m.npy", "velocity": [0, 0, 0]}, {}) | {"last": last}
+        job = prepare_coupled(MESHES, parse_coupled(scene, folder=tmp_path, out=tmp_path / "bake"))
+        return bake_coupled(job, caches_of(job))
+
+    assert moving(3) == 2 and moving(6) == 3 and moving(6) == 0
+    top = ParticleCache(tmp_path / "bake" / "top")
+    lifted = top.read(6).vertices[group] - MESHES[0].vertices[group]
+    assert np.abs(lifted - [0, 0, 0.1]).max() < 0.02
+    with pytest.raises(UsageError, match=r'body "top".*holds another simulation'):
+        moving(6, far=0.05)
