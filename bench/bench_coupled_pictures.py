@@ -34,7 +34,7 @@ Array = np.ndarray
 FIGURE = ROOT / "docs" / "images" / "coupled.png"
 FOLDER = OUT / "coupled"
 #: Frames that are shown of each.
-FALLEN, FLOWN = (1, 11, 16, 30), (1, 10, 14, 24)
+FALLEN, FLOWN = (1, 4, 8, 30), (1, 8, 11, 15)
 
 
 def mound(path: Path, across: float, height: float) -> Path:
@@ -120,7 +120,7 @@ def main() -> None:
         return {"asset": path, "material": jelly, "matrix_world": place} | more
 
     corners = np.array([[x, y, z] for x in (-0.75, 0.75) for y in (-0.5, 0.5) for z in (0, 1.1)], float)
-    camera = frame_camera(corners, options.size, azimuth=-70, fill=1.35)
+    camera = frame_camera(corners, options.size, azimuth=-70, fill=0.8)
     stone = {"name": "jelly", "youngs_modulus": 6e5, "density": 2600}
     fall = [
         body(cat, 0.8, (0, 0, 0.45), 20) | {"material": stone} | {"velocity": [0, 0, -4.0]},
