@@ -86,6 +86,7 @@ def make_environment(folder: Path) -> None:
     pins, fields = [{"box": [[-1, -1, -1], [1, 1, -0.5]]}], [{"kind": "wind", "strength": 2.0, "flow": 1.0}]
     ground = {"mesh": str(folder / "ground.obj")}
     settings = {"resolution": 12, "last": 3, "colliders": [ground], "pins": pins, "fields": fields}
+    settings["velocity"] = [9, 0, 0]  # particles leave their blocks within a frame
     (folder / "settings.json").write_text(json.dumps(settings))
     above = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
     pile = {"asset": "spot.drgs", "name": "pile", "material": "sand", "pins": pins}

@@ -17,6 +17,7 @@ import numpy as np
 from ..compute.jit import inlined, njit
 from ..compute.threads import over_range
 from .p2g_g2p import cell_of, weights_of
+from .packed import MASS, VOLUME
 
 Array = np.ndarray
 
@@ -46,12 +47,13 @@ class Side(NamedTuple):
     Attributes
     ----------
     x : (n, 3) float64 array
-        See `Particles`; so `mass` and `volume`, see `Properties`.
-    mass, volume : (n,) float32 array
+        See `Packed`; so `motion`.
+    motion : (n, WIDTH) float32 array
     rim : (n, 4) float32 array
         See `Scene`.
-    gradient : (n, 9) float32 array
-        Deformation gradient since the start less 1.
+    gradient : (n, WIDTH) float32 array
+        From column `first` on the deformation gradient since the start less 1.
+    first : int
     start, source, source_start, active, slot : array
         See `Arrangement`.
     values : (a, 64, 4) float32 array
@@ -61,10 +63,10 @@ class Side(NamedTuple):
     """
 
     x: Array
-    mass: Array
-    volume: Array
+    motion: Array
     rim: Array
     gradient: Array
+    first: int
     start: Array
     source: Array
     source_start: Array
@@ -117,7 +119,7 @@ def _moved_normal(side, p):  # type: ignore[no-untyped-def]
     x, y, z = side.rim[p, 0], side.rim[p, 1], side.rim[p, 2]
     if x == _ZERO and y == _ZERO and z == _ZERO:
         return x, y, z
-    f = side.gradient[p]
+    f = side.gradient[p, side.first : side.first + 9]
     one = np.float32(1.0)
     a, b, c, d, e, g, h, i, j = one + f[0], f[1], f[2], f[3], one + f[4], f[5], f[6], f[7], one + f[8]
     return (
@@ -149,7 +151,7 @@ def _gather(side, s, origin, scale, shared, found, outward):  # type: ignore[no-
     for q in range(side.source_start[s], side.source_start[s + 1]):
         b = side.source[q] // 27
         for p in range(side.start[b], side.start[b + 1]):
-            if side.mass[p] == _ZERO:
+            if side.motion[p, MASS] == _ZERO:
                 continue
             i, j, k, fx, fy, fz = cell_of(side.x, p, origin, scale)
             i, j, k = i - cx, j - cy, k - cz
@@ -165,7 +167,7 @@ def _gather(side, s, origin, scale, shared, found, outward):  # type: ignore[no-
                         n = ((i + ii) * 4 + j + jj) * 4 + k + kk
                         if shared[n]:
                             near = True
-                            v = side.volume[p]
+                            v = side.motion[p, VOLUME]
                             outward[n, 0] += v * sx[ii] * wy[jj] * wz[kk]
                             outward[n, 1] += v * wx[ii] * sy[jj] * wz[kk]
                             outward[n, 2] += v * wx[ii] * wy[jj] * sz[kk]

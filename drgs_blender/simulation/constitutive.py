@@ -1,8 +1,7 @@
-"""The constitutive models: plastic flow and Kirchhoff stress of one particle, in compiled code.
+"""Plastic flow and Kirchhoff stress of one particle, whatever its deformation, in compiled code; also for devices.
 
-Return mappings: von Mises with viscosity after Simo and Hughes (Computational Inelasticity, ch. 3), sand after Klar et
-al. 2016, snow after Stomakhin et al. 2013. Stresses are Kirchhoff's, tau = P F^T, kept as xx, yy, zz, xy, xz, yz.
-Deformation gradients are kept less 1: small strains have all digits of single precision then.
+Principal strains are found by the singular value decomposition, in double precision; the models are in `models`.
+Stresses are kept as xx, yy, zz, xy, xz, yz.
 """
 
 from __future__ import annotations
@@ -12,25 +11,18 @@ import math
 import numpy as np
 
 from ..compute.jit import inlined, njit
-from ..core.sim_materials import (
-    COROTATED,
-    ELASTIC,
-    FIRST,
-    FLUID,
-    LAMBDA,
-    MOST_HARDENING,
-    MU,
-    PLASTIC,
-    SAND,
-    SECOND,
-    THIRD,
-)
+from ..core.sim_materials import COROTATED, ELASTIC, FIRST, FLUID, LAMBDA, MU, PLASTIC, SECOND, SNOW, THIRD
 from .decompose import svd3
-
-Array = np.ndarray
-
-_FLOOR = np.float32(0.02)  # of the volume ratio in logarithms and powers
-_NORM = math.sqrt(2 / 3)  # of a deviator per uniaxial stress, and of equivalent plastic strain per norm of a strain
+from .models import (
+    corotated_stress,
+    fluid_stress,
+    hencky_stress,
+    neo_hookean,
+    plastic_flow,
+    sand_flow,
+    snow_flow,
+    snow_stiffness,
+)
 
 
 @inlined
@@ -58,33 +50,6 @@ def _compose(f, p, u, a, b, c, v):  # type: ignore[no-untyped-def]
     f[p, 8] = a * u[6] * v[6] + b * u[7] * v[7] + c * u[8] * v[8] - 1.0
 
 
-@inlined
-def neo_hookean(f, p, mu, first, tau):  # type: ignore[no-untyped-def]
-    """Neo-Hookean elasticity: Kirchhoff stress tau = mu (F F^T - 1) + lambda log(J) 1 of one particle.
-
-    Parameters
-    ----------
-    f : (n, 9) float32 array
-        Elastic deformation gradient less 1, row-major.
-    p : int64
-        Particle.
-    mu, first : float32
-        Lame's mu and lambda, Pa.
-    tau : (n, 6) float32 array
-        Row `p` is written, Pa: xx, yy, zz, xy, xz, yz.
-    """
-    one = np.float32(1.0)
-    a, b, c, d, e, g, h, i, k = one + f[p, 0], f[p, 1], f[p, 2], f[p, 3], one + f[p, 4], f[p, 5], f[p, 6], f[p, 7], one + f[p, 8]  # noqa: E501  # fmt: skip
-    j = a * (e * k - g * i) - b * (d * k - g * h) + c * (d * i - e * h)
-    pressure = first * np.log(max(j, _FLOOR)) - mu
-    tau[p, 0] = mu * (a * a + b * b + c * c) + pressure
-    tau[p, 1] = mu * (d * d + e * e + g * g) + pressure
-    tau[p, 2] = mu * (h * h + i * i + k * k) + pressure
-    tau[p, 3] = mu * (a * d + b * e + c * g)
-    tau[p, 4] = mu * (a * h + b * i + c * k)
-    tau[p, 5] = mu * (d * h + e * i + g * k)
-
-
 @njit
 def respond(p, model, parameters, f, tau, memories, affine, dt):  # type: ignore[no-untyped-def]
     """Let particle p flow and find its stress. Arrays are whole: rows of them would be counted, by both threads.
@@ -108,90 +73,44 @@ def respond(p, model, parameters, f, tau, memories, affine, dt):  # type: ignore
     """
     kind = model[p]
     if kind == ELASTIC:
-        neo_hookean(f, p, parameters[p, MU], parameters[p, LAMBDA], tau)
+        h = f[p, 0], f[p, 1], f[p, 2], f[p, 3], f[p, 4], f[p, 5], f[p, 6], f[p, 7], f[p, 8]
+        tau[p, 0], tau[p, 1], tau[p, 2], tau[p, 3], tau[p, 4], tau[p, 5] = neo_hookean(
+            h, parameters[p, MU], parameters[p, LAMBDA]
+        )
         return
-    mu, first, memory = float(parameters[p, MU]), float(parameters[p, LAMBDA]), memories[p]
+    mu, first, memory = float(parameters[p, MU]), float(parameters[p, LAMBDA]), float(memories[p])
     if kind == FLUID:
-        # Equation of state p = K / g (J^-g - 1); J alone is remembered.
-        trace = float(affine[p, 0] + affine[p, 4] + affine[p, 8])
-        j = min(max(float(memory) * (1.0 + dt * trace), 0.2), 1.1)
-        gamma = float(parameters[p, FIRST])
-        pressure = -first / gamma * (j ** (-gamma) - 1.0) * j
-        for k in range(3):
-            tau[p, k] = pressure + 2.0 * mu * j * (affine[p, 4 * k] - trace / 3.0)
-        tau[p, 3] = mu * j * (affine[p, 1] + affine[p, 3])
-        tau[p, 4] = mu * j * (affine[p, 2] + affine[p, 6])
-        tau[p, 5] = mu * j * (affine[p, 5] + affine[p, 7])
-        memories[p] = np.float32(j)
+        g0, g1, g2, g3 = float(affine[p, 0]), float(affine[p, 1]), float(affine[p, 2]), float(affine[p, 3])
+        g4, g5, g6, g7, g8 = affine[p, 4], affine[p, 5], affine[p, 6], affine[p, 7], affine[p, 8]
+        stress, memory = fluid_stress(
+            (g0, g1, g2, g3, g4, g5, g6, g7, g8), memory, (mu, first, float(parameters[p, FIRST])), dt
+        )
+        tau[p, 0], tau[p, 1], tau[p, 2], tau[p, 3], tau[p, 4], tau[p, 5] = stress
+        memories[p] = np.float32(memory)
         return
 
     u, s, v = svd3(f, p)
+    first_number, second, third = float(parameters[p, FIRST]), float(parameters[p, SECOND]), float(parameters[p, THIRD])
     if kind == COROTATED:
-        j = s[0] * s[1] * s[2]
-        push = first * (j - 1.0) * j
-        _put(
-            tau,
-            p,
-            u,
-            2 * mu * (s[0] - 1) * s[0] + push,
-            2 * mu * (s[1] - 1) * s[1] + push,
-            2 * mu * (s[2] - 1) * s[2] + push,
-        )
-        memories[p] = memory
+        x, y, z = corotated_stress(s[0] - 1.0, s[1] - 1.0, s[2] - 1.0, mu, first)
+        _put(tau, p, u, x, y, z)
         return
 
-    if kind in (PLASTIC, SAND):
+    if kind == SNOW:
+        a, b, c, memory = snow_flow(s[0] - 1.0, s[1] - 1.0, s[2] - 1.0, -first_number, second, memory)
+        _compose(f, p, u, 1.0 + a, 1.0 + b, 1.0 + c, v)
+        harder = snow_stiffness(memory, third)
+        x, y, z = corotated_stress(a, b, c, harder * mu, harder * first)
+    else:
         a, b, c = math.log(max(s[0], 1e-4)), math.log(max(s[1], 1e-4)), math.log(max(s[2], 1e-4))
-        flows = False
         if kind == PLASTIC:
-            mean = (a + b + c) / 3.0
-            x, y, z = a - mean, b - mean, c - mean
-            length = math.sqrt(x * x + y * y + z * z)
-            strength = max(
-                float(parameters[p, FIRST]) + float(parameters[p, SECOND]) * memory, 0.1 * float(parameters[p, FIRST])
-            )
-            excess = 2.0 * mu * length - _NORM * strength
-            if excess > 0.0:
-                flows = True
-                stiff = 2.0 * mu * (s[0] * s[0] + s[1] * s[1] + s[2] * s[2]) / 3.0
-                slower = 1.0 + float(parameters[p, THIRD]) / (stiff * dt)
-                step = excess / (2.0 * mu * slower + 2.0 / 3.0 * max(float(parameters[p, SECOND]), 0.0))
-                keep = 1.0 - step / length
-                a, b, c = mean + keep * x, mean + keep * y, mean + keep * z
-                memory = np.float32(memory + _NORM * step)
+            stretch = (s[0] * s[0] + s[1] * s[1] + s[2] * s[2]) / 3.0
+            x, y, z, memory = plastic_flow(a, b, c, stretch, (mu, first_number, second, third), memory, dt)
         else:
-            # Volume lost or gained in earlier flow is taken up before new stress arises.
-            given = float(memory) / 3.0
-            a, b, c = a + given, b + given, c + given
-            trace = a + b + c - float(parameters[p, SECOND])
-            mean = (a + b + c) / 3.0
-            x, y, z = a - mean, b - mean, c - mean
-            length = math.sqrt(x * x + y * y + z * z)
-            flows = True
-            if trace >= 0.0:
-                memory = np.float32(a + b + c)
-                a = b = c = 0.0
-            else:
-                memory = np.float32(0.0)
-                step = length + (3.0 * first + 2.0 * mu) / (2.0 * mu) * trace * float(parameters[p, FIRST])
-                if step > 0.0:
-                    keep = 1.0 - step / length
-                    a, b, c = mean + keep * x, mean + keep * y, mean + keep * z
-        if flows:
+            x, y, z, memory = sand_flow(a, b, c, (mu, first, first_number, second), memory)
+        a, b, c = a + x, b + y, c + z
+        if x != 0.0 or y != 0.0 or z != 0.0:
             _compose(f, p, u, math.exp(a), math.exp(b), math.exp(c), v)
-        push = first * (a + b + c)
-        _put(tau, p, u, 2 * mu * a + push, 2 * mu * b + push, 2 * mu * c + push)
-        memories[p] = memory
-        return
-
-    # Snow: strain beyond the critical compression and stretch becomes plastic, and hardens or softens.
-    low, high = 1.0 - float(parameters[p, FIRST]), 1.0 + float(parameters[p, SECOND])
-    a, b, c = min(max(s[0], low), high), min(max(s[1], low), high), min(max(s[2], low), high)
-    j = a * b * c
-    plastic = min(max(float(memory) * s[0] * s[1] * s[2] / j, 0.1), 4.0)
-    _compose(f, p, u, a, b, c, v)
-    harder = min(max(math.exp(float(parameters[p, THIRD]) * (1.0 - plastic)), 0.05), MOST_HARDENING)
-    mu, first = mu * harder, first * harder
-    push = first * (j - 1.0) * j
-    _put(tau, p, u, 2 * mu * (a - 1) * a + push, 2 * mu * (b - 1) * b + push, 2 * mu * (c - 1) * c + push)
-    memories[p] = np.float32(plastic)
+        x, y, z = hencky_stress(a, b, c, mu, first)
+    _put(tau, p, u, x, y, z)
+    memories[p] = np.float32(memory)

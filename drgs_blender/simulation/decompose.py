@@ -1,10 +1,17 @@
-"""Singular value decomposition of 3 x 3 matrices in compiled code."""
+"""Decompositions of 3 x 3 matrices in compiled code: singular values of one, eigenvectors of sixteen."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from ..compute.jit import inlined, njit
+from ..compute.simd import select, some, spread
+
+_ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-20)
+#: Rotations in three planes each, at most; and of what is off the diagonal, the share that may stay.
+_SWEEPS, _LEFT = 6, np.float32(1e-6)
 
 
 @inlined
@@ -80,3 +87,45 @@ def svd3(f, n):  # type: ignore[no-untyped-def]
     l2 = (r if s2 <= tiny else s2) + 1e-300
     u = (ux / l0, wx / l1, qx / l2, uy / l0, wy / l1, qy / l2, uz / l0, wz / l1, qz / l2)
     return u, (s0, s1, s2), (v0, v1, v2, v3, v4, v5, v6, v7, v8)
+
+
+@inlined
+def _turn16(spp, sqq, spq, spr, sqr):  # type: ignore[no-untyped-def]
+    """As `_turn`, of sixteen matrices."""
+    d, twice = sqq - spp, spq + spq
+    t = select(d < _ZERO, _ZERO - twice, twice) / (abs(d) + math.sqrt(d * d + twice * twice) + _TINY)
+    c = _ONE / math.sqrt(_ONE + t * t)
+    s = t * c
+    return c, s, spp - t * spq, sqq + t * spq, c * spr - s * sqr, s * spr + c * sqr
+
+
+@inlined
+def eigen16(e):  # type: ignore[no-untyped-def]
+    """Eigenvalues and eigenvectors of sixteen symmetric matrices, by Jacobi rotations, in single precision.
+
+    Parameters
+    ----------
+    e : tuple of Float32x16
+        xx, yy, zz, xy, xz, yz.
+
+    Returns
+    -------
+    values : tuple of Float32x16
+        Three, not sorted.
+    vectors : tuple of Float32x16
+        Nine; the columns of a row-major matrix.
+    """
+    xx, yy, zz, xy, xz, yz = e
+    v0 = v4 = v8 = spread(_ONE)
+    v1 = v2 = v3 = v5 = v6 = v7 = spread(_ZERO)
+    for _ in range(_SWEEPS):
+        if not some(abs(xy) + abs(xz) + abs(yz) > _LEFT * (abs(xx) + abs(yy) + abs(zz)) + _TINY):
+            break
+        c, s, xx, yy, xz, yz = _turn16(xx, yy, xy, xz, yz)
+        v0, v1, v3, v4, v6, v7 = c * v0 - s * v1, s * v0 + c * v1, c * v3 - s * v4, s * v3 + c * v4, c * v6 - s * v7, s * v6 + c * v7  # fmt: skip  # noqa: E501
+        c, s, xx, zz, xy, yz = _turn16(xx, zz, xz, spread(_ZERO), yz)
+        v0, v2, v3, v5, v6, v8 = c * v0 - s * v2, s * v0 + c * v2, c * v3 - s * v5, s * v3 + c * v5, c * v6 - s * v8, s * v6 + c * v8  # fmt: skip  # noqa: E501
+        c, s, yy, zz, xy, xz = _turn16(yy, zz, yz, xy, spread(_ZERO))
+        yz = spread(_ZERO)
+        v1, v2, v4, v5, v7, v8 = c * v1 - s * v2, s * v1 + c * v2, c * v4 - s * v5, s * v4 + c * v5, c * v7 - s * v8, s * v7 + c * v8  # fmt: skip  # noqa: E501
+    return (xx, yy, zz), (v0, v1, v2, v3, v4, v5, v6, v7, v8)

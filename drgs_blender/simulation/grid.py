@@ -14,8 +14,10 @@ from .colliders import MovingCollider
 from .contact import bound, collide
 from .fields import FieldRows, ForceField, blow_nodes
 from .grid_blocks import Arrangement, Domain, Nodes, arrange
-from .p2g_g2p import SCRATCH, advance_nodes, g2p, hold_pins, p2g
-from .particles import Particles, Properties, taken
+from .node_forces import advance_nodes, hold_pins
+from .p2g_g2p import SCRATCH, g2p, p2g
+from .packed import ELASTIC, MASS, TOTAL, move, pack, room_for, unpacked
+from .particles import Particles, Properties
 
 Array = np.ndarray
 
@@ -133,20 +135,32 @@ class Grid(ABC):
 class HostGrid(Grid):
     """On the CPU: particles lie in the order of the blocks."""
 
-    _state: Particles
     _a: Arrangement
+    _state: Particles | None  # of a frame that was entered and not sorted yet
+    _order: Array
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        n = len(scene.properties.mass)
+        self._rows, self._spare = room_for(n), room_for(n)
 
     def enter(self, state: Particles, frame: int, seconds: float, pin_velocity: Array) -> None:
-        self._state, self._order = state, np.arange(len(state.x))
+        self._state, self._kept = state, len(state.total) > 0
         self._frame, self._seconds, self._pin_velocity = frame, seconds, pin_velocity
 
     def sort(self) -> bool:
         scene = self._scene
-        self._a, lost = arrange(self._state.x, scene.domain)
+        self._a, lost = arrange(self._rows.x if self._state is None else self._state.x, scene.domain)
         if len(lost):
             return False
-        self._state, self._order = taken(self._state, self._a.order), self._order[self._a.order]
-        self._properties = taken(scene.properties, self._order)
+        order = self._a.order
+        if self._state is None:
+            move(self._rows, order, self._spare)
+            self._order = self._order[order]
+        else:
+            pack(self._state, scene.properties, order, self._spare)
+            self._order = order
+        self._rows, self._spare, self._state = self._spare, self._rows, None
         self._rim = scene.rim[self._order]
         self._pins = _inverse(self._order)[scene.pins]
         values = np.empty((len(self._a.active), 64, 4), np.float32)
@@ -164,7 +178,7 @@ class HostGrid(Grid):
     def to_nodes(self, done: float, dt: float) -> None:
         """The first half of a step of `dt` that begins at `done`: velocities of the nodes, which met nothing yet."""
         scene, forces, nodes = self._scene, self._scene.forces, self._nodes
-        p2g(self._state, self._properties, self._a, nodes, dt, self._scratch)
+        p2g(self._rows, self._a, nodes, dt, self._scratch)
         gravity, wind = np.asarray(forces.gravity, np.float64), np.asarray(forces.wind, np.float64)
         advance_nodes(nodes.values, scene.least, dt, gravity, wind, forces.drag, forces.damping)
         if len(scene.fields):
@@ -172,7 +186,7 @@ class HostGrid(Grid):
 
     def from_nodes(self, done: float, dt: float) -> float:
         """The second half: obstacles and pins, then the particles; the highest speed as `step` gives it."""
-        scene, s, a, nodes = self._scene, self._state, self._a, self._nodes
+        scene, rows, a, nodes = self._scene, self._rows, self._a, self._nodes
         part = (done + 0.5 * dt) / self._seconds
         for moving in scene.colliders:
             field, motion = moving.at(part)
@@ -182,10 +196,10 @@ class HostGrid(Grid):
             bound(nodes, scene.planes)
         if len(self._pins):
             self._hold(_NO_MARKS)
-            kept = s.x[self._pins] + dt * self._pin_velocity
-        g2p(s, self._properties, a, nodes, dt, self._fastest)
+            kept = rows.x[self._pins] + dt * self._pin_velocity
+        g2p(rows, a, nodes, dt, self._fastest)
         if len(self._pins):
-            s.x[self._pins], s.v[self._pins] = kept, self._pin_velocity
+            rows.x[self._pins], rows.motion[self._pins, :MASS] = kept, self._pin_velocity
         return float(self._fastest.max())
 
     @property
@@ -194,7 +208,7 @@ class HostGrid(Grid):
         return self._a
 
     def _hold(self, marks: Array) -> None:
-        given = self._state.x, self._properties.mass, self._pins, self._pin_velocity
+        given = self._rows.x, self._rows.motion, self._pins, self._pin_velocity
         hold_pins(*given, self._a.slot, self._nodes, self._held, marks)
 
     def side(self) -> Side:
@@ -202,14 +216,13 @@ class HostGrid(Grid):
         marks = np.zeros((len(self._a.active) if len(self._pins) else 0, 64), np.bool_)
         if len(marks):
             self._hold(marks)
-        a = self._a
-        s = self._state
-        gradient = s.total if len(s.total) else s.elastic
-        given = s.x, self._properties.mass, self._properties.volume, self._rim, gradient
+        a, rows = self._a, self._rows
+        gradient, first = (rows.matter, TOTAL) if self._kept else (rows.strain, ELASTIC)
+        given = rows.x, rows.motion, self._rim, gradient, first
         return Side(*given, a.start, a.source, a.source_start, a.active, a.slot, self._nodes.values, marks)
 
     def state(self) -> Particles:
-        return taken(self._state, _inverse(self._order))
+        return self._state or unpacked(self._rows, self._order, self._kept)
 
 
 def _inverse(order: Array) -> Array:

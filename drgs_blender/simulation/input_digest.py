@@ -21,6 +21,8 @@ from .colliders import Collider
 from .settings import Settings
 
 Array = np.ndarray
+#: Raised where a solver computes other bits than before: caches that older versions began are not continued.
+_ARITHMETIC = {"mpm": 2}
 #: Name of a setting -> the former one, which digests hash: caches of before stay valid.
 _FORMER = {new: old for old, new in RENAMED.items()}
 
@@ -47,7 +49,11 @@ def digest_of(mesh: Mesh, settings: Settings, colliders: Sequence[Collider], mot
     described["moved"] = motion is not None
     parts = [*settings.pins, *(region for region, _ in settings.regions)]
     groups = sorted({part.group for part in parts if part.group is not None})
+    if settings.courant is None and settings.solver not in _ARITHMETIC:
+        described["courant"] = 0.5  # as it was before it could be left out
     hashed = [__version__, _with_former_names(described), groups]
+    if settings.solver in _ARITHMETIC:
+        hashed.append(_ARITHMETIC[settings.solver])
     digest = hashlib.sha256(json.dumps(hashed, sort_keys=True).encode())
     arrays = [mesh.vertices, mesh.faces, *(mesh.groups[name] for name in groups)]
     arrays += [a for c in colliders for a in (c.vertices[0], c.faces)]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
 Array = np.ndarray
-Rows = TypeVar("Rows", "Particles", "Properties")
 
 
 class Particles(NamedTuple):
@@ -63,8 +62,3 @@ class Properties(NamedTuple):
     model: Array
     parameters: Array
     solid: Array
-
-
-def taken(rows: Rows, order: Array) -> Rows:
-    """The rows in another order."""
-    return type(rows)(*(a.take(order, axis=0) if len(a) else a for a in rows))

@@ -115,7 +115,7 @@ class Settings:
     first: int = 1
     last: int = 48
     fps: float = 24.0
-    courant: float = 0.5
+    courant: float | None = None
     jitter: float | None = None
     seed: int = 0
     device: str = "cpu"
@@ -294,7 +294,7 @@ KEYS: dict[str, Any] = {
     "first": lambda r, k: r.integer(k, -1_048_574, 1_048_574),
     "last": lambda r, k: r.integer(k, -1_048_574, 1_048_574),
     "fps": lambda r, k: r.number(k, 0.1, 10_000),
-    "courant": lambda r, k: r.number(k, 0.01, 1.0),
+    "courant": lambda r, k: r.optional(k, lambda key: r.number(key, 0.01, 1.0)),
     "jitter": lambda r, k: r.optional(k, lambda key: r.number(key, 0, 1)),
     "seed": lambda r, k: r.integer(k, 0, 2**31 - 1),
     "device": lambda r, k: r.choice(k, tuple(DEVICES)),

@@ -82,9 +82,9 @@ class Solver(Stepper):
         Mesh obstacles.
     planes : sequence of Plane
         Plane obstacles.
-    courant : float
-        The Courant number (CFL condition): time step in parts of what elastic waves and viscosity bear; above 1 is
-        unstable.
+    courant : float, optional
+        The Courant number (CFL condition): time step in parts of what elastic waves and viscosity bear, by default
+        `Material.courant`; above 1 is unstable.
     device : str
         One of `DEVICES`; what it cannot do is done by the CPU, with a warning.
 
@@ -103,7 +103,7 @@ class Solver(Stepper):
         forces: Forces | None = None,
         colliders: Sequence[Collider] = (),
         planes: Sequence[Plane] = (),
-        courant: float = 0.5,
+        courant: float | None = None,
         device: str = "cpu",
     ) -> None:
         self.body, self.domain, self.forces = body, domain, forces or Forces()
@@ -128,8 +128,9 @@ class Solver(Stepper):
         self.grid = self._grid_on(device)
         still = bool(len(self._pins) == n)
         h = domain.spacing
-        fastest = float((matter.wave_speed / h + 2 * matter.diffusivity / h**2).max())
-        self.rate = 0.0 if still else fastest / courant
+        courant_of = matter.courant if courant is None else courant
+        fastest = float(((matter.wave_speed / h + 2 * matter.diffusivity / h**2) / courant_of).max())
+        self.rate = 0.0 if still else fastest
         self.state = self._at_rest()
         self._check_start()
 

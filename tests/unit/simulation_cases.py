@@ -37,7 +37,7 @@ def solver_of(
     markers: Any = (),
     colliders: Any = (),
     planes: Any = (),
-    courant: float = 0.5,
+    courant: float | None = 0.5,
     domain: Domain | None = None,
     way_out: np.ndarray | None = None,
     **numbers: float,

@@ -241,14 +241,16 @@ def test_a_longer_bake_goes_on_also_where_things_move(tmp_path):
 
 
 def test_the_digest_is_that_of_before_settings_were_renamed(monkeypatch):
-    """A bake that began when Young's modulus was called `young` goes on."""
+    """A bake that began when Young's modulus was called `young` goes on, unless its solver now computes other bits."""
     monkeypatch.setattr(input_digest, "__version__", "0.1.0")
     mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], np.ones((3, 3)), np.ones(3), np.ones(3))
     mesh.groups["left"] = np.arange(2, dtype=np.int32)
     metal = {"group": "left", "material": {"name": "metal", "youngs_modulus": 1e7}}
     settings = parse_settings({"material": {"name": "jelly", "youngs_modulus": 2e4}, "regions": [metal]})
+    now = input_digest.digest_of(mesh, settings, [], None)
+    monkeypatch.setattr(input_digest, "_ARITHMETIC", {})
     digest = input_digest.digest_of(mesh, settings, [], None)
-    assert digest == "534207947bffd29dba4777418cae7a0d01096cdc89d0938f9dfc9bb2e5fa43ec"
+    assert now != digest == "534207947bffd29dba4777418cae7a0d01096cdc89d0938f9dfc9bb2e5fa43ec"
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from simulation_cases import cantilever, energy, lattice, masses, momenta, solve
 
 from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.errors import Cancelled, UsageError
-from drgs_blender.simulation import grid_blocks, p2g_g2p
+from drgs_blender.simulation import grid_blocks, node_forces, p2g_g2p
 from drgs_blender.simulation.colliders import Collider
 from drgs_blender.simulation.contact import Plane
 from drgs_blender.simulation.grid_blocks import arrange
@@ -435,6 +435,7 @@ def test_any_number_of_threads_gives_the_same_bits(monkeypatch):
     """Also where work is cut into the smallest pieces, into which so small a body would not be."""
     monkeypatch.setattr(grid_blocks, "_SHARE", 1)
     monkeypatch.setattr(p2g_g2p, "SLOTS", 1)
+    monkeypatch.setattr(node_forces, "SLOTS", 1)
     threads = get_num_threads()
     results = []
     try:
@@ -560,3 +561,23 @@ def test_only_what_is_too_fast_for_its_size_has_run_away():
     assert hill.steps == 3 and (hill.points - points)[:, 2].max() < 0
     with pytest.raises(UsageError, match="ran away: matter moves at 1e"):
         solver_of(points / size, 0.1, velocity=(1e6, 0, 0)).advance(1 / 24)
+
+
+@pytest.mark.parametrize("poisson", [0.0, 0.3, 0.49])
+def test_what_yields_takes_longer_steps_and_stays_stable(poisson):
+    """A block of metal that tumbles and hits the ground, particles in disorder."""
+    h, frames = 0.1, 6
+    points = lattice((0.4, 0.3, 0.3), h / 2)
+    points += np.random.default_rng(0).uniform(-0.2 * h, 0.2 * h, points.shape)
+    velocity = np.cross([2.0, -2.0, 4.0], points - points.mean(axis=0)) + np.sin(9 * points[:, [1, 2, 0]]) - [0, 0, 3.0]
+    numbers = {"youngs_modulus": 1e7, "yield_stress": 1e9, "poisson": poisson}
+    solver = solver_of(
+        points, h, "metal", gravity=(0, 0, -9.81), velocity=velocity, planes=[Plane((0, 0, -0.1), (0, 0, 1))],
+        low=(-1.5, -1.5, -0.4), high=(2, 2, 1.5), courant=None, **numbers,
+    )  # fmt: skip
+    assert solver.rate * h / solver.body.matter.wave_speed[0] < 1 / 0.7
+    limit = 0.5 * (masses(solver) * (velocity**2).sum(axis=1)).sum() + 9.81 * masses(solver).sum()
+    for _ in range(frames):
+        solver.advance(FRAME)
+        assert 0.5 * (masses(solver) * (solver.state.v.astype(float) ** 2).sum(axis=1)).sum() < limit
+    assert solver_of(points, h, courant=None).rate == solver_of(points, h).rate

@@ -22,7 +22,9 @@ from ..constitutive import respond
 from ..contact import respond as slide
 from ..contact import surface_near
 from ..fields import push_of
-from ..p2g_g2p import BARE, PINNED, apply_forces, cell_of, momentum_of, node_of, update_deformation_gradient, weights_of
+from ..node_forces import PINNED, apply_forces
+from ..p2g_g2p import BARE, cell_of, node_of, weights_of
+from .updates import momentum_of, update_deformation_gradient
 
 F = np.float32
 ZERO, ONE = F(0.0), F(1.0)
