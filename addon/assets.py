@@ -16,6 +16,7 @@ from ..drgs_blender.core.asset.container import read_asset
 from ..drgs_blender.core.asset.part import vertices_of
 from ..drgs_blender.core.errors import AssetError, UsageError
 from ..drgs_blender.core.frame_sequences import frame_path
+from ..drgs_blender.core.system import replace
 from . import mesh_arrays
 from .blend_paths import relative
 from .preferences import ROOT
@@ -197,7 +198,7 @@ def _unpack(volume: bpy.types.Volume) -> Path:
     if not path.is_file():
         partial = path.with_suffix(f".{os.getpid()}.part")
         partial.write_bytes(data)
-        partial.replace(path)
+        replace(partial, path)
     return path
 
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-import os
 import re
 import tomllib
 from pathlib import Path
 from typing import NamedTuple
+
+from ..drgs_blender.core.system import WINDOWS, replace
 
 #: The extension's folder: what the engine needs and the engine itself come with it.
 SOURCE = Path(__file__).resolve().parents[1]
@@ -44,7 +45,6 @@ GPU = Group("gpu", 150e6, 400e6)
 CUDA_BYTES = 3e9
 
 _STAMP = "drgs-engine.json"
-_WINDOWS = os.name == "nt"
 
 
 @functools.cache
@@ -76,7 +76,7 @@ def pinned(source: Path = SOURCE) -> tuple[str, ...]:
 
 def interpreter(folder: Path) -> Path:
     """Path of the Python of the environment `folder`, also before it exists."""
-    return folder / ("Scripts/python.exe" if _WINDOWS else "bin/python")
+    return folder / ("Scripts/python.exe" if WINDOWS else "bin/python")
 
 
 def state(folder: Path, source: Path = SOURCE) -> str:
@@ -123,12 +123,12 @@ def write_stamp(folder: Path, **entries: object) -> None:
     """Remember what is done in `folder`."""
     partial = folder / f"{_STAMP}.part"
     partial.write_text(json.dumps(read_stamp(folder) | entries, indent=2), encoding="utf-8")
-    partial.replace(folder / _STAMP)
+    replace(partial, folder / _STAMP)
 
 
 def site_packages(folder: Path) -> Path:
     """Folder of the packages of the environment `folder`; FileNotFoundError where there is none."""
-    if _WINDOWS:
+    if WINDOWS:
         return folder / "Lib" / "site-packages"
     found = sorted((folder / "lib").glob("python3*/site-packages"))
     if not found:

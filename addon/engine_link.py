@@ -18,6 +18,7 @@ import bpy
 
 from ..drgs_blender.core.errors import DeviceError, EngineError, UsageError
 from ..drgs_blender.core.frame import Frame
+from ..drgs_blender.core.system import WINDOWS
 from ..drgs_blender.ipc.child_process import clean_environment
 from ..drgs_blender.ipc.client import EngineClient, Passes, locate_engine
 from ..drgs_blender.ipc.locate import VARIABLE, bundled_command
@@ -33,14 +34,9 @@ UPDATE = "Press Set Up Engine in sidebar > DR-GS; nothing need be fetched for it
 
 #: Runs ``drgs`` and ends it together with Blender, however that ends: its standard input is closed then.
 _MAIN = """
-import os, signal, sys, threading
-
-def watch():
-    while os.read(0, 1):
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
-
-threading.Thread(target=watch, daemon=True).start()
+import sys, threading
+from drgs_blender.core.system import claim_input, end_at_close
+threading.Thread(target=end_at_close, args=(claim_input(),), daemon=True).start()
 from drgs_blender.cli.main import main
 sys.exit(main())
 """
@@ -125,6 +121,14 @@ def drgs_command() -> list[str]:
     """
     command = command_line()
     return [*command[: command.index("-m")], "-c", _MAIN]
+
+
+def ask_to_end(process: subprocess.Popen[bytes]) -> None:
+    """Ask a program of `drgs_command` to end, which saves what it needs to go on."""
+    if WINDOWS and process.stdin is not None:  # to terminate it there would be to kill it
+        process.stdin.close()
+    else:
+        process.terminate()
 
 
 def output_of(arguments: list[str]) -> str:

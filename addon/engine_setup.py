@@ -20,6 +20,7 @@ from typing import IO
 
 from ..drgs_blender.core.errors import DeviceError
 from ..drgs_blender.core.phases import PREPARING
+from ..drgs_blender.core.system import WINDOWS, replace
 from ..drgs_blender.ipc.child_process import clean_environment
 from ..drgs_blender.ipc.locate import VARIABLE
 from .engine_environment import (
@@ -60,7 +61,6 @@ _UNREACHED = re.compile(r"^Could not fetch URL (\S+?):? .*?\((?:Caused by )?(\w+
 _COUNT = re.compile(re.escape(PREPARING) + r", (\d+) of (\d+)")
 #: Name and size of a package that pip begins with.
 _PACKAGE = re.compile(r"(?:Downloading|Using cached|Processing) (?:\S*/)?([A-Za-z0-9_.]+?)-\d\S*( \([\d.]+ \wB\))?")
-_WINDOWS = os.name == "nt"
 
 
 @dataclass(slots=True)
@@ -179,7 +179,7 @@ class EngineSetup:
     def cancel(self) -> None:
         """End the command under way and all it started. What was finished stays."""
         if self._process is not None and self._process.poll() is None:
-            if _WINDOWS:
+            if WINDOWS:
                 self._process.terminate()
             else:
                 os.killpg(self._process.pid, signal.SIGKILL)
@@ -244,7 +244,7 @@ class EngineSetup:
                     stdout=out,
                     stderr=subprocess.STDOUT,
                     env=environment,
-                    start_new_session=not _WINDOWS,
+                    start_new_session=not WINDOWS,
                     creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
                 )
         except OSError as error:
@@ -260,8 +260,8 @@ class EngineSetup:
             shutil.rmtree(stale, ignore_errors=True)
         shutil.copytree(self.source / PACKAGE, fresh, ignore=shutil.ignore_patterns("__pycache__"))
         if target.exists():
-            target.replace(old)
-        fresh.replace(target)
+            replace(target, old)
+        replace(fresh, target)
         shutil.rmtree(old, ignore_errors=True)
 
     def _read(self) -> None:

@@ -143,7 +143,7 @@ class CommandOperator(DrgsOperator):
     def cancel(self, context: bpy.types.Context) -> None:
         """End the process; called by Esc and when Blender closes."""
         if self._process is not None:
-            self._process.terminate()
+            engine_link.ask_to_end(self._process)
             try:
                 self._process.wait(2)  # a kernel that is under way hears of it late; Blender's window waits
             except subprocess.TimeoutExpired:

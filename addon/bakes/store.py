@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...drgs_blender.core.system import replace
 from ...drgs_blender.core.user_cache import named_cache, user_cache
 
 log = logging.getLogger("drgs")
@@ -89,7 +90,7 @@ class Store:
             part = folder / f".{key}.{uuid.uuid4().hex[:12]}.tmp"
             try:
                 shutil.copyfile(path, part)
-                os.replace(part, folder / f"{key}{_SUFFIX}")
+                replace(part, folder / f"{key}{_SUFFIX}")
             except OSError:
                 _remove(part)
                 raise

@@ -130,7 +130,10 @@ class SimulateProcess:
         if any(process is self._process for process, _ in _ending):
             return
         if self.alive:
-            (self._process.terminate if save else self._process.kill)()
+            if save:
+                engine_link.ask_to_end(self._process)
+            else:
+                self._process.kill()
             try:
                 self._process.wait(_WAIT)
             except subprocess.TimeoutExpired:

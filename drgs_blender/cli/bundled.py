@@ -2,11 +2,12 @@
 
 A program, started by its path:
 
-    python -I .../drgs_blender/cli/bundled.py SITE_PACKAGES -m drgs_blender.engine [arguments]
-    python -I .../drgs_blender/cli/bundled.py SITE_PACKAGES -c "code" [arguments]
+    python -I -Xutf8 .../drgs_blender/cli/bundled.py SITE_PACKAGES -m drgs_blender.engine [arguments]
+    python -I -Xutf8 .../drgs_blender/cli/bundled.py SITE_PACKAGES -c "code" [arguments]
 
 ``-I`` keeps the user's packages and settings out, and with them the folders of the extension: these are added here,
-last, so that what Blender's Python has, NumPy among it, is found first.
+last, so that what Blender's Python has, NumPy among it, is found first. ``-Xutf8``: on Windows pipes have the code page
+of the user else, and Blender reads UTF-8.
 """
 
 import runpy
@@ -21,7 +22,7 @@ def main() -> None:
     sys.path += [site, str(Path(__file__).resolve().parents[2])]
     from drgs_blender.core import own_python
 
-    own_python.bundled = [sys.executable, "-I", __file__, site]
+    own_python.bundled = [sys.executable, "-I", "-Xutf8", __file__, site]
     sys.argv = [kind, *arguments]
     try:
         if kind == "-m":

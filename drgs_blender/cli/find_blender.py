@@ -44,7 +44,9 @@ class Blender:
         """
         ask = ["-c", "import bpy; print('Blender', bpy.app.version_string)"] if self.is_module else ["--version"]
         try:
-            result = subprocess.run([self.program, *ask], capture_output=True, text=True, timeout=120)
+            result = subprocess.run(
+                [self.program, *ask], capture_output=True, encoding="utf-8", errors="replace", timeout=120
+            )
         except (OSError, subprocess.TimeoutExpired) as error:
             raise DeviceError(f"Blender at {self.program}", f"does not start ({error})", _REMEDY) from error
         found = re.search(r"^Blender (\d+\.\d+\.\d+)", result.stdout, re.M)

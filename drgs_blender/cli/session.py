@@ -27,6 +27,7 @@ from ..core import own_python
 from ..core.asset.archive import replace_file
 from ..core.errors import EXIT_INTERRUPTED, EXIT_TERMINATED, EngineError, UsageError
 from ..core.file_lock import FileLock
+from ..core.system import WINDOWS, terminate_self
 from . import sampling
 from .session_link import POLL_SECONDS, acquire, claim_folder, end, is_running
 
@@ -75,7 +76,7 @@ def start(folder: Path, idle: int) -> int:
     command = [*own_python.command(), "-m", module, "session", "serve", str(folder), f"--idle={idle}"]
     # It inherits no stream: the caller of this command would wait for its end.
     log = folder / "log"
-    apart = {"creationflags": 0x208} if os.name == "nt" else {"start_new_session": True}  # detached, in a group
+    apart = {"creationflags": 0x08000200} if WINDOWS else {"start_new_session": True}  # no window, in a group
     with open(log, "wb") as out:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, **apart)
     deadline = time.monotonic() + START_SECONDS
@@ -172,7 +173,7 @@ class _IdleWatch:
                 worker = next((each for each in self._ancestors if _alive(each)), None)
             if (reason := self._reason(worker)) is not None:
                 logger.info("session %s: ends, %s", self._folder, reason)
-                os.kill(os.getpid(), signal.SIGTERM)
+                terminate_self()
                 return
 
     def _reason(self, worker: tuple[int, str] | None) -> str | None:

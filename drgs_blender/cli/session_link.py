@@ -29,6 +29,7 @@ from typing import IO
 from ..core.asset.archive import replace_file
 from ..core.errors import EngineError, UsageError, WriteError
 from ..core.file_lock import FileLock
+from ..core.system import WINDOWS
 from .frame_lines import HEARTBEAT_SECONDS, emit
 
 logger = logging.getLogger(__name__)
@@ -58,7 +59,7 @@ def claim_folder(folder: Path) -> None:
     if foreign := next((name for name in names if not _FILES.fullmatch(name)), None):
         problem = f"is a folder with other files ({foreign!r}), and sessions empty theirs"
         raise UsageError(f"session {folder}", problem, "Choose a new folder")
-    if os.name != "nt" and (about.st_uid != os.getuid() or about.st_mode & 0o022):
+    if not WINDOWS and (about.st_uid != os.getuid() or about.st_mode & 0o022):
         raise UsageError(f"session {folder}", "is a folder in which others may write", "Choose a folder of your own")
 
 
@@ -95,7 +96,7 @@ def end(folder: Path) -> None:
     (folder / "stop").touch()
     if not _wait_until_ended(folder, END_SECONDS):
         with contextlib.suppress(OSError, ValueError):  # it ended just now
-            os.kill(int((folder / "pid").read_text()), signal.SIGTERM if os.name == "nt" else signal.SIGKILL)
+            os.kill(int((folder / "pid").read_text()), signal.SIGTERM if WINDOWS else signal.SIGKILL)
         _wait_until_ended(folder, END_SECONDS)
 
 
@@ -166,7 +167,8 @@ def delegate(folder: Path, words: Sequence[str]) -> int | None:
     finally:
         waits.close()
         for path in (request, *files.values()):
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(PermissionError):  # Windows, while the session looks at it: it sweeps
+                path.unlink(missing_ok=True)
 
 
 def _other_requests(folder: Path, request: Path) -> bool:

@@ -18,6 +18,7 @@ import uuid
 from pathlib import Path
 
 from ..core.file_lock import FileLock
+from ..core.system import replace
 from ..core.user_cache import named_cache, user_cache
 
 log = logging.getLogger(__name__)
@@ -137,7 +138,7 @@ def write_atomically(path: Path, data: bytes) -> None:
         part.write_bytes(data)
         # Not flushed to the disk before, which on a busy one takes longer than to compile: where the power is lost,
         # the file may be empty, which its digest shows.
-        os.replace(part, path)
+        replace(part, path)
     except OSError:
         part.unlink(missing_ok=True)
         raise

@@ -12,11 +12,11 @@ import logging
 import os
 import queue
 import signal
-import sys
 import threading
 
 signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C in the terminal is for the program that waits
 
+from ..core.system import claim_input  # noqa: E402
 from . import folders, jit, manifest  # noqa: E402, F401  (jit sets Numba up)
 from .manifest import Kernel  # noqa: E402
 
@@ -26,13 +26,14 @@ log = logging.getLogger(__name__)
 def main() -> None:
     """Compile until the input ends."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    requests = os.fdopen(claim_input(), encoding="utf-8")
     os.dup2(2, 1)  # what anything else prints is no answer
     logging.getLogger(folders.__name__).setLevel(logging.ERROR)  # what it warns of is the answer
     gc.disable()  # a search through all of the compiler's objects takes longer than it gives back
     lines: queue.SimpleQueue[str] = queue.SimpleQueue()
 
     def listen() -> None:
-        for line in sys.stdin:
+        for line in requests:
             lines.put(line)
         os._exit(0)
 

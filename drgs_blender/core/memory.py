@@ -27,7 +27,7 @@ def total_memory(root: Path = _ROOT) -> float:
     total = float("inf")
     with suppress(AttributeError, OSError, ValueError):  # not every system has it
         total = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    return min([total, *(float(limit) for limit, _ in _cgroups(root))])
+    return min([total, _windows()[0], *(float(limit) for limit, _ in _cgroups(root))])
 
 
 def available_memory(root: Path = _ROOT) -> float:
@@ -47,7 +47,7 @@ def available_memory(root: Path = _ROOT) -> float:
     with suppress(OSError, ValueError, StopIteration, IndexError):
         lines = (root / "proc/meminfo").read_text().splitlines()
         free = float(int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]) << 10)
-    return max(min([free, *(float(limit - used) for limit, used in _cgroups(root))]), 0.0)
+    return max(min([free, _windows()[1], *(float(limit - used) for limit, used in _cgroups(root))]), 0.0)
 
 
 def give_back() -> None:
@@ -60,6 +60,17 @@ def give_back() -> None:
 
         with suppress(OSError, AttributeError):  # another C library
             ctypes.CDLL(None).malloc_trim(0)
+
+
+def _windows() -> tuple[float, float]:
+    """Memory of a machine with Windows, and what of it is free; infinite on others."""
+    if sys.platform != "win32":
+        return float("inf"), float("inf")
+    import ctypes
+
+    status = (ctypes.c_uint64 * 8)(64)  # MEMORYSTATUSEX: its own size, all memory, what is free, and more
+    done = ctypes.windll.kernel32.GlobalMemoryStatusEx(status)
+    return (float(status[1]), float(status[2])) if done else (float("inf"), float("inf"))
 
 
 def _cgroups(root: Path) -> Iterator[tuple[int, int]]:

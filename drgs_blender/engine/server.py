@@ -25,6 +25,7 @@ from ..core import own_python
 from ..core.errors import EXIT_INTERNAL, EXIT_OK, EXIT_VERSION, Cancelled, DeviceError, DrgsError
 from ..core.loading import many_imports
 from ..core.phases import PREPARING, STARTING, is_counted
+from ..core.system import claim_input
 from ..core.version import __version__
 from ..ipc import protocol
 from ..ipc.codec import CodecError, decode_frame
@@ -225,11 +226,8 @@ def _exit(code: int) -> None:
 
 def claim_pipes() -> Link:
     """Keep the pipes for messages: whatever else writes to standard output goes to standard error from now on."""
-    reader = os.fdopen(os.dup(0), "rb", buffering=0)
+    reader = os.fdopen(claim_input(), "rb", buffering=0)
     writer = os.fdopen(os.dup(1), "wb", buffering=0)
-    nothing = os.open(os.devnull, os.O_RDONLY)
-    os.dup2(nothing, 0)
-    os.close(nothing)
     os.dup2(2, 1)
     return Link(reader, writer)
 

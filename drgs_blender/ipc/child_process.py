@@ -44,6 +44,22 @@ def clean_environment() -> dict[str, str]:
     return kept | {"OMP_WAIT_POLICY": "PASSIVE", "PYTHONNOUSERSITE": "1"}
 
 
+def is_crash(code: int) -> bool:
+    """Whether an exit code is that of a signal, or of an exception of Windows (an NTSTATUS that is an error)."""
+    return code < 0 or code >= 0xC0000000
+
+
+def ended_how(code: int) -> str:
+    """How a process ended, in words.
+
+    >>> ended_how(1), ended_how(-9), ended_how(0xC0000005)
+    ('exited (1)', 'was killed by signal 9', 'crashed (0xC0000005)')
+    """
+    if not is_crash(code):
+        return f"exited ({code})"
+    return f"was killed by signal {-code}" if code < 0 else f"crashed (0x{code:X})"
+
+
 class Child:
     """One running engine.
 
@@ -107,9 +123,9 @@ class Child:
 
     @property
     def killed(self) -> bool:
-        """Whether a signal ended the process (Windows has none)."""
+        """Whether a signal ended the process, on Windows an exception."""
         try:
-            return self._process is not None and self._process.wait(1.0) < 0
+            return self._process is not None and is_crash(self._process.wait(1.0))
         except subprocess.TimeoutExpired:
             return False
 
@@ -175,9 +191,7 @@ class Child:
             code = None
         if self._log_thread is not None:
             self._log_thread.join(0.5)
-        how = (
-            "stopped answering" if code is None else f"was killed by signal {-code}" if code < 0 else f"exited ({code})"
-        )
+        how = "stopped answering" if code is None else ended_how(code)
         last = next((line for line in reversed(self._log) if line.strip()), "")
         return f"{how}; last log line: {last[:300]}" if last else how
 

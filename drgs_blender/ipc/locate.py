@@ -10,6 +10,8 @@ from ..core.errors import DeviceError
 
 #: Environment variable that names the engine: farms start Blender with factory settings.
 VARIABLE = "DRGS_ENGINE"
+#: Nothing of the user's own Python settings; what is printed is UTF-8, which on Windows it is not by itself.
+_ALONE = ("-I", "-Xutf8")
 
 
 def _interpreter_in(folder: Path) -> Path | None:
@@ -36,14 +38,14 @@ def engine_command(interpreter: str | os.PathLike[str] | None = None) -> list[st
 
     No setting of this process leaks in.
     """
-    python = own_python.command("-I") if interpreter is None else [os.fspath(interpreter), "-I"]
+    python = own_python.command(*_ALONE) if interpreter is None else [os.fspath(interpreter), *_ALONE]
     return [*python, "-m", "drgs_blender.engine"]
 
 
 def bundled_command(python: str | os.PathLike[str], site_packages: str | os.PathLike[str]) -> list[str]:
     """Command that runs the engine of this very package on `python`, with the packages of a folder."""
     script = Path(__file__).resolve().parents[1] / "cli" / "bundled.py"
-    return [os.fspath(python), "-I", str(script), os.fspath(site_packages), "-m", "drgs_blender.engine"]
+    return [os.fspath(python), *_ALONE, str(script), os.fspath(site_packages), "-m", "drgs_blender.engine"]
 
 
 def locate_engine(preference: str | os.PathLike[str] | None = None) -> list[str]:

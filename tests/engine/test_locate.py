@@ -36,7 +36,7 @@ def test_folder_interpreter_and_program_lead_to_the_interpreter(environment, mon
     if through == "variable":
         monkeypatch.setenv(VARIABLE, place)
     command = locate_engine(place if through == "preference" else None)
-    assert command == [str(environment / "bin/python3"), "-I", "-m", "drgs_blender.engine"]
+    assert command == [str(environment / "bin/python3"), "-I", "-Xutf8", "-m", "drgs_blender.engine"]
 
 
 def test_a_checkout_has_its_environment_in_it(environment, tmp_path):

@@ -41,7 +41,7 @@ def command(tmp_path):
     site.symlink_to(Path(spec.origin).parents[1], target_is_directory=True)
     whole = bundled_command(sys._base_executable, site)
     before = whole[: whole.index("-m")]
-    before[2] = str(folder / "drgs" / "drgs_blender" / "cli" / "bundled.py")
+    before[before.index("-Xutf8") + 1] = str(folder / "drgs" / "drgs_blender" / "cli" / "bundled.py")
     return before
 
 

@@ -166,6 +166,14 @@ def test_blender_that_does_not_start_is_said(tmp_path):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="uses a shell script as a program")
+def test_blender_may_print_what_is_no_text_here(tmp_path):
+    fake = tmp_path / "blender"
+    fake.write_bytes(b"#!/bin/sh\necho 'Ger\x81t'; echo 'Blender 4.2.0'\n")
+    fake.chmod(0o755)
+    assert find_blender(str(fake)).version() == "4.2.0"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="uses a shell script as a program")
 @pytest.mark.parametrize("place", ["bin/python", "blender"])
 def test_blender_may_be_named_by_its_folder(tmp_path, place):
     program = tmp_path / place

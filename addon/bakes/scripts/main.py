@@ -1,8 +1,8 @@
 """Runs inside the Blender that bakes: does the jobs that come as lines of JSON on standard input, one after another.
 
-Started as a plain script; nothing of the package is imported but `node_trees`, by its path. What Blender prints goes to
-standard error; answers are lines of JSON on the original standard output: of the job's key, and an error or none. The
-process ends with its parent, whose end of standard input is closed then.
+Started as a plain script; of the package `node_trees` and `core/system` alone are imported, by their path. What Blender
+prints goes to standard error; answers are lines of JSON on the original standard output: of the job's key, and an error
+or none. The process ends with its parent, whose end of standard input is closed then.
 """
 
 from __future__ import annotations
@@ -10,12 +10,14 @@ from __future__ import annotations
 import json
 import os
 import queue
+import runpy
 import sys
 import threading
 import traceback
 from pathlib import Path
 
 _FOLDER = Path(__file__).resolve().parent
+_SYSTEM = _FOLDER.parents[2] / "drgs_blender" / "core" / "system.py"
 sys.path[:0] = [str(_FOLDER), str(_FOLDER.parent)]
 
 
@@ -24,7 +26,7 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     jobs: queue.Queue[str] = queue.Queue()
-    threading.Thread(target=listen, args=(jobs,), daemon=True).start()
+    threading.Thread(target=listen, args=(runpy.run_path(str(_SYSTEM))["claim_input"](), jobs), daemon=True).start()
 
     import bpy
 
@@ -48,10 +50,11 @@ def main() -> None:
         print(json.dumps({"key": job["key"], "error": error}), file=answers, flush=True)
 
 
-def listen(jobs: queue.Queue[str]) -> None:
+def listen(pipe: int, jobs: queue.Queue[str]) -> None:
     """Take in jobs, also while one is done; end with the parent."""
-    for line in sys.stdin:
-        jobs.put(line)
+    with open(pipe, encoding="utf-8") as lines:
+        for line in lines:
+            jobs.put(line)
     os._exit(0)
 
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from ..errors import AssetError, WriteError
 from ..file_types import READ
+from ..system import WINDOWS, replace
 
 Array = np.ndarray
 
@@ -159,13 +160,17 @@ def _framing(members: Sequence[Member]) -> tuple[list[bytes], list[int], bytes]:
 
 
 def _map(path: Path) -> Array:
-    """The bytes of `path`, mapped read-only."""
+    """The bytes of `path`, mapped read-only; on Windows, where nobody could replace a mapped file, read."""
     try:
         about = path.stat()
         if not stat.S_ISREG(about.st_mode):  # a pipe or a device may never end
             raise AssetError(str(path), "cannot be read (it is no regular file)", "Choose a file")
         if (size := about.st_size) < _END.size:
             raise AssetError(str(path), f"is {size} bytes long, too short for a .drgs file", _RESTORE)
+        if WINDOWS:
+            data = np.fromfile(path, np.uint8)
+            data.flags.writeable = False
+            return data
         return np.asarray(np.memmap(path, dtype=np.uint8, mode="r"))
     except FileNotFoundError as error:
         raise AssetError(str(path), "does not exist", "Check the path, or find the missing file in Blender") from error
@@ -251,7 +256,7 @@ def replace_file(path: Path, parts: Iterable[bytes | memoryview]) -> None:
                     file.write(part)
                 file.flush()
                 os.fsync(file.fileno())
-            os.replace(temporary, target)
+            replace(temporary, target)
             _sync_folder(target.parent)
         finally:
             with suppress(OSError):  # after success it is gone already
@@ -271,7 +276,7 @@ def replace_by(path: Path, save: Callable[[Path], object]) -> None:
             save(temporary)
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
-            os.replace(temporary, target)
+            replace(temporary, target)
             _sync_folder(target.parent)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
@@ -304,7 +309,7 @@ def first_reason(text: str) -> str:
 
 def _sync_folder(folder: Path) -> None:
     """Make the new name durable where the system can (Windows cannot open folders)."""
-    if os.name == "nt":
+    if WINDOWS:
         return
     descriptor = os.open(folder, os.O_RDONLY)
     try:

@@ -27,6 +27,7 @@ from ...compute.threads import get_num_threads
 from ...core.cryptomatte import METADATA
 from ...core.errors import AssetError, UsageError, WriteError
 from ...core.passes import AOV_COLOUR, AOV_VALUE, BY_NAME, LIGHT_GROUP, Pass, pass_of
+from ...core.system import WINDOWS, replace
 
 Array = np.ndarray
 
@@ -76,7 +77,7 @@ def write_frame(path: str | Path, passes: dict[str, Array], metadata: dict[str, 
         _flush(temporary)
         _verify(temporary, channels, checksum)
         temporary.chmod(0o666 & ~_umask())
-        os.replace(temporary, path)
+        replace(temporary, path)
         with contextlib.suppress(OSError):  # the frame is there; some network disks cannot flush a folder
             _flush(path.parent)
     except _FAILURES as error:
@@ -208,9 +209,9 @@ def _verify(path: Path, channels: dict[str, Array], checksum: str) -> None:
 
 def _flush(path: Path) -> None:
     """Force a file, or where the system can do so a folder, to the disk."""
-    if path.is_dir() and os.name == "nt":
+    if path.is_dir() and WINDOWS:
         return
-    handle = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
+    handle = os.open(path, os.O_RDWR if WINDOWS else os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:
