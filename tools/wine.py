@@ -69,7 +69,7 @@ assert 1 << 28 < memory.available_memory() < memory.total_memory() < 1 << 45
 print("the system says how much memory there is")
 """
 #: One of two: a process that compiles the same kernels at the same time.
-PREPARE = ("-m", "drgs_blender.compute.prepare", "light groups")
+PREPARE = ("-m", "drgs_blender.compute.prepare", "motion")
 
 
 class Windows:
