@@ -202,7 +202,7 @@ def main() -> int:
             windows.drgs("relight", asset, "--env", light, "--size", "64", "--samples", "4", "--cache",
                          there / "Bäcker", "--frames", "4", "--out", there / "falling.png")  # fmt: skip
         with trial("formats", failures):
-            for suffix in (".ply", ".glb", ".spz", ".obj"):
+            for suffix in (".ply", ".spz", ".sog", ".glb"):
                 windows.drgs("convert", asset, there / f"cow{suffix}")
                 windows.drgs("inspect", there / f"cow{suffix}")
     return int(bool(failures))

@@ -123,7 +123,8 @@ def read(path: Path) -> Baked:
         It cannot be read, or is damaged.
     """
     try:
-        with np.load(path, allow_pickle=False) as data:
+        # NumPy leaves a damaged file open, and Windows lets nobody replace it then
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
             found = {name: data[name] for name in data.files}  # the checksum of each is compared
     except (zipfile.BadZipFile, EOFError, KeyError, SyntaxError, MemoryError, NotImplementedError) as error:
         raise ValueError(str(error) or type(error).__name__) from error

@@ -231,6 +231,19 @@ def test_results_are_kept_by_content(scene, bake, jobs, folder):
     assert len(jobs) == 2
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_a_damaged_result_is_not_left_open(tmp_path):
+    """On Windows it could not be made again."""
+    path = tmp_path / "cut.npz"
+    np.savez(path, map=np.zeros(300))
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(ValueError) as error:
+        part("addon.bakes.store").read(path)
+    assert error.value.__cause__ is not None, "what holds the file is alive"
+    links = (f"/proc/self/fd/{name}" for name in os.listdir("/proc/self/fd"))
+    assert str(path) not in {os.readlink(link) for link in links if os.path.lexists(link)}
+
+
 @pytest.mark.parametrize("damage", ["empty", "cut", "flipped", "other", "foreign"])
 def test_a_damaged_result_is_made_again(scene, bake, jobs, folder, damage):
     gradient(scene, "")
