@@ -25,7 +25,7 @@ SHIPPED = Path(__file__).with_name("kernels")
 #: What kernels' modules import and machine code does not depend on, or only through the target's name.
 NEUTRAL = frozenset(f"drgs_blender/{name}.py" for name in (
     "compute/closure", "compute/folders", "compute/shipped", "compute/targets", "core/errors", "core/file_lock",
-    "core/user_cache", "core/version",
+    "core/system", "core/user_cache", "core/version",
 ))  # fmt: skip
 _DIGITS = 16
 _MOST_ROWS = 4000

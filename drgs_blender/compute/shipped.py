@@ -66,6 +66,8 @@ def versions() -> dict[str, str]:
 def _archive() -> zipfile.ZipFile | None:
     if not is_on("DRGS_SHIPPED", True):
         return None
+    from . import jit  # noqa: F401 - settles the target; a process that prepares has not imported it yet
+
     path = FOLDER / archive_name(targets.current())
     try:
         return zipfile.ZipFile(path)

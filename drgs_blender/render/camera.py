@@ -98,7 +98,7 @@ def camera_parameters(camera: Camera, settings: RenderSettings, noise_index: int
     out[FX], out[FY], out[CX], out[CY] = camera.fx, camera.fy, camera.cx, camera.cy
     out[ORTHOGRAPHIC] = camera.orthographic
     out[CLIP_START], out[CLIP_END], out[WIDTH] = camera.clip_start, camera.clip_end, camera.width
-    out[SEED] = mix(np.uint32(settings.seed & 0xFFFFFFFF) ^ mix(np.uint32(noise_index & 0xFFFFFFFF)))
+    out[SEED] = mix(np.uint32(settings.seed & 0xFFFFFFFF) ^ np.uint32(mix(np.uint32(noise_index & 0xFFFFFFFF))))
     out[SUBPIXELS] = settings.subpixel_count
     out[LEAN : LEAN + 2] = lean(camera)
     out[FILTER] = settings.filter_width

@@ -71,6 +71,14 @@ def kept(folder: Path) -> list[Path]:
     return list(folder.glob("*/*.kernel"))
 
 
+def test_a_process_that_has_compiled_nothing_looks_into_the_same_archive(release):
+    """That of ``compute.prepare``, the last step of *Set Up Engine*, asks before anything has set Numba up."""
+    code = "import pathlib, sys; from drgs_blender.compute import shipped; shipped.FOLDER = pathlib.Path(sys.argv[1]); "
+    code += "print(shipped.brings_any())"
+    done = subprocess.run([sys.executable, "-c", code, release.parent], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.strip() == "True", done.stderr
+
+
 def test_a_shipped_kernel_is_not_compiled(release, compiled, tmp_path):
     assert njit(_twice)(2.0) == 5.0
     assert compiled == [] and kept(tmp_path / "cache") == []
