@@ -23,6 +23,7 @@ import numpy as np
 
 from ..drgs_blender.core.asset.archive import replace_file
 from ..drgs_blender.core.errors import AssetError, DrgsError, UsageError, WriteError
+from ..drgs_blender.core.frame import Inside
 from ..drgs_blender.core.particle_cache import HEADER, Header, ParticleCache
 from . import point_caches
 from .point_caches import MAGIC, PC2
@@ -204,15 +205,26 @@ def path_of(obj: bpy.types.Object, modifier: bpy.types.Modifier) -> Path:
 
 
 def fracture_state(obj: bpy.types.Object) -> dict[str, Any]:
-    """`tear` and `grain` of the played mesh, see `frame.ObjectState`; empty where nothing is played."""
+    """`tear`, `grain` and `inside` of the played mesh, see `frame.ObjectState`; empty where nothing is played."""
     modifier, physics = modifier_of(obj), obj.drgs.physics
     if modifier is None:
         return {}
     with suppress(DrgsError):  # a damaged cache plays all the same; the next bake says it
         header = ParticleCache(path_of(obj, modifier).parent).header()
         if header is not None:
-            return {"tear": header.tear * physics.tear, "grain": header.grain * physics.grain}
+            given = {"tear": header.tear * physics.tear, "grain": header.grain * physics.grain}
+            return given | {"inside": _inside(physics)}
     return {}
+
+
+def _inside(physics: bpy.types.PropertyGroup) -> Inside | None:
+    """The material inside; None where nothing is to be closed."""
+    if not physics.tear or physics.inside == "open":
+        return None
+    if physics.inside == "automatic":
+        return Inside()
+    red, green, blue = physics.inside_colour
+    return Inside((red, green, blue), physics.inside_roughness, physics.inside_metallic)
 
 
 def attach(obj: bpy.types.Object, path: Path, first: int) -> None:

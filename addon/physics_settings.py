@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import bpy
 from bpy.props import (
     BoolProperty,
@@ -16,42 +14,16 @@ from bpy.props import (
     StringProperty,
 )
 
-from ..drgs_blender.core.sim_materials import MATERIALS
 from . import blend_paths
+from .physics_materials import MaterialNumbers
 from .property_limits import tag_changed
 
-#: Numbers of every material, and those that some models have besides.
-BASIC = ("youngs_modulus", "poisson", "density")
-OF_MODEL = {
-    "plastic": ("yield_stress", "hardening", "viscosity"),
-    "sand": ("friction_angle", "cohesion"),
-    "snow": ("compression", "stretch", "hardening"),
-    "fluid": ("viscosity",),
-}
-#: Numbers that Blender keeps in radians and the engine in degrees.
-ANGLES = ("friction_angle",)
-_FIRST = MATERIALS["jelly"]
-
-MATERIAL_ITEMS = [(name, name.title(), row.about[:1].upper() + row.about[1:]) for name, row in MATERIALS.items()]
 CONTACT_ITEMS = (
     ("separate", "Separate", "The object slides with friction and may leave the surface"),
     ("slip", "Slip", "The object slides without friction and stays on the surface"),
     ("sticky", "Sticky", "What touches the surface sticks to it"),
 )
 WALL_ITEMS = (("open", "Open", "Particles that leave the domain stop the bake with a message"), *CONTACT_ITEMS)
-
-
-def numbers_of(material: str) -> tuple[str, ...]:
-    """The numbers that count for a material of the table."""
-    return BASIC + OF_MODEL.get(MATERIALS[material].model, ())
-
-
-def _take_preset(settings: _MaterialNumbers, context: bpy.types.Context) -> None:
-    """Fill the numbers in when another material is chosen."""
-    row = MATERIALS[settings.material]
-    for name in BASIC + tuple({n for names in OF_MODEL.values() for n in names}):
-        value = getattr(row, name)
-        setattr(settings, name, math.radians(value) if name in ANGLES else value)
 
 
 def _take_range(settings: DrgsPhysicsSettings, context: bpy.types.Context) -> None:
@@ -62,105 +34,7 @@ def _take_range(settings: DrgsPhysicsSettings, context: bpy.types.Context) -> No
         settings.frame_start, settings.frame_end = scene.frame_start, scene.frame_end
 
 
-class _MaterialNumbers:
-    """A material: a row of the engine's table and the numbers of it."""
-
-    material: EnumProperty(
-        name="Material",
-        description="Material. Choosing one sets its parameters",
-        items=MATERIAL_ITEMS,
-        default=_FIRST.name,
-        update=_take_preset,
-        options=set(),
-    )
-    youngs_modulus: FloatProperty(
-        name="Young's Modulus",
-        description="Stiffness, pascals. A hundred times as stiff takes ten times as long",
-        min=1.0,
-        soft_min=1e3,
-        soft_max=1e8,
-        max=1e12,
-        default=_FIRST.youngs_modulus,
-        precision=0,
-        step=100,
-    )
-    poisson: FloatProperty(
-        name="Poisson's Ratio",
-        description="How much it bulges when it is squeezed: 0 not at all, 0.49 keeps its volume",
-        min=0.0,
-        max=0.495,
-        default=_FIRST.poisson,
-        precision=3,
-    )
-    density: FloatProperty(
-        name="Density (kg/m³)",
-        description="Kilograms per cubic metre",
-        min=0.01,
-        max=1e5,
-        soft_max=1e4,
-        default=_FIRST.density,
-        precision=0,
-        step=100,
-    )
-    yield_stress: FloatProperty(
-        name="Yield Stress (Pa)",
-        description="Stress beyond which deformation is permanent, pascals",
-        min=0.0,
-        max=1e12,
-        soft_max=1e7,
-        precision=0,
-        step=100,
-    )
-    hardening: FloatProperty(
-        name="Hardening",
-        description="Metal, clay and foam: pascals that the yield stress gains as it deforms, less than 0 softens. "
-        "Snow: how fast it gets hard when pressed",
-        soft_min=-1e6,
-        soft_max=1e6,
-        precision=1,
-        step=100,
-    )
-    viscosity: FloatProperty(
-        name="Viscosity (Pa s)",
-        description="Resistance to flowing, pascal seconds: water 0, honey 300",
-        min=0.0,
-        max=1e6,
-        soft_max=1e3,
-    )
-    friction_angle: FloatProperty(
-        name="Friction Angle",
-        description="The slope at which a pile of it comes to rest",
-        subtype="ANGLE",
-        min=0.0,
-        max=math.radians(89),
-    )
-    cohesion: FloatProperty(
-        name="Cohesion",
-        description="Volumetric strain, as a share of the volume, at which it comes apart",
-        min=0.0,
-        max=1.0,
-        soft_max=0.1,
-        precision=4,
-    )
-    compression: FloatProperty(
-        name="Crush Limit",
-        description="Compression, as a share of the length, beyond which snow is crushed for good",
-        min=1e-5,
-        max=1.0,
-        default=_FIRST.compression,
-        precision=4,
-    )
-    stretch: FloatProperty(
-        name="Break Limit",
-        description="Stretch, as a share of the length, beyond which snow breaks",
-        min=1e-5,
-        max=1.0,
-        default=_FIRST.stretch,
-        precision=4,
-    )
-
-
-class DrgsPhysicsRegion(_MaterialNumbers, bpy.types.PropertyGroup):
+class DrgsPhysicsRegion(MaterialNumbers, bpy.types.PropertyGroup):
     """A part of the object with another material."""
 
     group: StringProperty(
@@ -197,7 +71,7 @@ class DrgsPhysicsCollider(bpy.types.PropertyGroup):
     )
 
 
-class DrgsPhysicsSettings(_MaterialNumbers, bpy.types.PropertyGroup):
+class DrgsPhysicsSettings(MaterialNumbers, bpy.types.PropertyGroup):
     """Material, forces, colliders and frames of a simulated object.
 
     Animated and driven values count as they are in the first frame.
@@ -246,8 +120,68 @@ class DrgsPhysicsSettings(_MaterialNumbers, bpy.types.PropertyGroup):
     )
     tear: BoolProperty(
         name="Open Tears",
-        description="Leave out faces that span a gap where the material has come apart, with their splats",
+        description="Part the mesh where the material has come apart, instead of stretching it over the gap",
         default=True,
+        update=tag_changed,
+        options=set(),
+    )
+    surface: EnumProperty(
+        name="Surface",
+        description="What is shown of the simulated object",
+        items=(
+            (
+                "automatic",
+                "Automatic",
+                "Fluids by a surface around their particles, everything else by mesh and splats",
+            ),
+            ("mesh", "Mesh", "The object's mesh and splats, which the particles move"),
+            ("particles", "Particles", "A surface around the particles, in the object's colours; splats are not shown"),
+        ),
+        update=tag_changed,
+        options=set(),
+    )
+    inside: EnumProperty(
+        name="Inside",
+        description="What is seen where the material has come apart",
+        items=(
+            (
+                "automatic",
+                "As Outside",
+                "Pieces are closed; inside they have the mean colour and material of the object",
+            ),
+            ("own", "Own Material", "Pieces are closed; inside they have a colour and material of their own"),
+            ("open", "Hollow", "No faces are made: one looks into the pieces as into shells"),
+        ),
+        update=tag_changed,
+        options=set(),
+    )
+    inside_colour: FloatVectorProperty(
+        name="Base Color",
+        description="Colour of the inside",
+        subtype="COLOR",
+        min=0.0,
+        max=1.0,
+        default=(0.5, 0.5, 0.5),
+        update=tag_changed,
+        options=set(),
+    )
+    inside_roughness: FloatProperty(
+        name="Roughness",
+        description="Roughness of the inside",
+        subtype="FACTOR",
+        min=0.0,
+        max=1.0,
+        default=0.8,
+        update=tag_changed,
+        options=set(),
+    )
+    inside_metallic: FloatProperty(
+        name="Metallic",
+        description="How metallic the inside is",
+        subtype="FACTOR",
+        min=0.0,
+        max=1.0,
+        default=0.0,
         update=tag_changed,
         options=set(),
     )

@@ -92,8 +92,8 @@ class DrgsObjects:
         cage_nodes.check(obj, self._depsgraph, self._warn)
         cache_playback.check(obj, self._warn, final=self._depsgraph.mode == "RENDER")
         appearance = (
-            obj.drgs.show_captured, obj.drgs.adjustment.values(), *cache_playback.fracture_state(obj).items(),
-            obj.drgs.physics.driven_by, surfel_points.state_of(obj),
+            obj.drgs.show_captured, obj.drgs.adjustment.values(), str(cache_playback.fracture_state(obj)),
+            obj.drgs.physics.driven_by, obj.drgs.physics.surface, surfel_points.state_of(obj),
         )  # fmt: skip
         shape = self._cache.get(
             ("object", uid(obj), obj.name, obj.data.as_pointer(), obj.mode, str(assets.file_of(obj)), appearance),
@@ -171,7 +171,8 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
             state.adjustment = None if captured else _adjustment(obj, mesh, None, warn)
             given = mesh_arrays.read_vertices(mesh), proxies.read_rest(mesh)
             proxies.check(obj, given[1], warn, final=depsgraph.mode == "RENDER")
-            if state.proxy is not None and (particles := particles_of(obj, depsgraph, *given, warn)) is not None:
+            particles = None if state.proxy is None else particles_of(obj, depsgraph, *given, warn)
+            if particles is not None and particles.surfels:
                 state.proxy, state.particles = None, replace(particles, all=True)
             return state
         point_caches.check(obj, asset.mesh, warn, final=depsgraph.mode == "RENDER")
@@ -186,7 +187,10 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
             if array is not None:
                 array.flags.writeable = False  # so that the engine's client need not copy it
         appearance = cache_playback.fracture_state(obj)
-        appearance["particles"] = particles_of(obj, depsgraph, vertices, fit.rest(asset.mesh, len(vertices)), warn)
+        particles = particles_of(obj, depsgraph, vertices, fit.rest(asset.mesh, len(vertices)), warn)
+        if particles is not None and particles.began is not None:
+            particles = replace(particles, began=fit.of_part(particles.began))
+        appearance["particles"] = particles
         adjustment = None if captured else _adjustment(obj, mesh, fit, warn)
         return ObjectState(
             name=obj.name, asset=key_of(path), part=fit.part, adjustment=adjustment, **arrays, **appearance

@@ -30,7 +30,9 @@ _MOST = 16
 def particles_of(
     obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, vertices: Array, rest: Array, warn: Warn
 ) -> Particles | None:
-    """What carries the splats of an evaluated object besides the faces of its mesh; None: they alone do.
+    """What carries the splats of an evaluated object besides the faces of its mesh, or says only what has broken.
+
+    None: faces alone carry splats, and nothing that breaks is closed.
 
     Parameters
     ----------
@@ -43,9 +45,13 @@ def particles_of(
     warn : callable
         Told why particles that were asked for, or are there, carry nothing.
     """
-    modifier, wanted = cache_playback.modifier_of(obj), obj.drgs.physics.driven_by
-    if wanted == "surface" or modifier is None or not len(vertices):
+    physics, modifier = obj.drgs.physics, cache_playback.modifier_of(obj)
+    wanted, closes = physics.driven_by, physics.tear and physics.inside != "open"
+    if (wanted == "surface" and not closes and physics.surface == "mesh") or modifier is None or not len(vertices):
         return None
+    follow = "splats follow the mesh" if wanted != "surface" else "what it tears apart is hollow"
+    if closes and wanted != "surface":
+        follow += ", and what is torn is hollow"
     if not (modifier.show_render if depsgraph.mode == "RENDER" else modifier.show_viewport):
         return None
     path = cache_playback.path_of(obj, modifier)
@@ -54,32 +60,47 @@ def particles_of(
         header = cache.header()
         if header is None:
             return None  # told by `cache_playback.check`
-        if not header.keeps_shape:
+        skin = physics.surface == "particles" or (physics.surface == "automatic" and header.is_fluid)
+        if skin and header.cells is None:
+            warn(f'"{obj.name}": was baked before particles had a surface, so its mesh is shown, stretched. Bake again')
+            skin = False
+        closes = closes and header.keeps_shape and not skin
+        if wanted == "surface" and not (closes or skin):
+            return None
+        if not header.keeps_shape and not skin:
             if wanted == "particles":
                 warn(f'"{obj.name}": its material flows, so no particle knows how it deforms; splats follow the mesh')
             return None
+        if closes and header.cells is None:
+            warn(f'"{obj.name}": was baked before pieces were closed, so what is torn is hollow. Bake again')
+            if wanted == "surface":
+                return None
         played = cache_playback.Played(path, header)
         frame = _frame_of(modifier, header, depsgraph.scene_eval)
         points, began = _rest_of(cache, header)
         particles, shown = cache.driving(frame, points, last=played.last, place=_placing(played))
     except (DrgsError, OSError) as error:
-        warn(f'"{obj.name}": splats follow the mesh, as particles cannot be read: {error}')
+        warn(f'"{obj.name}": {follow}, as particles cannot be read: {error}')
         return None
-    if not _same_places(began, rest):
-        if wanted == "particles":
-            warn(
-                f'"{obj.name}": its simulation begins with another shape than the captured one (posed, or edited), '
-                "so splats follow the mesh; Driven By: Surface says so for good"
-            )
+    posed = not skin and not _same_places(began, rest)
+    if posed and wanted == "particles":
+        warn(
+            f'"{obj.name}": its simulation begins with another shape than the captured one (posed, or edited), '
+            "so splats follow the mesh; Driven By: Surface says so for good"
+        )
+    if posed and (not closes or began.shape != vertices.shape):
         return None
     moved = _moved(particles, _affine(shown, vertices))
     if moved is None:
         warn(
             f'"{obj.name}": its mesh is not as the simulation has it in this frame (modifiers after '
-            f'"{modifier.name}", or edits), so splats follow the mesh; Driven By: Surface says so for good'
+            f'"{modifier.name}", or edits), so {follow}; Driven By: Surface and Inside: Hollow say so for good'
         )
         return None
-    return replace(moved, all=wanted == "particles")
+    cells = np.array(header.cells, np.float64) if header.cells is not None and (closes or skin) else None
+    carries = wanted != "surface" and header.keeps_shape and not posed
+    mesh = began if posed else None
+    return replace(moved, all=wanted == "particles", cells=cells, surfels=carries, skin=skin, began=mesh)
 
 
 def _frame_of(modifier: bpy.types.Modifier, header: Header, scene: bpy.types.Scene) -> float:

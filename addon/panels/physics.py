@@ -10,7 +10,8 @@ from ...drgs_blender.core.errors import DrgsError
 from ...drgs_blender.core.sim_materials import MATERIALS
 from .. import assets
 from ..physics import bake_job, bake_time, cache_state, coupling, particle_display
-from ..physics_settings import DrgsPhysicsRegion, DrgsPhysicsSettings, numbers_of
+from ..physics_materials import numbers_of
+from ..physics_settings import DrgsPhysicsRegion, DrgsPhysicsSettings
 from .text_layout import bar_text, wrapped
 
 
@@ -83,8 +84,16 @@ class DRGS_PT_physics(_Physics, bpy.types.Panel):
         _draw_material(column, physics)
         column.prop(physics, "solver")
         column.prop(physics, "resolution")
+        column.prop(physics, "surface")
         column.prop(physics, "driven_by")
         column.prop(physics, "tear")
+        if MATERIALS[physics.material].keeps_shape:
+            inside = column.column()
+            inside.active = physics.tear
+            inside.prop(physics, "inside")
+            if physics.inside == "own":
+                for name in ("inside_colour", "inside_roughness", "inside_metallic"):
+                    inside.prop(physics, name)
         if MATERIALS[physics.material].grain:
             column.prop(physics, "grain")
         row = self.layout.row(align=True)

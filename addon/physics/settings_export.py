@@ -14,7 +14,8 @@ import numpy as np
 from ...drgs_blender.core.errors import UsageError
 from ...drgs_blender.core.sim_materials import MATERIALS
 from .. import cache_playback
-from ..physics_settings import ANGLES, DrgsPhysicsSettings, numbers_of
+from ..physics_materials import ANGLES, numbers_of
+from ..physics_settings import DrgsPhysicsSettings
 
 #: Where to look for the settings, in messages.
 PANEL = "Physics > DR-GS Physics"

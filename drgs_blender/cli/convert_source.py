@@ -282,7 +282,9 @@ class FrameSource:
             values = {channel: getattr(traced, channel) for channel in BASE_CHANNELS} | item.channels
             mesh = replace(mesh, **values, textures=mesh.textures if bare else None)
             if traced.torn is not None and traced.torn.any():
-                self.notes.append(f"{name}: has torn faces, which are written stretched over the gap")
+                self.notes.append(f"{name}: has torn faces, which are written stretched over the gap, not closed")
+            if state.particles is not None and state.particles.skin:
+                self.notes.append(f"{name}: is shown by a surface of its particles; its own mesh is written instead")
         splats = None
         if surfels or mesh is None:
             if self._args.colour == "relit":

@@ -23,7 +23,7 @@ from ..core import cryptomatte
 from ..core.asset import Asset
 from ..core.asset.model import Mesh
 from ..core.errors import UsageError
-from ..core.frame import Camera, Frame, ObjectState, Particles, ProxyMesh, RenderSettings, World
+from ..core.frame import Camera, Frame, Inside, ObjectState, Particles, ProxyMesh, RenderSettings, World
 from ..core.frame_sequences import frame_path
 from ..core.loading import many_imports
 from ..core.particle_cache import ParticleCache
@@ -97,6 +97,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "the mesh (default)",
     )  # fmt: skip
     parser.add_argument(
+        "--inside", type=_inside, default=Inside(), metavar="R,G,B[,ROUGHNESS[,METALLIC]]",
+        help="material inside of what CACHE has torn apart, linear colour; open: pieces are hollow; default: the means "
+        "of the asset",
+    )  # fmt: skip
+    parser.add_argument(
+        "--surface", choices=("automatic", "mesh", "particles"), default="automatic",
+        help="what is shown of CACHE: the asset's mesh and surfels, or a surface around the particles; automatic: that "
+        "of fluids (default)",
+    )  # fmt: skip
+    parser.add_argument(
         "--frames", metavar="RANGE", help="of CACHE or V: 12, 1-24, 1-24x2; default: all that are there"
     )
     sampling.add_arguments(parser, defaults=True)
@@ -116,6 +126,16 @@ def positive(text: str) -> float:
     if value <= 0:
         raise argparse.ArgumentTypeError(f"{text} is not above 0")
     return value
+
+
+def _inside(text: str) -> Inside | None:
+    """Parser of a material: colour, roughness, metallic."""
+    if text == "open":
+        return None
+    values = [sampling.number(word) for word in text.split(",")]
+    if len(values) not in (3, 4, 5) or not all(0 <= value <= 1 for value in values):
+        raise argparse.ArgumentTypeError(f"{text} is not open, nor R,G,B[,ROUGHNESS[,METALLIC]] from 0 to 1")
+    return Inside((values[0], values[1], values[2]), *values[3:])
 
 
 def run(args: argparse.Namespace) -> int:
@@ -139,7 +159,9 @@ def run(args: argparse.Namespace) -> int:
         world = World(strength=0.0)
     else:
         world = World(read_environment(args, asset), rotation_z(args.env_rotation), strength=args.env_strength)
-    state = ObjectState(args.asset.stem, key, tear=tear, grain=grain, captured_colours=args.captured)
+    state = ObjectState(
+        args.asset.stem, key, tear=tear, grain=grain, captured_colours=args.captured, inside=args.inside
+    )
     carrier = _carrier(args, asset)
     warned = False
     for number, give_pose in poses:
@@ -291,12 +313,24 @@ def _poses(args: argparse.Namespace) -> tuple[Sequence[tuple[int, Callable[[], _
     if missing := sorted(set(frames) - set(cache.frames())):
         cache.read(missing[0])  # says which are there
     check_template(str(args.out), frames)
-    driven = args.driven_by if header.keeps_shape else "surface"
-    if driven == "surface":
+    driven, skin = args.driven_by, args.surface == "particles" or (args.surface == "automatic" and header.is_fluid)
+    driven = driven if header.keeps_shape else "surface"
+    if skin and header.cells is None:
+        problem = "was baked before particles had a surface"
+        if args.surface == "particles":
+            raise UsageError(f"--cache {args.cache}", problem, "Bake again")
+        logger.warning("%s %s: the mesh is shown, stretched. Bake again", args.cache, problem)
+        skin = False
+    closes = header.keeps_shape and args.inside is not None and not skin
+    if closes and header.cells is None:
+        logger.warning("%s was baked before pieces were closed: what is torn is hollow. Bake again", args.cache)
+    if driven == "surface" and not skin and (not closes or header.cells is None):
         give = [(frame, partial(_by_mesh, partial(_vertices, cache, frame))) for frame in frames]
     else:
         rest = np.array(cache.rest().points)
-        give = [(frame, partial(_simulated, cache, frame, rest, driven == "particles")) for frame in frames]
+        cells = None if header.cells is None else np.array(header.cells, np.float64)
+        shown = Particles(rest, rest, rest, driven == "particles", cells, driven != "surface", skin)
+        give = [(frame, partial(_simulated, cache, frame, shown)) for frame in frames]
     return give, (header.tear, header.grain)
 
 
@@ -308,9 +342,9 @@ def _vertices(cache: ParticleCache, frame: int) -> np.ndarray:
     return cache.read(frame).vertices
 
 
-def _simulated(cache: ParticleCache, frame: int, rest: np.ndarray, whole: bool) -> _Pose:
-    particles, vertices = cache.driving(frame, rest)
-    return vertices, replace(particles, all=whole)
+def _simulated(cache: ParticleCache, frame: int, shown: Particles) -> _Pose:
+    particles, vertices = cache.driving(frame, shown.rest)
+    return vertices, replace(shown, points=particles.points, gradients=particles.gradients)
 
 
 def read_environment(args: argparse.Namespace, asset: Asset) -> np.ndarray:

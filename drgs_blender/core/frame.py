@@ -147,12 +147,42 @@ class Particles:
     all : bool
         Whether they carry all surfels; else only those that do not lie on the mesh, which moves with the particles, or
         that it smears.
+    cells : (4, 4) float64 array, optional
+        Brings places at rest to the lattice that the particles fill, of cells with sides of 1: by it is known which are
+        neighbours, and so what has broken.
+    surfels : bool
+        Whether they carry surfels; else they say only what has broken.
+    began : (n, 3) float32 array, optional
+        Metres, vertices of the object's mesh when the particles were at rest; None: as in the asset.
+    skin : bool
+        Whether camera and rays meet a surface around them in place of mesh and surfels, as of fluids; needs ``cells``.
     """
 
     rest: Array
     points: Array
     gradients: Array
     all: bool = False
+    cells: Array | None = None
+    surfels: bool = True
+    skin: bool = False
+    began: Array | None = None
+
+
+@dataclass(slots=True)
+class Inside:
+    """Material of what was inside of matter, seen where it has broken.
+
+    Attributes
+    ----------
+    base_colour : tuple of float, optional
+        Linear Rec.709; None: the mean albedo of the object.
+    roughness, metallic : float, optional
+        In [0, 1]; None: the means of the object, of the roughness at least 0.5.
+    """
+
+    base_colour: tuple[float, float, float] | None = None
+    roughness: float | None = None
+    metallic: float | None = None
 
 
 @dataclass(slots=True)
@@ -225,6 +255,9 @@ class ObjectState:
         What carries the surfels; None: their faces do. Rays meet the mesh as ``vertices`` have it.
     proxy : ProxyMesh, optional
         What carries the surfels of an asset without a mesh, in place of particles.
+    inside : Inside, optional
+        Where the particles know of their lattice: pieces that have come apart are closed, by faces of this material
+        inside; None: they are open shells.
     """
 
     name: str
@@ -252,6 +285,7 @@ class ObjectState:
     part: Part | None = None
     particles: Particles | None = None
     proxy: ProxyMesh | None = None
+    inside: Inside | None = None
 
 
 @dataclass(slots=True)

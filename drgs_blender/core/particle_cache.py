@@ -29,7 +29,7 @@ from .sim_materials import LOOSE
 
 Array = np.ndarray
 
-VERSION = 1
+VERSION = 2
 HEADER, _REST, _STATE = "cache.json", "rest.drgp", "state.drgp"
 _NAME = re.compile(r"frame_(-?\d+)\.drgp")
 _AGAIN = "Bake again"
@@ -57,6 +57,8 @@ class Header:
         JSON-able, as they were given.
     tear, grain : float
         See `frame.ObjectState`.
+    cells : list of list of float, optional
+        See `frame.Particles`; caches of version 1 have none.
     """
 
     digest: str
@@ -69,14 +71,24 @@ class Header:
     tear: float = 0.0
     grain: float = 0.0
     moves: list[str] = field(default_factory=list)
+    cells: list[list[float]] | None = None
+
+    @property
+    def is_fluid(self) -> bool:
+        """Whether all of the matter is fluid."""
+        return all(isinstance(row, dict) and row.get("model") == "fluid" for row in self._materials)
 
     @property
     def keeps_shape(self) -> bool:
         """Whether none of the matter flows: only then do its particles know how space around them deforms."""
+        return all(isinstance(row, dict) and row.get("model") not in LOOSE for row in self._materials)
+
+    @property
+    def _materials(self) -> list[Any]:
+        """That of the body and those of its regions, as far as they are known."""
         settings = self.settings if isinstance(self.settings, dict) else {}
         regions = settings.get("regions") or ()
-        given = [settings.get("material"), *(row[-1] if isinstance(row, list) and row else None for row in regions)]
-        return all(isinstance(row, dict) and row.get("model") not in LOOSE for row in given)
+        return [settings.get("material"), *(row[-1] if isinstance(row, list) and row else None for row in regions)]
 
 
 @dataclass(slots=True)
@@ -176,7 +188,7 @@ class ParticleCache:
             header = Header(**json.loads(text))
         except (ValueError, TypeError) as error:
             raise AssetError(str(path), "is not the header of a particle cache", _AGAIN) from error
-        if header.version != VERSION:
+        if header.version not in (1, VERSION):
             raise AssetError(str(path), f"is of version {header.version}, not {VERSION}", "Use the DR-GS that baked it")
         return header
 

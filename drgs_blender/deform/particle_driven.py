@@ -128,6 +128,17 @@ class ParticleDriven:
         self.hidden_count = int(np.count_nonzero(hidden))
 
 
+def place(rest: Frames, centre: Array, gradients: Array, matrix_world: Array) -> Frames:
+    """Surfels in the world at `centre` (n, 3) of object space, deformed by `gradients` (n, 3, 3) since rest."""
+    n, linear = len(centre), np.ascontiguousarray(matrix_world[:3, :3], np.float64)
+    out = Frames(*(np.zeros((n, 3), np.float32) for _ in Frames._fields))
+    affine = linear, np.array(matrix_world[:3, 3], np.float64), -1.0 if np.linalg.det(linear) < 0 else 1.0
+    ones, none = np.ones(n, np.float32), np.zeros(n, np.bool_)
+    carried = np.ascontiguousarray(centre, np.float32), np.ascontiguousarray(gradients, np.float32).reshape(-1, 9)
+    _place(0, n, carried, (*rest, ones, none), affine, (*out, ones.copy()), none.copy())
+    return out
+
+
 def on_the_mesh(mesh: Mesh, binding: Binding, centre: Array, spacing: float) -> Array:
     """Which surfels follow the faces of the mesh at least as well as particles that move it.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,13 +12,16 @@ from ..core.asset.model import PosedSurfels
 from ..core.frame import MeshState, ObjectState
 from ..core.level_of_detail import Detail
 from ..core.materials import Image
+from ..deform.closed_matter import ClosedMatter
 from ..render.scene.ray_masks import CAMERA, group_mask
 from ..render.scene.trace_scene import ObjectMesh, TraceObject
 from ..render.surfels.captured import CapturedObject
+from .broken_matter import inside_mesh
 from .captured_objects import glowing_mesh
 from .loaded_assets import LoadedAsset
 from .object_meshes import channels_of, object_mesh, stub
 from .optional_channels import optional_channels
+from .particle_surfaces import Skin, skin_mesh
 from .scene_objects import material_faults, traced_object
 
 
@@ -30,6 +33,8 @@ class CachedObject:
     its own, or with `channels` that rays meet, has a `mesh` with `images` and the optional channels `shown`; `met` is
     what stands for the object in the scene. Of a thin one light meets `sheet`. Its surfels may have `emission` (n, 3).
     Of the surfels, `lost` are left out as the particles that carry them are not finite.
+    Where its matter has broken, `inside` are the faces made there, and `closed` says what else is different.
+    Where its particles have a `skin`, that is its `mesh`.
     It has `levels` of fewer surfels by their number; of these each has the `detail` by which they grow.
     """
 
@@ -47,11 +52,19 @@ class CachedObject:
     sheet: MeshState | None = None
     mesh: ObjectMesh | None = None
     images: list[Image] = field(default_factory=list)
+    closed: ClosedMatter | None = None
+    inside: ObjectMesh | None = None
+    skin: Skin | None = None
     emission: Array | None = None
     channels: dict[str, Array] = field(default_factory=dict)
     shown: frozenset[str] = frozenset()
     levels: dict[int, CachedObject] = field(default_factory=dict)
     detail: Detail | None = None
+
+    @property
+    def meshes(self) -> tuple[MeshState | None, ...]:
+        """What is laid out as a mesh of it."""
+        return self.glowing, self.sheet, self.mesh, self.inside
 
     @property
     def sheeted(self) -> bool:
@@ -61,7 +74,7 @@ class CachedObject:
     @property
     def seen_by_mesh(self) -> bool:
         """Whether the camera sees its mesh, not its surfels."""
-        return self.mesh is not None and self.mesh.clear
+        return self.mesh is not None and self.mesh.ordinary
 
 
 def surfel_mask(item: CachedObject) -> int:
@@ -81,7 +94,10 @@ def emission_of(objects: Sequence[CachedObject]) -> Array | None:
     return np.concatenate(rows)
 
 
-def begun(state: ObjectState, loaded: LoadedAsset, mode: tuple[bool, bool, bool, bool], index: int) -> CachedObject:
+def begun(
+    state: ObjectState, loaded: LoadedAsset, mode: tuple[bool, bool, bool, bool], index: int,
+    closed: ClosedMatter | None = None, skin: Skin | None = None,
+) -> CachedObject:  # fmt: skip
     """An object that is new or has changed, without its surfels.
 
     Parameters
@@ -93,24 +109,53 @@ def begun(state: ObjectState, loaded: LoadedAsset, mode: tuple[bool, bool, bool,
         light meets sheets.
     index : int
         Of the object in the frame.
+    closed : ClosedMatter, optional
+        Where its matter has broken.
+    skin : Skin, optional
+        The surface of its particles, which stands for it.
     """
     met, shown, textured, sheeted = mode
     asset = loaded.asset
     channels = {} if shown else optional_channels(state, asset)
-    traced = traced_object(state, asset, met or shown, sheeted and not channels)
-    item = CachedObject(state, loaded, traced, traced, mode=mode)
+    shape = state if closed is None else replace(state, vertices=closed.vertices)
+    cut = None if closed is None else closed.cut
+    traced = traced_object(shape, asset, met or shown, sheeted and not channels, cut)
+    item = CachedObject(state, loaded, traced, traced, mode=mode, closed=closed)
+    if closed is not None:
+        item.inside = inside_mesh(state, traced, closed, index)
     item.faults = [*(f"{state.name}: {fault}" for fault in loaded.faults), *material_faults(state)]
     if shown:
         if len(asset.mesh.faces):
             item.glowing = glowing_mesh(state, traced, loaded.glow_of(state.asset))
         return item
+    if skin is not None:
+        return _skinned(item, skin, index)
     item.channels = channels
     textures = asset.mesh.textures
     needed = textures is not None and bool(textured or item.channels or textures.optional)
     images = loaded.textured_of(state.asset) if needed else None
-    item.mesh, item.images, faults = object_mesh(state, traced, asset, index, item.channels, images)
+    item.mesh, item.images, faults = object_mesh(shape, traced, asset, index, item.channels, images)
     item.faults += faults
     item.shown = channels_of(item.mesh)
+    if closed is not None and (images is not None or channels):
+        item.faults.append(
+            f"{state.name}: next to where it has broken, its albedo, roughness and metallic are those of vertices; "
+            "images and other channels are not shown there"
+        )
     if item.mesh is not None:
         item.met = stub(traced)
+    return item
+
+
+def _skinned(item: CachedObject, skin: Skin, index: int) -> CachedObject:
+    """An object that is met by the surface of its particles."""
+    name = item.state.name
+    item.mesh, item.met, item.skin = skin_mesh(item.state, item.traced, skin, index), stub(item.traced), skin
+    item.faults.append(f"{name}: shown by a surface of its particles, not by its surfels; Surface: Mesh shows these")
+    if item.loaded.asset.mesh.textures is not None:
+        item.faults.append(f"{name}: the surface of its particles has the materials of vertices, not images")
+    if skin.surface.coarse:
+        item.faults.append(
+            f"{name}: its particles are spread so far that their surface is coarse; use a domain with walls"
+        )
     return item

@@ -34,7 +34,7 @@ class CarrierCache:
 
     def begin(self, states: Iterable[ObjectState]) -> None:
         """A frame begins: bindings to particles that none of its objects has are forgotten."""
-        rests = [state.particles.rest for state in states if state.particles is not None]
+        rests = [state.particles.rest for state in states if state.particles is not None and state.particles.surfels]
         self._known = [
             known
             for known in self._known
@@ -50,7 +50,7 @@ class CarrierCache:
             The particles are none, or not finite at rest; names the object.
         """
         particles = state.particles
-        if particles is None:
+        if particles is None or not particles.surfels:
             return None
         for known in self._known:
             if known.loaded() is loaded and known.all == particles.all and _same(known.rest, particles.rest):

@@ -106,6 +106,8 @@ def channel_faults(state: ObjectState, asset: Asset, shown: Collection[str], set
 
 
 def may_need(frame: Frame, assets: list[Asset]) -> bool:
-    """Whether a frame with these assets of its objects may have meshes that emit, or sheets; both need more kernels."""
+    """Whether a frame with these assets of its objects may have meshes that emit, sheets or skins: these need more."""
+    if any(state.particles is not None and state.particles.skin for state in frame.objects):
+        return True
     both = zip(frame.objects, assets)
     return any(has_channels(state, asset) or meets_sheets(state, asset, frame) for state, asset in both)

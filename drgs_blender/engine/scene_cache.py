@@ -33,6 +33,7 @@ from ..render.lights.mesh_lights import Emitters
 from ..render.scene.trace_scene import TraceScene
 from ..render.surfels.captured import CapturedObject
 from ..render.surfels.surfel_bvh import SurfelBVH
+from .broken_matter import BrokenMatter
 from .cached_objects import CachedObject, begun, emission_of
 from .captured_objects import captured_faults, captured_object, shows_captured
 from .carrier_cache import CarrierCache
@@ -40,6 +41,7 @@ from .level_of_detail import Budget, counts, grown, reduced
 from .loaded_assets import LoadedAsset
 from .optional_channels import channel_faults, may_need, surfel_emission
 from .part_cache import PartCache
+from .particle_surfaces import ParticleSurfaces
 from .proxy_meshes import ProxyMeshes
 from .scene_objects import check_surface, in_asset_order, join, moved_vertices, posed_surfels
 from .surfel_sheets import meets_sheets, sheet_mesh
@@ -87,7 +89,8 @@ class SceneCache:
     def __init__(self) -> None:
         self._assets: dict[str, LoadedAsset] = {}
         self._parts = PartCache()
-        self._carriers, self._proxies = CarrierCache(), ProxyMeshes()
+        self._carriers, self._proxies, self._broken = CarrierCache(), ProxyMeshes(), BrokenMatter()
+        self._skins = ParticleSurfaces()
         self.objects: list[CachedObject] = []
         self.meshes: list[MeshState] = []
         self.images: list[Image] = []
@@ -175,6 +178,8 @@ class SceneCache:
         self._parts.begin()
         states = self._proxies.carried(frame.objects, self._assets)
         self._carriers.begin(states)
+        self._broken.begin(states)
+        self._skins.begin(states)
         for index, state in enumerate(states):
             loaded = self._assets.get(state.asset)
             if loaded is None:
@@ -184,17 +189,21 @@ class SceneCache:
                     "Link the object to its file again",
                 )
             loaded = self._parts.loaded(loaded, state)
-            shown = shows_captured(state, loaded.asset, frame)
+            skinned = state.particles is not None and state.particles.skin
+            shown = not skinned and shows_captured(state, loaded.asset, frame)
             check_surface(state, loaded.asset, frame.settings, shown)
             state = in_asset_order(state, loaded.asset)
             known = self.objects[index] if index < len(self.objects) else None
             kept = reuse_equal(state, None if known is None else known.state)
             textured = loaded.asset.mesh.textures is not None and not shown and not (seen and met)
-            mode = met, shown, textured, not shown and meets_sheets(state, loaded.asset, frame)
+            mode = met, shown, textured, not (shown or skinned) and meets_sheets(state, loaded.asset, frame)
             if known is not None and known.loaded is loaded and known.state is kept and known.mode == mode:
                 item = known
             else:
-                item = begun(kept, loaded, mode, index)
+                same = known is not None and known.loaded is loaded and known.state is kept
+                closed = known.closed if same and known is not None else self._broken.closed(loaded, kept)
+                skin = known.skin if same and known is not None else self._skins.skin(loaded, kept)
+                item = begun(kept, loaded, mode, index, closed, skin)
                 if known is not None and known.loaded is loaded and known.state is kept and known.mode[:2] == mode[:2]:
                     # Only how the camera sees it is another: its surfels stand where they stood.
                     item.posed, item.hidden_count, item.lost = known.posed, known.hidden_count, known.lost
@@ -217,6 +226,7 @@ class SceneCache:
             others = [*meshes, *(item.glowing for item in glowing if item.glowing is not None)]
             others += [item.sheet for item in objects if item.sheet is not None]
             others += [item.mesh for item in objects if item.mesh is not None]
+            others += [item.inside for item in objects if item.inside is not None]
             textures = {image.name: image for item in objects for image in item.images}
             layout = self.scene.layout
             self.scene.update([item.met for item in objects], others, [*images, *glows.values(), *textures.values()])
@@ -261,9 +271,12 @@ class SceneCache:
         driven = loaded.surfels_of(item.state)
         if item.posed is None:
             carrier = self._carriers.carrier(loaded, item.state)
-            given = item.state, index, driven, item.traced, self._poser(backend), carrier
+            way = self._poser(backend) if item.closed is None else MeshDriven.pose
+            given = item.state, index, driven, item.traced, way, carrier
             posed, item.hidden_count = posed_surfels(*given)
             item.lost = 0 if carrier is None else carrier.hidden_count
+            if item.closed is not None and isinstance(driven, MeshDriven):
+                self._broken.carry(loaded, item.state, driven, item.closed, posed)
             item.posed = posed if item.detail is None else grown(posed, item.detail)
         if item.mode[1]:
             item.captured = item.captured or captured_object(item.state, loaded.asset, item.posed)
@@ -310,7 +323,7 @@ class SceneCache:
             None if pose is None else moved_vertices(item.state, item.loaded.asset, pose)
             for pose, item in zip(step.objects, self.objects)
         ]
-        others = [part for item in self.objects for part in (item.glowing, item.sheet, item.mesh) if part is not None]
+        others = [part for item in self.objects for part in item.meshes if part is not None]
         vertices, instances = self.scene.at(moved, [*step.meshes, *[None] * len(others)])
         parameters = camera_parameters(step.camera, frame.settings, frame.noise_index)
         surfels = state_at(self._shown, step.objects, self._assets, self._proxies, self._carriers)

@@ -129,11 +129,14 @@ def _has(state: ObjectState, name: str) -> bool:
     return getattr(state, name) is not None
 
 
-def traced_object(state: ObjectState, asset: Asset, seen_only: bool = False, sheeted: bool = False) -> TraceObject:
+def traced_object(
+    state: ObjectState, asset: Asset, seen_only: bool = False, sheeted: bool = False, cut: Array | None = None
+) -> TraceObject:
     """The object's mesh in world space with this frame's materials.
 
     Faces are counter-clockwise seen from outside also where the object's matrix mirrors it. `seen_only`: light meets
-    the object's surfels instead; `sheeted`: sheets of them.
+    the object's surfels instead; `sheeted`: sheets of them. `cut` (m,) bool: faces that others replace; without
+    it those that span a tear are left out.
 
     Raises
     ------
@@ -161,7 +164,9 @@ def traced_object(state: ObjectState, asset: Asset, seen_only: bool = False, she
         materials = adjusted(materials, state.adjustment, _mask(state, n))
     linear = matrix[:3, :3]
     faces = mesh.faces
-    torn = torn_faces(mesh.vertices, vertices, faces, state.tear) if state.tear > 0 else None
+    torn = cut
+    if cut is None and state.tear > 0:
+        torn = torn_faces(mesh.vertices, vertices, faces, state.tear)
     with np.errstate(over="ignore", invalid="ignore"):  # bad vertices are counted by the scene
         determinant = float(np.linalg.det(linear))
         world = world_vertices(vertices, matrix)

@@ -58,7 +58,7 @@ def bake(
     rest = job.rest()
     header = Header(
         job.digest, len(rest.points), len(rest.vertices), settings.first, settings.fps, asdict(settings),
-        tear=job.tear, grain=job.grain, moves=job.moves,
+        tear=job.tear, grain=job.grain, moves=job.moves, cells=job.cells,
     )  # fmt: skip
     start = _resume(job, cache, header, overwrite)
     if start is None:

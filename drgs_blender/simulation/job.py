@@ -99,6 +99,15 @@ class Job:
             gradients = linear @ gradients @ matrix[:3, :3]
         return ParticleFrame(points.astype(np.float32), gradients, vertices.astype(np.float32))
 
+    @property
+    def cells(self) -> list[list[float]]:
+        """See `frame.Particles`."""
+        space, to_cells = self.filling.space, np.eye(4)
+        to_cells[:3, :3] /= space.spacing
+        to_cells[:3, 3] = -space.origin / space.spacing
+        found: list[list[float]] = (to_cells @ np.asarray(self.settings.matrix_world)).tolist()
+        return found
+
     def pin_targets(self, frame: int) -> Array | None:
         """World positions of pinned points `frame` frames after the start; None where they stay."""
         return None if self._pins is None else self._pins.at(frame)

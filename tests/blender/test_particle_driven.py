@@ -8,7 +8,7 @@ import pytest
 from physics_scenes import FRAMES, cache_of, vertices
 from scenes import part
 
-playback = part("addon.cache_playback")
+playback, core_frame = part("addon.cache_playback"), part("drgs_blender.core.frame")
 
 
 @pytest.fixture
@@ -40,9 +40,43 @@ def test_driven_by_chooses(baked, export):
     physics.driven_by = "particles"
     assert state_at(baked, 3, export=export)[0].particles.all
     physics.driven_by = "surface"
+    assert not state_at(baked, 3, export=export)[0].particles.surfels, "they say only what has broken"
+    physics.inside = "open"
     assert state_at(baked, 3, export=export)[0].particles is None
     physics.driven_by = "automatic"
     assert state_at(baked, 3, export=export)[0].particles is not None
+
+
+def test_the_inside_reaches_the_engine(baked, export):
+    physics, lattice = baked.drgs.physics, cache_of(baked).header().cells
+    state = state_at(baked, 3, export=export)[0]
+    assert state.inside == core_frame.Inside() and np.array_equal(state.particles.cells, lattice)
+    places = state.particles.rest @ state.particles.cells[:3, :3].T + state.particles.cells[:3, 3]
+    np.testing.assert_allclose(places % 1.0, 0.5, atol=1e-3)
+    physics.inside, physics.inside_colour = "own", (0.5, 0.25, 0.125)
+    physics.inside_roughness, physics.inside_metallic = 0.25, 1.0
+    assert state_at(baked, 3, export=export)[0].inside == core_frame.Inside((0.5, 0.25, 0.125), 0.25, 1.0)
+    physics.inside = "open"
+    state = state_at(baked, 3, export=export)[0]
+    assert state.inside is None and state.particles.cells is None
+    physics.inside, physics.tear = "own", False
+    assert state_at(baked, 3, export=export)[0].inside is None
+
+
+def test_the_surface_of_particles_reaches_the_engine(baked, export):
+    physics = baked.drgs.physics
+    physics.inside, physics.driven_by = "open", "surface"
+    assert state_at(baked, 3, export=export)[0].particles is None, "of matter that keeps its shape the mesh is shown"
+    physics.surface = "particles"
+    particles = state_at(baked, 3, export=export)[0].particles
+    assert particles.skin and not particles.surfels
+    assert np.array_equal(particles.cells, cache_of(baked).header().cells)
+    bpy.ops.drgs.free_physics()
+    physics.surface, physics.material = "automatic", "water"
+    bpy.ops.drgs.bake_physics()
+    assert state_at(baked, 3, export=export)[0].particles.skin
+    physics.surface = "mesh"
+    assert state_at(baked, 3, export=export)[0].particles is None
 
 
 def test_particles_move_with_what_moves_the_whole_mesh(baked, export):
@@ -153,7 +187,11 @@ def test_a_simulation_that_begins_posed_leaves_surfels_to_the_mesh(body, scene, 
     bend.deform_method, bend.angle = "BEND", 1.0
     bpy.ops.drgs.bake_physics()
     state, told = state_at(body, 3, export=export)
-    assert state.particles is None and not [text for text in told if "splats follow" in text]
+    assert not state.particles.surfels and not [text for text in told if "splats follow" in text]
+    begun = cache_of(body).rest().vertices
+    assert np.array_equal(state.particles.began, begun) and np.abs(begun - vertices(body, 1)).max() < 1e-6
     body.drgs.physics.driven_by = "particles"
     state, told = state_at(body, 3, export=export)
-    assert state.particles is None and [text for text in told if "begins with another shape" in text]
+    assert not state.particles.surfels and [text for text in told if "begins with another shape" in text]
+    body.drgs.physics.inside = "open"
+    assert state_at(body, 3, export=export)[0].particles is None

@@ -110,6 +110,51 @@ def test_surfels_follow_what_they_are_told_to(relight, folder, tmp_path, capsys)
         assert told in capsys.readouterr().err
 
 
+def test_torn_and_flowing_matter_is_shown_as_it_is_asked_for(relight, folder, tmp_path, capsys):
+    """The upper half is lifted off: closed in green or hollow; of water, boxes of particles instead of the mesh."""
+    mesh = read_asset(folder / "lit.drgs").mesh
+    axis = np.linspace(-1.4, 1.4, 8)
+    rest = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3).astype(np.float32)
+    still = np.tile(np.eye(3, dtype=np.float16), (len(rest), 1, 1))
+    cells = np.eye(4) / 0.4
+    cells[:3, 3], cells[3, 3] = 4.0, 1.0
+
+    def bake(name, model, given):
+        cache, settings = ParticleCache(tmp_path / name), {"material": {"model": model}, "regions": []}
+        header = Header("digest", len(rest), len(mesh.vertices), 1, 24.0, settings, tear=0.8, cells=given)
+        cache.create(header, ParticleFrame(rest, still, mesh.vertices))
+        lifted = [x + np.where(x[:, 2:] > 0, np.float32([[0, 0, 1.6]]), 0) for x in (rest, mesh.vertices)]
+        cache.write(1, ParticleFrame(lifted[0], still, lifted[1]))
+        return "--cache", str(cache.folder)
+
+    def green(*options):
+        colour = relight("--passes", "DiffCol", "--frames", "1", "--samples", "2", *options)[0]["DiffCol"]
+        return int((colour[..., 1] > 2 * np.maximum(colour[..., 0], colour[..., 2]) + 0.1).sum())
+
+    jelly, water = bake("jelly", "elastic", cells.tolist()), bake("water", "fluid", cells.tolist())
+    assert green(*jelly, "--inside", "0,1,0,0.9") > 10
+    assert green(*jelly, "--inside", "0,1,0", "--driven-by", "surface") > 10
+    assert green(*jelly) == green(*jelly, "--inside", "open") == 0
+
+    def rows(*options):
+        alpha = relight("--transparent", "--frames", "1", "--samples", "2", *options)[0]["Combined"][..., 3]
+        return np.count_nonzero(alpha > 0.5, axis=1)
+
+    capsys.readouterr()
+    flows = rows(*water)
+    assert "surface of its particles" in capsys.readouterr().err
+    halves = rows(*jelly)
+    assert np.ptp(flows[flows > 0]) < np.ptp(halves[halves > 0]), "boxes are as wide everywhere"
+    np.testing.assert_array_equal(rows(*jelly, "--surface", "particles"), flows)
+    capsys.readouterr()
+    rows(*water, "--surface", "mesh")
+    assert "surface of its particles" not in capsys.readouterr().err
+    rows(*bake("old", "elastic", None))
+    assert "Bake again" in capsys.readouterr().err
+    for value in ("1,2,3", "red", "0.1,0.2"):
+        assert main(["relight", str(folder / "lit.drgs"), "--out", "x.exr", *jelly, "--inside", value]) == 64
+
+
 def test_rotation_is_that_of_a_mapping_node(relight):
     """Mapping turns the looked-up vector: with Rotation Z of 90 degrees, -Y looks up +X, where the light is."""
     front, back, right, left = (

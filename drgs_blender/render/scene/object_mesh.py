@@ -17,12 +17,20 @@ class ObjectMesh(MeshState):
         Which of the scene's objects it is; that `TraceObject` has no faces.
     seen_only : bool
         As of `TraceObject`.
+    beside : bool
+        Whether the camera meets it next to the surfels, which are not tied to it.
     """
 
     owner: int = 0
     seen_only: bool = False
+    beside: bool = False
 
     @property
     def clear(self) -> bool:
         """Whether light may pass it; no surfels are tied to it then, and the camera sees it next to those of others."""
         return any(material.clear for material in self.materials)
+
+    @property
+    def ordinary(self) -> bool:
+        """Whether the camera meets it as it does ordinary meshes."""
+        return self.beside or self.clear

@@ -210,7 +210,7 @@ class Part:
 
 def mask_of(item: TraceObject | MeshState) -> int:
     """Group mask of an object or a mesh."""
-    if isinstance(item, TraceObject) or (isinstance(item, ObjectMesh) and not item.clear):
+    if isinstance(item, TraceObject) or (isinstance(item, ObjectMesh) and not item.ordinary):
         return group_mask(item.visibility, True, item.seen_only)
     return group_mask(item.visibility, False, clear=any(material.clear for material in item.materials))
 

@@ -252,9 +252,9 @@ class TraceScene:
         self.cut = set()
         self.faults = [ObjectFaults(item.name, 0, 0, 0, p.bad if p else 0) for item, p in zip(items, instances)]
         for part in parts:
-            fault = self.faults[part.owner]
-            fault.bad_vertices, fault.empty_faces = part.bad_vertices, max(part.empty_faces, part.flat_faces)
-            fault.bad_faces = part.bad_faces
+            fault, bad, empty = self.faults[part.owner], part.bad_vertices, max(part.empty_faces, part.flat_faces)
+            fault.bad_vertices, fault.empty_faces = fault.bad_vertices + bad, fault.empty_faces + empty
+            fault.bad_faces += part.bad_faces
         self._parts, self._known = parts, list(zip(meshes, stands))
 
     def at(self, objects: Sequence[Array | None], meshes: Sequence[Pose | None]) -> tuple[Array, Array]:
@@ -343,7 +343,7 @@ class TraceScene:
         self.sheeted = np.array([o.sheeted for o in objects], bool)
         self._offsets.take(objects, meshes, self.source)
         visible = [len(p.matrices) > 0 and m.visibility.camera for m, p in zip(meshes, where)]
-        self.any_ordinary = any(v and (not isinstance(m, ObjectMesh) or m.clear) for v, m in zip(visible, meshes))
+        self.any_ordinary = any(v and (not isinstance(m, ObjectMesh) or m.ordinary) for v, m in zip(visible, meshes))
 
     def _commit(
         self,

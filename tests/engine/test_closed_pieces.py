@@ -1,0 +1,189 @@
+"""Torn objects in pictures: pieces are closed, of the inside's material, and what is whole keeps its bits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pictures import assert_same_bits, fresh
+
+from drgs_blender.core.errors import AssetError
+from drgs_blender.core.frame import Inside, Particles
+from drgs_blender.simulation.fill import fill
+
+GREEN = Inside((0.0, 1.0, 0.0), 1.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def filling(mesh):
+    return fill(mesh.vertices, mesh.faces, 0.1)
+
+
+def torn_frame(make_frame, filling, lifted, inside, **settings):
+    """The ball with its upper part lifted off, tilted so that one looks onto the lower part."""
+    frame = make_frame(size=(48, 64), **settings)
+    state, spacing = frame.objects[0], filling.space.spacing
+    to_cells = np.eye(4)
+    to_cells[:3, :3] /= spacing
+    to_cells[:3, 3] = -filling.space.origin / spacing
+
+    def moved(places):
+        return (places + np.where(places[:, 2:] > 0.1, [[0, 0, lifted]], 0)).astype(np.float32)
+
+    rest = filling.points.astype(np.float32)
+    gradients = np.tile(np.eye(3, dtype=np.float32), (len(rest), 1, 1))
+    state.particles = Particles(rest, moved(rest), gradients, cells=to_cells)
+    state.vertices, state.tear, state.inside = moved(state.vertices), 2 * spacing, inside
+    c, s = np.cos(0.7), np.sin(0.7)
+    state.matrix_world = np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1.0]])
+    return frame
+
+
+def green(passes):
+    """How much of each pixel is the inside's: of nothing else the colour has green alone."""
+    colour = passes["DiffCol"]
+    return colour[..., 1] - np.maximum(colour[..., 0], colour[..., 2])
+
+
+@pytest.mark.parametrize("surface", ["mesh", "surfels"])
+def test_a_torn_body_shows_its_inside(session, make_frame, filling, surface):
+    hollow = torn_frame(make_frame, filling, 1.2, None, camera_sees=surface, rays_see=surface)
+    closed = torn_frame(make_frame, filling, 1.2, GREEN, camera_sees=surface, rays_see=surface)
+    for frame in (hollow, closed):
+        frame.passes = ("Combined", "DiffCol")
+    shown, seen = session.render(hollow), session.render(closed)
+    assert green(shown).max() < 0.4
+    wall = green(seen) > 0.9
+    assert wall.sum() > 100
+    assert seen["Combined"][..., 3][wall].min() > 0.99 and not seen.warnings
+    closed.objects[0].inside = Inside()
+    plain = session.render(closed)["DiffCol"][wall]
+    assert np.ptp(plain, axis=0).max() < 0.05, "of one colour, the mean"
+
+
+def first_hits(scene, places, directions):
+    """Cosines between rays and the faces that they meet first; NaN of rays that meet none."""
+    a, b, c = scene.vertices[scene.faces].astype(np.float64).transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    found = np.full(len(places), np.nan)
+    for i, (start, way) in enumerate(zip(places, directions)):
+        with np.errstate(all="ignore"):
+            across = np.cross(way, c - a)
+            scale = np.einsum("ij,ij->i", b - a, across)
+            u = np.einsum("ij,ij->i", start - a, across) / scale
+            turned = np.cross(start - a, b - a)
+            v = turned @ way / scale
+            t = np.einsum("ij,ij->i", c - a, turned) / scale
+            t = np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0), t, np.inf)
+        nearest = int(np.argmin(t))
+        if np.isfinite(t[nearest]):
+            found[i] = normal[nearest] @ way
+    return found
+
+
+def test_no_ray_from_outside_sees_the_back_of_a_face(session, make_frame, filling):
+    generator = np.random.default_rng(3)
+    places = generator.normal(size=(600, 3))
+    places *= 5 / np.linalg.norm(places, axis=1, keepdims=True)
+    targets = generator.uniform(-0.6, 0.6, (600, 3)) + np.array([0, 0.4, 0.5])
+    backs = []
+    for inside in (None, GREEN):
+        session.render(torn_frame(make_frame, filling, 1.2, inside, camera_sees="mesh"))
+        cosines = first_hits(session._scene_cache.scene, places, targets - places)
+        assert np.isfinite(cosines).sum() > 300
+        backs.append(int((cosines > 0).sum()))
+    assert backs[0] > 30 and backs[1] == 0
+
+
+@pytest.mark.parametrize("surface", ["mesh", "surfels"])
+def test_whole_objects_keep_their_bits(session, make_frame, filling, surface):
+    """At rest, and stretched but joined, the picture is that of an object whose pieces stay hollow."""
+    for lifted in (0.0, 0.05):
+        frames = [torn_frame(make_frame, filling, lifted, inside, camera_sees=surface) for inside in (None, GREEN)]
+        assert_same_bits(*[session.render(frame) for frame in frames])
+
+
+def test_history_does_not_show_in_broken_objects(session, make_frame, filling, asset_path):
+    for lifted, inside in ((0.0, GREEN), (1.2, GREEN), (1.4, GREEN), (1.4, None), (1.4, Inside()), (0.0, GREEN)):
+        frame = torn_frame(make_frame, filling, lifted, inside)
+        assert_same_bits(session.render(frame), fresh(asset_path, frame))
+
+
+def test_passes_name_the_object_inside_and_out(session, make_frame, filling):
+    frame = torn_frame(make_frame, filling, 1.2, GREEN)
+    frame.objects[0].pass_index = 7
+    frame.passes = ("DiffCol", "IndexOB", "CryptoObject00", "Vector", "Combined")
+    frame.settings = replace(frame.settings, denoise="svgf")
+    passes = session.render(frame)
+    wall = green(passes) > 0.9
+    assert (passes["IndexOB"][wall] == 7).all()
+    outside = (passes["Combined"][..., 3] > 0.99) & (green(passes) < 0.1)
+    assert len(np.unique(passes["CryptoObject00"][..., 0][wall | outside])) == 1
+
+
+def test_damaged_particles_are_refused_by_name(session, make_frame, filling):
+    frame = torn_frame(make_frame, filling, 1.2, GREEN)
+    particles = frame.objects[0].particles
+    wrong = [
+        replace(particles, cells=np.zeros((4, 4))),
+        replace(particles, cells=np.full((4, 4), np.nan)),
+        replace(particles, points=particles.points[1:]),
+    ]
+    for given in wrong:
+        frame.objects[0].particles = given
+        with pytest.raises(AssetError, match=frame.objects[0].name):
+            session.render(frame)
+
+
+@pytest.mark.parametrize("surface", ["mesh", "surfels"])
+def test_what_flows_is_shown_by_its_particles(session, make_frame, filling, surface, asset_path):
+    """Poured into a flat box: camera and rays meet that, in the colours that the particles bring, and no surfel."""
+    frame = torn_frame(make_frame, filling, 0.0, GREEN, camera_sees=surface, rays_see=surface)
+    state, count = frame.objects[0], len(filling.points)
+    spacing = filling.space.spacing
+    n = int(np.ceil((count / 4) ** 0.5))
+    i = np.arange(count)
+    poured = np.stack([i % n - n / 2, (i // n) % n - n / 2, i // n**2 - 2], 1) * spacing
+    state.matrix_world = np.eye(4)
+    state.vertices[:] = 50.0
+    state.particles = replace(state.particles, points=poured.astype(np.float32), skin=True, surfels=False)
+    frame.passes = ("Combined", "DiffCol", "IndexOB", "CryptoObject00")
+    state.pass_index = 3
+    passes = session.render(frame)
+    seen = passes["Combined"][..., 3] > 0.99
+    rows, columns = np.nonzero(seen)
+    assert np.ptp(columns) > 3 * np.ptp(rows) > 0 and (passes["IndexOB"][seen] == 3).all()
+    assert passes["DiffCol"][seen].std() > 0.01, "not of one colour"
+    assert [text for text in passes.warnings if "surface of its particles" in text]
+    assert_same_bits(passes, fresh(asset_path, frame))
+    frame.objects[0].particles = replace(state.particles, points=np.full_like(poured, np.nan, np.float32))
+    assert not session.render(frame)["Combined"][..., 3].any()
+
+
+def test_matter_that_was_posed_before_it_broke_is_closed(session, make_frame, filling):
+    """Particles that filled the ball where a pose had put it: the same picture as of one that was there all along."""
+    plain = torn_frame(make_frame, filling, 1.2, GREEN, camera_sees="mesh")
+    posed = torn_frame(make_frame, filling, 1.2, GREEN, camera_sees="mesh")
+    state, shift = posed.objects[0], np.float32([5.0, 0.0, 0.0])
+    began = session.asset(state.asset).mesh.vertices + shift
+    cells = state.particles.cells.copy()
+    cells[:3, 3] -= cells[:3, :3] @ shift
+    state.particles = replace(
+        state.particles,
+        rest=state.particles.rest + shift,
+        points=state.particles.points + shift,
+        cells=cells,
+        began=began,
+    )
+    state.vertices = state.vertices + shift
+    state.matrix_world = state.matrix_world.copy()
+    state.matrix_world[:3, 3] -= state.matrix_world[:3, :3] @ shift
+    for frame in (plain, posed):
+        frame.passes = ("Combined", "DiffCol")
+    shown = [green(session.render(frame)) for frame in (plain, posed)]
+    assert (shown[0] > 0.9).sum() > 100
+    np.testing.assert_allclose(shown[1], shown[0], atol=0.3)
+    state.particles = replace(state.particles, began=began[1:])
+    with pytest.raises(AssetError, match="began"):
+        session.render(posed)
