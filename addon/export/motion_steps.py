@@ -74,7 +74,7 @@ def _carrier(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, now: ObjectS
     if now.particles is not None:
         given = mesh_arrays.read_vertices(obj.data), proxies.read_rest(obj.data)
         particles = particles_of(obj, depsgraph, *given, lambda text: None)  # which the frame itself has told
-        if particles is not None:
+        if particles is not None and particles.surfels:
             return replace(particles, all=True), None
     pose = proxies.read_pose(obj.data)
     still = now.proxy is None and now.particles is None and np.array_equal(pose.rest, pose.vertices)

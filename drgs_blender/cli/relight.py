@@ -240,7 +240,7 @@ def _posed(
         return replace(state, proxy=ProxyMesh(carrier.vertices, vertices, carrier.faces))
     if len(asset.mesh.faces) or vertices is None:
         return replace(state, vertices=vertices, particles=particles)
-    if particles is None:
+    if particles is None or not particles.surfels:
         problem = "has no mesh that could follow matter that flows"
         raise UsageError(str(args.asset), problem, "Simulate a material that keeps its shape")
     return replace(state, particles=replace(particles, all=True))
