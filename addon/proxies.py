@@ -109,7 +109,7 @@ class Separated:
 
     def __init__(self, warn: Callable[[str], None]) -> None:
         self._warn = warn
-        self._known: dict[str, dict[int, tuple[str, set[bytes]]]] = {}
+        self._known: dict[str, dict[int, tuple[str, Array]]] = {}
 
     def add(self, obj: bpy.types.Object) -> None:
         """Take in an evaluated object that has a proxy."""
@@ -118,15 +118,19 @@ class Separated:
         if key in parts:  # as instances and linked copies have it
             return
         rest = read_rest(obj.original.data)
-        rows = {row.tobytes() for row in rest[np.isfinite(rest).all(axis=1)]}
-        for name, others in parts.values():
+        rows = _rows(rest) if parts else set()
+        for name, others in ((name, _rows(known)) for name, known in parts.values()):
             if 2 * len(rows & others) < min(len(rows), len(others)):  # both have the rim of the cut
                 self._warn(
                     f'"{name}" and "{obj.name}": parts of one proxy, so the surfels are there twice. Take them away '
                     "from each by Crop or Edit Surfels, or undo the separation"
                 )
                 break
-        parts[key] = obj.name, rows
+        parts[key] = obj.name, rest
+
+
+def _rows(rest: Array) -> set[bytes]:
+    return {row.tobytes() for row in rest[np.isfinite(rest).all(axis=1)]}
 
 
 class _Parts(NamedTuple):

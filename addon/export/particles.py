@@ -52,6 +52,7 @@ def particles_of(
     follow = "splats follow the mesh" if wanted != "surface" else "what it tears apart is hollow"
     if closes and wanted != "surface":
         follow += ", and what is torn is hollow"
+    ends = "Driven By: Surface and Inside: Hollow say so"
     if not (modifier.show_render if depsgraph.mode == "RENDER" else modifier.show_viewport):
         return None
     path = cache_playback.path_of(obj, modifier)
@@ -60,11 +61,13 @@ def particles_of(
         header = cache.header()
         if header is None:
             return None  # told by `cache_playback.check`
-        skin = physics.surface == "particles" or (physics.surface == "automatic" and header.is_fluid)
+        automatic = physics.surface == "automatic" and header.is_fluid and not obj.drgs.captured_colours
+        skin = physics.surface == "particles" or automatic
         if skin and header.cells is None:
             warn(f'"{obj.name}": was baked before particles had a surface, so its mesh is shown, stretched. Bake again')
             skin = False
         closes = closes and header.keeps_shape and not skin
+        follow, ends = ("its mesh is shown, stretched", "Surface: Mesh says so") if skin else (follow, ends)
         if wanted == "surface" and not (closes or skin):
             return None
         if not header.keeps_shape and not skin:
@@ -94,7 +97,7 @@ def particles_of(
     if moved is None:
         warn(
             f'"{obj.name}": its mesh is not as the simulation has it in this frame (modifiers after '
-            f'"{modifier.name}", or edits), so {follow}; Driven By: Surface and Inside: Hollow say so for good'
+            f'"{modifier.name}", or edits), so {follow}; {ends} for good'
         )
         return None
     cells = np.array(header.cells, np.float64) if header.cells is not None and (closes or skin) else None

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from ...drgs_blender.core.sim_materials import MATERIALS
 from ..physics_settings import DrgsPhysicsSettings
 
-#: Steps of particles that a core makes in a second at best, by material model (bench/bench_simulate.py measures it);
-#: models that need singular values, and the preview (XPBD).
-_RATES, _SLOW, _QUICK = {"elastic": 1.2e7, "fluid": 1e7}, 2.7e6, 1.5e8
+#: Steps of particles that a core makes in a second at best (bench/bench_simulate.py measures it), and in the preview
+#: (XPBD).
+_RATE, _QUICK = 1.2e7, 1.5e8
 #: Seconds that the start takes, a frame besides, and a particle in it.
 _START, _FRAME, _KEEP = 3.0, 0.02, 5e-7
 
@@ -15,9 +14,7 @@ _START, _FRAME, _KEEP = 3.0, 0.02, 5e-7
 def estimate(physics: DrgsPhysicsSettings, counts: tuple[int, int], cores: int) -> float:
     """Seconds that a bake takes at least, from particles and time steps a frame."""
     particles, steps = counts
-    rate = max(_RATES.get(MATERIALS[part.material].model, _SLOW) for part in (physics, *physics.regions))
-    if physics.solver != "mpm":
-        rate = _QUICK
+    rate = _RATE if physics.solver == "mpm" else _QUICK
     frame = _FRAME + _KEEP * particles + particles * steps / (rate * max(1, cores) ** 0.85)
     return _START + (physics.frame_end - physics.frame_start) * frame
 

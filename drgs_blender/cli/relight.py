@@ -211,7 +211,8 @@ def _carrier(args: argparse.Namespace, asset: Asset) -> Mesh | None:
     subject = str(args.asset)
     if args.proxy is not None:
         if args.vertices is None:
-            raise UsageError(f"--proxy {args.proxy}", "carries nothing at rest", "Give its moved --vertices")
+            remedy = "Give its moved --vertices" if args.cache is None else "Leave it out: the particles of CACHE carry"
+            raise UsageError(f"--proxy {args.proxy}", "carries nothing at rest", remedy)
         if args.vertex_order:
             raise UsageError("--vertex-order", "is that of an asset's mesh, not of a proxy", "Leave it out")
         return read_proxy(args.proxy, asset, subject)
@@ -313,7 +314,8 @@ def _poses(args: argparse.Namespace) -> tuple[Sequence[tuple[int, Callable[[], _
     if missing := sorted(set(frames) - set(cache.frames())):
         cache.read(missing[0])  # says which are there
     check_template(str(args.out), frames)
-    driven, skin = args.driven_by, args.surface == "particles" or (args.surface == "automatic" and header.is_fluid)
+    automatic = args.surface == "automatic" and header.is_fluid and not args.captured
+    driven, skin = args.driven_by, args.surface == "particles" or automatic
     driven = driven if header.keeps_shape else "surface"
     if skin and header.cells is None:
         problem = "was baked before particles had a surface"

@@ -17,7 +17,7 @@ from .progress import FractionBar, clock, prepare_engine
 #: Options that are of one body alone.
 _OF_ONE = (
     "material", "youngs_modulus", "poisson", "density", "resolution", "solver", "device", "gravity", "velocity",
-    "floor", "pin", "collider",
+    "floor", "pin", "collider", "proxy",
 )  # fmt: skip
 
 
@@ -54,6 +54,14 @@ def run_coupled(args: argparse.Namespace, data: Any, folder: Path) -> int:
         check_writable(body.out / "cache.json")
     use_threads(args.threads)
     meshes = [read_asset(body.asset).mesh for body in scene.bodies]
+    for body, mesh in zip(scene.bodies, meshes, strict=True):
+        if not len(mesh.faces):
+            problem = "has surfels alone, which say nothing of what they enclose"
+            raise UsageError(f'body "{body.name}", {body.asset}', problem, "Bake it alone, with --proxy")
+        for path in _exports(args, body.name):
+            if Path(body.name).name != body.name or "#" in body.name:
+                raise UsageError(f'body "{body.name}"', "has a name that no file can have", 'Give it another "name"')
+            check_writable(path)
     prepare_engine(args, "coupled")
     with clock(args, "filling"):
         job = prepare_coupled(meshes, scene)
@@ -80,6 +88,14 @@ def run_coupled(args: argparse.Namespace, data: Any, folder: Path) -> int:
     return 0
 
 
+def _exports(args: argparse.Namespace, name: str) -> list[Path]:
+    """Files that are written for a body alone: the pattern of its poses, its motion."""
+    found = [Path(args.vertices)] if args.vertices else []
+    if args.export is not None and args.export.suffix.lower() not in USD_SUFFIXES:
+        found.append(args.export)
+    return [path.parent / f"{name}_{path.name}" for path in found]
+
+
 def _write_exports(args: argparse.Namespace, bodies: list[tuple[str, Any, ParticleCache, Any]]) -> None:
     """All bodies in one USD file; of other formats a file for each, which is named after it."""
     from .simulate import write_points, write_usd, write_vertices
@@ -87,8 +103,8 @@ def _write_exports(args: argparse.Namespace, bodies: list[tuple[str, Any, Partic
     if args.export is not None and args.export.suffix.lower() in USD_SUFFIXES:
         write_usd(args.export, bodies)
     for name, _, cache, settings in bodies:
-        if args.vertices:
-            pattern = Path(args.vertices)
-            write_vertices(str(pattern.with_name(f"{name}_{pattern.name}")), cache, settings)
-        if args.export is not None and args.export.suffix.lower() not in USD_SUFFIXES:
-            write_points(args.export.with_name(f"{name}_{args.export.name}"), cache, settings)
+        for path in _exports(args, name):
+            if "#" in path.name:
+                write_vertices(str(path), cache, settings)
+            else:
+                write_points(path, cache, settings)

@@ -142,14 +142,15 @@ class ParticleCache:
             ) from error
         self.clear()
         _write(self.folder / _REST, _members_of(rest))
-        self._write_header(header)
+        self.describe(header)
 
     def extend(self, header: Header, last: int) -> None:
         """Go on under another header: frames after `last` are removed."""
         self._remove([self.path(frame) for frame in self.frames() if frame > last])
-        self._write_header(header)
+        self.describe(header)
 
-    def _write_header(self, header: Header) -> None:
+    def describe(self, header: Header) -> None:
+        """Write the header alone."""
         replace_file(self.folder / HEADER, [json.dumps(asdict(header), indent=1).encode()])
 
     def clear(self) -> None:

@@ -126,7 +126,7 @@ class Bonds:
             b = self.neighbour[a, 2 * axis + 1]
             before, after = (np.linalg.norm(x[a] - x[b], axis=1) for x in (self.rest, now))
             for ends in (a, b):  # each is among them once
-                found[ends] = np.maximum(found[ends], after / before)
+                found[ends] = np.fmax(found[ends], after / before)
         return found[which]
 
     def zone(self, now: Array, broken: Array, gap: float) -> Cells:

@@ -41,17 +41,21 @@ class Sides:
     now: Array
     gradients: Array
 
-    def carried(self, points: Array) -> tuple[Array, Array]:
-        """Places now, and deformation gradients, of (n, 3) points at rest, all object space."""
+    def carried(self, points: Array) -> tuple[Array, Array, Array]:
+        """Of (n, 3) points at rest: which have matter near, and of these places now and deformation gradients.
+
+        All object space.
+        """
         bonds = self.bonds
         rest = bonds.placed(points)
         places = rest + _BESIDE
         warp(places, self.zone.size + 1, *self.nodes)
         cell = np.floor(places).astype(np.int64).clip(0, bonds.size - 1)
         owner = bonds.owners((cell[:, 0] * bonds.size[1] + cell[:, 1]) * bonds.size[2] + cell[:, 2])
-        weights, _ = bonds.carriers(rest, owner.clip(0), self.broken)
+        known = owner >= 0
+        weights, _ = bonds.carriers(rest[known], owner[known], self.broken)
         at, turn, _ = carry(weights, self.now, self.gradients)
-        return bonds.returned(at), bonds.returned_gradients(turn)
+        return known, bonds.returned(at), bonds.returned_gradients(turn)
 
 
 @dataclass(slots=True)

@@ -51,9 +51,12 @@ class BrokenMatter:
         self._known = [
             known
             for known in self._known
-            if known.loaded() is not None and any(rest is known.rest or same_bits(rest, known.rest) for rest in rests)
+            if known.loaded() is not None and any(_same(rest, known.rest) for rest in rests)
         ]
-        self._frames = [known for known in self._frames if self._known and known[0]() is not None]
+        begun = [known.began for known in self._known]
+        self._frames = [
+            frames for frames in self._frames if frames[0]() is not None and any(_same(frames[1], b) for b in begun)
+        ]
 
     def closed(self, loaded: LoadedAsset, state: ObjectState) -> ClosedMatter | None:
         """The object's mesh with closed pieces; None where it shows nothing that has broken, or is not to be closed.
@@ -75,7 +78,7 @@ class BrokenMatter:
         rest = particles.rest, particles.cells, _began(loaded, state)
         for known in self._known:
             both = zip(rest, (known.rest, known.cells, known.began))
-            if known.loaded() is loaded and all(a is b or same_bits(a, b) for a, b in both):
+            if known.loaded() is loaded and all(_same(a, b) for a, b in both):
                 matter = known.matter
                 break
         else:
@@ -93,23 +96,31 @@ class BrokenMatter:
         rows = np.flatnonzero(near | (keep < 1))
         if not len(rows):
             return
+        known, centre, gradients = closed.sides.carried(whole.centre[rows])
+        rows = rows[known]
+        if not len(rows):
+            return
         rest, keep = Frames(*(array[rows] for array in whole)), keep[rows]
-        centre, gradients = closed.sides.carried(rest.centre)
         found = place(rest, centre, gradients, np.asarray(state.matrix_world, np.float64))
         for name, values in zip(Frames._fields, found):
             getattr(posed, name)[rows] = values * keep[:, None] if name.startswith("tangent") else values
         opacity = np.array(posed.opacity)
-        opacity[rows] = np.where(keep > _LEAST, driven.surfels.opacity[rows], 0.0)
+        there = np.isfinite(centre).all(axis=1) & np.isfinite(gradients).all(axis=(1, 2))
+        opacity[rows] = np.where((keep > _LEAST) & there, driven.surfels.opacity[rows], 0.0)
         posed.opacity = opacity
 
     def _at_rest(self, loaded: LoadedAsset, state: ObjectState, driven: MeshDriven) -> Frames:
         began = _began(loaded, state)
         for known, places, frames in self._frames:
-            if known() is loaded and (places is began or same_bits(places, began)):
+            if known() is loaded and _same(places, began):
                 return frames
         frames = Frames.of(driven.pose(began))
         self._frames.append((weakref.ref(loaded), began, frames))
         return frames
+
+
+def _same(a: Array, b: Array) -> bool:
+    return a is b or same_bits(a, b)
 
 
 def _began(loaded: LoadedAsset, state: ObjectState) -> Array:

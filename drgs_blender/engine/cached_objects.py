@@ -9,7 +9,7 @@ import numpy as np
 
 from ..core.arrays import Array
 from ..core.asset.model import PosedSurfels
-from ..core.frame import MeshState, ObjectState
+from ..core.frame import MeshState, ObjectState, Pose
 from ..core.level_of_detail import Detail
 from ..core.materials import Image
 from ..deform.closed_matter import ClosedMatter
@@ -22,7 +22,7 @@ from .loaded_assets import LoadedAsset
 from .object_meshes import channels_of, object_mesh, stub
 from .optional_channels import optional_channels
 from .particle_surfaces import Skin, skin_mesh
-from .scene_objects import material_faults, traced_object
+from .scene_objects import material_faults, moved_vertices, traced_object, world_vertices
 
 
 @dataclass(slots=True)
@@ -159,3 +159,21 @@ def _skinned(item: CachedObject, skin: Skin, index: int) -> CachedObject:
             f"{name}: its particles are spread so far that their surface is coarse; use a domain with walls"
         )
     return item
+
+
+def same_matter(a: ObjectState, b: ObjectState) -> bool:
+    """Whether two states of an object have broken alike, and have the same particles."""
+    same = a.vertices is b.vertices and a.particles is b.particles
+    return same and (a.tear, a.inside is None) == (b.tear, b.inside is None)
+
+
+def vertices_at(item: CachedObject, pose: Pose) -> Array | None:
+    """As `moved_vertices`; what is beside its place in the mesh, as matter at cracks is, stays as far from it."""
+    then = moved_vertices(item.state, item.loaded.asset, pose)
+    if then is None or item.closed is None:
+        return then
+    own = item.loaded.asset.mesh.vertices if item.state.vertices is None else item.state.vertices
+    aside = (item.closed.vertices != own.astype(np.float32)).any(axis=1)
+    now = world_vertices(own, np.asarray(item.state.matrix_world, np.float64))
+    then[aside] += item.traced.vertices[aside] - now[aside]
+    return then

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..compute.threads import checkpoint
 from ..core.arrays import Array, same_bits
 from ..core.frame import ObjectState
 from ..geometry.particle_surface import ParticleSurface, particle_surface
@@ -82,7 +83,9 @@ class ParticleSurfaces:
         if not len(made.vertices):
             return Skin(made, np.zeros((0, 1), np.int32), np.zeros((0, 1), np.float32))
         count = min(_NEAR, int(usable.sum()))
-        distance, index = cKDTree(now[usable]).query(made.vertices, k=count)
+        checkpoint()
+        distance, index = cKDTree(now[usable]).query(made.vertices, k=count, workers=-1)
+        checkpoint()
         distance, index = distance.reshape(-1, count), index.reshape(-1, count)
         share = np.exp(-((distance / _WIDTH) ** 2) / 2) + 1e-12
         share /= share.sum(axis=1, keepdims=True)
@@ -105,7 +108,7 @@ class ParticleSurfaces:
         mesh = loaded.asset.mesh
         used = np.unique(mesh.faces)
         used = used[np.isfinite(mesh.vertices[used]).all(axis=1)]
-        vertex: Array = used[cKDTree(mesh.vertices[used]).query(rest)[1]].astype(np.int32)
+        vertex: Array = used[cKDTree(mesh.vertices[used]).query(rest, workers=-1)[1]].astype(np.int32)
         self._known.append(_Known(weakref.ref(loaded), rest, vertex))
         return vertex
 

@@ -34,7 +34,7 @@ from ..render.scene.trace_scene import TraceScene
 from ..render.surfels.captured import CapturedObject
 from ..render.surfels.surfel_bvh import SurfelBVH
 from .broken_matter import BrokenMatter
-from .cached_objects import CachedObject, begun, emission_of
+from .cached_objects import CachedObject, begun, emission_of, same_matter, vertices_at
 from .captured_objects import captured_faults, captured_object, shows_captured
 from .carrier_cache import CarrierCache
 from .level_of_detail import Budget, counts, grown, reduced
@@ -43,7 +43,7 @@ from .optional_channels import channel_faults, may_need, surfel_emission
 from .part_cache import PartCache
 from .particle_surfaces import ParticleSurfaces
 from .proxy_meshes import ProxyMeshes
-from .scene_objects import check_surface, in_asset_order, join, moved_vertices, posed_surfels
+from .scene_objects import check_surface, in_asset_order, join, posed_surfels
 from .surfel_sheets import meets_sheets, sheet_mesh
 from .surfel_states import state_at, state_now
 from .surfel_trees import SurfelTree
@@ -200,9 +200,11 @@ class SceneCache:
             if known is not None and known.loaded is loaded and known.state is kept and known.mode == mode:
                 item = known
             else:
-                same = known is not None and known.loaded is loaded and known.state is kept
-                closed = known.closed if same and known is not None else self._broken.closed(loaded, kept)
-                skin = known.skin if same and known is not None else self._skins.skin(loaded, kept)
+                alike = known is not None and known.loaded is loaded and same_matter(known.state, kept)
+                past = known if alike else None
+                with interruptible(check):
+                    closed = self._broken.closed(loaded, kept) if past is None else past.closed
+                    skin = self._skins.skin(loaded, kept) if past is None else past.skin
                 item = begun(kept, loaded, mode, index, closed, skin)
                 if known is not None and known.loaded is loaded and known.state is kept and known.mode[:2] == mode[:2]:
                     # Only how the camera sees it is another: its surfels stand where they stood.
@@ -319,10 +321,7 @@ class SceneCache:
                 raise UsageError(
                     f"motion of {what}", f"is of {len(poses)}, the frame has {len(shapes)}", "Give one each"
                 )
-        moved = [
-            None if pose is None else moved_vertices(item.state, item.loaded.asset, pose)
-            for pose, item in zip(step.objects, self.objects)
-        ]
+        moved = [None if pose is None else vertices_at(item, pose) for pose, item in zip(step.objects, self.objects)]
         others = [part for item in self.objects for part in item.meshes if part is not None]
         vertices, instances = self.scene.at(moved, [*step.meshes, *[None] * len(others)])
         parameters = camera_parameters(step.camera, frame.settings, frame.noise_index)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..compute.jit import njit
-from ..compute.threads import over_range
+from ..compute.threads import checkpoint, over_range
 
 Array = np.ndarray
 
@@ -23,7 +23,7 @@ _ENDS, _SUM = 3.0, 4.0 * np.pi * 8.0 / 105.0
 #: around it have this fade.
 _DROP, _FEW = 1.4, 5.0
 #: Nodes of the grid a spacing, at most; nodes in all; of a block along each axis.
-_NODES, _MOST, _BLOCK = 2.0, 1 << 26, 8
+_NODES, _MOST, _BLOCK = 2.0, 1 << 25, 8
 #: Level of the surface: that at which the surface of a block of particles is where their volume ends.
 LEVEL = 0.54
 
@@ -63,9 +63,7 @@ def particle_surface(points: Array, spacing: float) -> ParticleSurface:
     places = np.asarray(points, np.float64) / spacing
     places = places[np.isfinite(places).all(axis=1)]
     if not len(places):
-        return ParticleSurface(
-            np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32), False
-        )
+        return _nothing(False)
     reach = _ENDS * float(np.sqrt(_SHARE * 0.3 * _AROUND**2 + _ALONE))
     low, high = places.min(axis=0) - reach - 1, places.max(axis=0) + reach + 1
     step = 1.0 / _NODES
@@ -80,12 +78,17 @@ def particle_surface(points: Array, spacing: float) -> ParticleSurface:
     field = np.zeros(blocks * _BLOCK, np.float32)
     over_range(_sum, int(blocks.prod()), binned, blobs, (start, bins), (low, step, reach, wide), blocks, field)
     if not field.max() > LEVEL:
-        return ParticleSurface(
-            np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32), False
-        )
+        return _nothing(step > 1.0 / _NODES)
+    checkpoint()
     vertices, faces, normals, _ = marching_cubes(field, LEVEL, gradient_direction="ascent")
+    checkpoint()
     made = ((vertices * step + low) * spacing).astype(np.float32)
     return ParticleSurface(made, faces.astype(np.int32), normals.astype(np.float32), step > 1.0 / _NODES)
+
+
+def _nothing(coarse: bool) -> ParticleSurface:
+    none = np.zeros((0, 3), np.float32)
+    return ParticleSurface(none, np.zeros((0, 3), np.int32), none, coarse)
 
 
 def _binned(places: Array, low: Array, wide: float) -> tuple[Array, Array, Array]:
@@ -95,7 +98,7 @@ def _binned(places: Array, low: Array, wide: float) -> tuple[Array, Array, Array
     key = (cell[:, 0] * bins[1] + cell[:, 1]) * bins[2] + cell[:, 2]
     order = np.argsort(key, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(key, minlength=int(bins.prod())))])
-    return np.ascontiguousarray(places[order]), start.astype(np.int64), bins
+    return np.ascontiguousarray(places[order]), start.astype(np.int64, copy=False), bins
 
 
 @njit

@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from typing import Any
 
 from ..core.errors import UsageError
-from ..core.particle_cache import Header, ParticleCache
+from ..core.particle_cache import Header, ParticleCache, ParticleFrame
 from .input_digest import same_until
 from .job import Job
 
@@ -56,10 +57,7 @@ def bake(
     """
     settings, solver = job.settings, job.solver
     rest = job.rest()
-    header = Header(
-        job.digest, len(rest.points), len(rest.vertices), settings.first, settings.fps, asdict(settings),
-        tear=job.tear, grain=job.grain, moves=job.moves, cells=job.cells,
-    )  # fmt: skip
+    header = header_of(job, rest, asdict(settings))
     start = _resume(job, cache, header, overwrite)
     if start is None:
         cache.create(header, rest)
@@ -82,6 +80,15 @@ def bake(
         if now > kept and cache.path(now).exists() and owned(cache, job):
             cache.write_state(now, solver.arrays())
     return done
+
+
+def header_of(job: Job, rest: ParticleFrame, settings: dict[str, Any]) -> Header:
+    """What a cache says of a simulation that begins `rest`, made with `settings`."""
+    own = job.settings
+    return Header(
+        job.digest, len(rest.points), len(rest.vertices), own.first, own.fps, settings,
+        tear=job.tear, grain=job.grain, moves=job.moves, cells=job.cells,
+    )  # fmt: skip
 
 
 def owned(cache: ParticleCache, job: Job) -> bool:
@@ -117,6 +124,13 @@ def _resume(job: Job, cache: ParticleCache, header: Header, overwrite: bool) -> 
     if not whole or not job.solver.restore(frame - first, arrays):
         log.info("%s: does not hold all that is needed to go on; begins again", cache.folder)
         return None
-    if frame < job.settings.last and found.moves != job.moves:
-        cache.extend(header, frame)
+    go_on(cache, found, header, frame, job.settings.last)
     return frame
+
+
+def go_on(cache: ParticleCache, found: Header, header: Header, frame: int, last: int) -> None:
+    """Bring the header of a cache, `found`, up to date with what is to go on after `frame`."""
+    if frame < last and found.moves != header.moves:
+        cache.extend(header, frame)
+    elif found.cells != header.cells:  # of an earlier version, which did not know them
+        cache.describe(replace(found, cells=header.cells))

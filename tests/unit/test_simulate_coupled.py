@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import igl
@@ -177,6 +178,19 @@ def test_a_coupled_bake_goes_on_with_the_same_bits(tmp_path, whole):
     assert run(tmp_path, last=3) == 0, "a part of what is there"
 
 
+def test_headers_say_which_lattice_particles_fill_also_those_of_an_earlier_version(tmp_path, whole):
+    """Without it nothing that is torn is closed; baking again, which computes nothing anew, brings it."""
+    wanted = [ParticleCache(whole / name).header().cells for name in ("top", "pile")]
+    assert None not in wanted
+    run(tmp_path)
+    for name in ("top", "pile"):
+        cache = ParticleCache(tmp_path / name)
+        cache.describe(replace(cache.header(), cells=None))
+    assert run(tmp_path) == 0
+    assert [ParticleCache(tmp_path / name).header().cells for name in ("top", "pile")] == wanted
+    assert content(tmp_path) == content(whole)
+
+
 def test_a_cancelled_coupled_bake_keeps_its_frames(tmp_path, whole):
     top = ParticleCache(tmp_path / "top")
     with pytest.raises(Cancelled):
@@ -225,6 +239,8 @@ def test_the_command_line_names_bodies_and_exports_them(tmp_path, whole, capsys)
     assert (tmp_path / "top_all.mdd").exists() and (tmp_path / "pile_all.mdd").exists()
     assert main([*given, "--material", "sand"]) == 64
     assert "--material: is an option for one object" in capsys.readouterr().err
+    assert main([*given, "--proxy", "hull.ply"]) == 64
+    assert "--proxy: is an option for one object" in capsys.readouterr().err
     assert main(["simulate", str(tmp_path / "top.drgs"), *given[1:]]) == 64
     assert main(["simulate", "--out", str(tmp_path / "bake")]) == 64
     assert "ASSET: is not given" in capsys.readouterr().err
