@@ -100,18 +100,18 @@ class Windows:
                 data.rename(site / data.name)
         self._command += [within(source / "drgs_blender" / "cli" / "bundled.py"), within(site)]
 
-    def start(self, *arguments: str | Path) -> subprocess.Popen[bytes]:
+    def start(self, *arguments: object) -> subprocess.Popen[bytes]:
         """Start what the extension starts: ``-m`` or ``-c`` and what follows, paths of this machine or words."""
-        words = [within(word) if isinstance(word, Path) else word for word in arguments]
+        words = [within(word) if isinstance(word, Path) else str(word) for word in arguments]
         pipe = subprocess.PIPE
         environment = os.environ | self._environment
         return subprocess.Popen([*self._command, *words], stdout=pipe, stderr=subprocess.STDOUT, env=environment)
 
-    def run(self, *arguments: str | Path) -> str:
+    def run(self, *arguments: object) -> str:
         """What it prints; AssertionError where it fails."""
         return finished(self.start(*arguments))
 
-    def drgs(self, *arguments: str | Path) -> str:
+    def drgs(self, *arguments: object) -> str:
         """The same of the command ``drgs``."""
         return self.run("-m", "drgs_blender.cli.main", *arguments)
 
@@ -131,7 +131,8 @@ def within(path: Path) -> str:
 @contextmanager
 def trial(name: str, failures: list[str]) -> Iterator[Callable[[str], None]]:
     """Print a name, what was found, and how long it took; an error is noted."""
-    began, found = time.monotonic(), []
+    began = time.monotonic()
+    found: list[str] = []
     try:
         yield found.append
         print(f"ok      {name}: {time.monotonic() - began:.1f} s{''.join(f', {text}' for text in found)}", flush=True)
