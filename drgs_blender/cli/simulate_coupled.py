@@ -71,7 +71,8 @@ def run_coupled(args: argparse.Namespace, data: Any, folder: Path) -> int:
     for body, report in zip(job.bodies, reports, strict=True):
         print(f"{body.name}: {report['particles']} of the particles ({report['method']}), frames in {body.out}")
     total = sum(report["particles"] for report in reports)
-    print(f"{total} particles in {len(reports)} bodies, at least {steps} time steps a frame", flush=True)
+    many = "bodies" if len(reports) > 1 else "body"
+    print(f"{total} particles in {len(reports)} {many}, at least {steps} time steps a frame", flush=True)
     for i, (body, report) in enumerate(zip(job.bodies, reports, strict=True)):
         warn(f'body "{body.name}"', report, 0 if i else steps)
     caches = [ParticleCache(body.out) for body in job.bodies]

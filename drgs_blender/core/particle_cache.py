@@ -188,7 +188,9 @@ class ParticleCache:
         try:
             header = Header(**json.loads(text))
         except (ValueError, TypeError) as error:
-            raise AssetError(str(path), "is not the header of a particle cache", _AGAIN) from error
+            raise AssetError(
+                str(path), "is not the header of a particle cache", "Remove this file, and bake again"
+            ) from error
         if header.version not in (1, VERSION):
             raise AssetError(str(path), f"is of version {header.version}, not {VERSION}", "Use the DR-GS that baked it")
         return header
@@ -199,6 +201,17 @@ class ParticleCache:
             return []
         names = (_NAME.fullmatch(name) for name in os.listdir(self.folder))
         return sorted(int(match[1]) for match in names if match)
+
+    def lacking(self, first: int, last: int) -> int | None:
+        """The first of some frames that is missing, or cut off: all have as many bytes; None: none is."""
+        sizes = []
+        for frame in range(first, last + 1):
+            try:
+                sizes.append(self.path(frame).stat().st_size)
+            except OSError:
+                return frame
+        whole = max(sizes, default=0)
+        return next((first + i for i, size in enumerate(sizes) if size != whole), None)
 
     def rest(self) -> ParticleFrame:
         """Particles and mesh at rest."""

@@ -120,9 +120,11 @@ def _resume(job: Job, cache: ParticleCache, header: Header, overwrite: bool) -> 
         return None
     if state is None:
         return None
-    whole = set(range(first, frame + 1)) <= set(cache.frames())
-    if not whole or not job.solver.restore(frame - first, arrays):
-        log.info("%s: does not hold all that is needed to go on; begins again", cache.folder)
+    if (gone := cache.lacking(first, frame)) is not None:
+        log.warning("%s: frame %d is missing or damaged; begins again", cache.folder, gone)
+        return None
+    if not job.solver.restore(frame - first, arrays):
+        log.warning("%s: its state is not that of this simulation; begins again", cache.folder)
         return None
     go_on(cache, found, header, frame, job.settings.last)
     return frame

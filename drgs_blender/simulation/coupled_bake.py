@@ -111,13 +111,13 @@ def _resume(job: CoupledJob, caches: Sequence[ParticleCache], headers: Sequence[
         )
     if missing or state is None:
         return None
-    wanted = set(range(first, frame + 1))
     for body, cache in zip(job.bodies, caches, strict=True):
-        if not wanted <= set(cache.frames()):
-            log.info('body "%s", %s: does not hold all that is needed to go on; begins again', body.name, cache.folder)
+        if (gone := cache.lacking(first, frame)) is not None:
+            told = 'body "%s", %s: frame %d is missing or damaged; all bodies begin again'
+            log.warning(told, body.name, cache.folder, gone)
             return None
     if not job.solver.restore(frame - first, arrays):
-        log.info("%s: does not hold all that is needed to go on; begins again", caches[0].folder)
+        log.warning("%s: its state is not that of this simulation; begins again", caches[0].folder)
         return None
     for cache, there, header in zip(caches, found, headers, strict=True):
         if there is not None:

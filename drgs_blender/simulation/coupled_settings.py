@@ -78,8 +78,14 @@ def parse_coupled(
         raise UsageError(f"{subject}, bodies", "is empty", 'Name bodies: [{"asset": "cat.drgs"}, ...]')
     _check(bodies, subject)
     touches = {(i, j): bodies[i].touch.with_other(bodies[j].touch) for i, j in combinations(range(len(bodies)), 2)}
+    given: set[tuple[int, int]] = set()
     for row in reader.items("contacts") if "contacts" in reader.data else []:
         pair = _pair(row, [body.name for body in bodies])
+        if pair in given:
+            raise UsageError(
+                f"{row.subject}, between", "names two bodies that another row has", "Remove one of the two"
+            )
+        given.add(pair)
         touches[pair] = _touch(row, touches[pair])
     return CoupledSettings(bodies, touches)
 
@@ -90,11 +96,14 @@ def _body(item: Reader, shared: Mapping[str, Any], out: Path | None) -> BodySett
         raise UsageError(item.subject, "names no asset", 'Give it one: {"asset": "cat.drgs"}')
     asset = Path(item.path("asset"))
     name = item.text("name") if "name" in item.data else asset.stem
+    if not name.isprintable():
+        raise UsageError(item.subject, f"has the name {name!r}", "Leave line breaks and control characters out")
     subject = f'{item.subject} "{name}"'
     own = Reader(dict(shared) | dict(item.data), subject, item.folder)
     if "out" not in item.data and (out is None or Path(name).name != name or name == ".."):
         problem = "has no folder for its frames" + (", and its name makes none" if out else "")
-        raise UsageError(subject, problem, 'Give it "out", or all a folder with --out')
+        remedy = 'Give it "out", or another "name"' if out else 'Give it "out", or all a folder with --out'
+        raise UsageError(subject, problem, remedy)
     place = Path(item.path("out")) if "out" in item.data else Path(out or "") / name
     settings = parse_settings({k: v for k, v in own.data.items() if k not in _OWN}, subject, item.folder)
     if settings.solver != "mpm":
@@ -119,7 +128,8 @@ def _check(bodies: tuple[BodySettings, ...], subject: str) -> None:
             raise UsageError(
                 f'{subject}, body "{other.name}"', "has the name of another", 'Give it a "name" of its own'
             )
-        if body.out.resolve() == other.out.resolve():
+        # On Windows and macOS the case of letters does not tell them apart.
+        if str(body.out.resolve()).casefold() == str(other.out.resolve()).casefold():
             raise UsageError(who, f"have the same folder, {body.out}", 'Give each its own "out"')
         for key in _SAME:
             one, two = getattr(body.settings, key), getattr(other.settings, key)

@@ -299,7 +299,7 @@ def test_damaged_frames_are_named(tmp_path):
     with pytest.raises(AssetError, match=r"frame_000002.*Bake again"):
         cache.read(2)
     (tmp_path / "cache.json").write_text('{"no": 1}')
-    with pytest.raises(AssetError, match=r"cache\.json.*Bake again"):
+    with pytest.raises(AssetError, match=r"cache\.json.*Remove this file, and bake again"):
         cache.header()
 
 

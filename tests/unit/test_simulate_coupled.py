@@ -178,6 +178,15 @@ def test_a_coupled_bake_goes_on_with_the_same_bits(tmp_path, whole):
     assert run(tmp_path, last=3) == 0, "a part of what is there"
 
 
+def test_a_frame_that_is_cut_off_is_named_and_baked_anew(tmp_path, whole, caplog):
+    run(tmp_path)
+    path = ParticleCache(tmp_path / "pile").path(3)
+    path.write_bytes(path.read_bytes()[:500])
+    assert run(tmp_path) == 4
+    assert "pile" in caplog.text and "frame 3" in caplog.text
+    assert content(tmp_path) == content(whole)
+
+
 def test_headers_say_which_lattice_particles_fill_also_those_of_an_earlier_version(tmp_path, whole):
     """Without it nothing that is torn is closed; baking again, which computes nothing anew, brings it."""
     wanted = [ParticleCache(whole / name).header().cells for name in ("top", "pile")]
@@ -311,7 +320,13 @@ def bodies(*changes: dict) -> dict:
         (SCENE | {"bodies": SCENE["bodies"][:1] * 2}, r'body "top": is listed twice'),
         (bodies({}, {"name": "top"}), r'body "top": has the name of another'),
         (bodies({"out": "a"}, {"out": "./a"}), r'bodies "top" and "pile": have the same folder'),
-        (bodies({}, {"name": "../pile"}), r'bodies 2 "../pile": has no folder'),
+        (bodies({"out": "a"}, {"out": "A"}), r'bodies "top" and "pile": have the same folder'),
+        (bodies({}, {"name": "../pile"}), r'bodies 2 "../pile": has no folder.*another "name"'),
+        (bodies({}, {"name": "a\0b"}), r"bodies 2: has the name 'a.x00b'"),
+        (
+            SCENE | {"contacts": [{"between": ["top", "pile"]}, {"between": ["pile", "top"]}]},
+            r"contacts 2, between: names",
+        ),
         (bodies({}, {"fps": 30}), r'bodies "top" and "pile": differ in fps, 24.* and 30'),
         (bodies({}, {"last": 9}), r'bodies "top" and "pile": differ in last, 5 and 9'),
         (bodies({"solver": "rigid"}, {}), r'"top": has the solver rigid.*Choose mpm, or .*collider'),
