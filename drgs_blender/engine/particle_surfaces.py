@@ -94,7 +94,7 @@ class ParticleSurfaces:
         faces = made.faces if np.linalg.det(linear) > 0 else made.faces[:, ::-1]
         surface = ParticleSurface(
             (made.vertices @ back.T).astype(np.float32), np.ascontiguousarray(faces), normals.astype(np.float32),
-            made.coarse,
+            made.coarse, made.far,
         )  # fmt: skip
         vertex = self._vertices_of(loaded, particles.rest)[np.flatnonzero(usable)[index]]
         return Skin(surface, vertex, share.astype(np.float32))

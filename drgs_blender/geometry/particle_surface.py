@@ -24,6 +24,8 @@ _ENDS, _SUM = 3.0, 4.0 * np.pi * 8.0 / 105.0
 _DROP, _FEW = 1.4, 5.0
 #: Nodes of the grid a spacing, at most; nodes in all; of a block along each axis.
 _NODES, _MOST, _BLOCK = 2.0, 1 << 25, 8
+#: Share of the particles, at each end of an axis, that may be left out where they are far off.
+_STRAY = 0.002
 #: Level of the surface: that at which the surface of a block of particles is where their volume ends.
 LEVEL = 0.54
 
@@ -41,12 +43,15 @@ class ParticleSurface(NamedTuple):
         Unit.
     coarse : bool
         Whether the grid was made coarser, since the particles are spread too far.
+    far : int
+        Particles that are left out, as a few are much farther off than all others.
     """
 
     vertices: Array
     faces: Array
     normals: Array
     coarse: bool
+    far: int = 0
 
 
 def particle_surface(points: Array, spacing: float) -> ParticleSurface:
@@ -65,8 +70,14 @@ def particle_surface(points: Array, spacing: float) -> ParticleSurface:
     if not len(places):
         return _nothing(False)
     reach = _ENDS * float(np.sqrt(_SHARE * 0.3 * _AROUND**2 + _ALONE))
-    low, high = places.min(axis=0) - reach - 1, places.max(axis=0) + reach + 1
     step = 1.0 / _NODES
+    low, high = places.min(axis=0) - reach - 1, places.max(axis=0) + reach + 1
+    far = 0
+    if np.prod(np.ceil((high - low) / step) + 1) > _MOST:
+        ends = np.quantile(places, (_STRAY, 1.0 - _STRAY), axis=0)
+        near = (np.abs(places - ends.mean(axis=0)) <= 1.5 * np.ptp(ends, axis=0) + reach).all(axis=1)
+        far, places = int((~near).sum()), places[near]
+        low, high = places.min(axis=0) - reach - 1, places.max(axis=0) + reach + 1
     while np.prod(np.ceil((high - low) / step) + 1) > _MOST:
         step *= 1.25
     low = np.floor(low / step) * step  # the same nodes in all frames
@@ -83,7 +94,7 @@ def particle_surface(points: Array, spacing: float) -> ParticleSurface:
     vertices, faces, normals, _ = marching_cubes(field, LEVEL, gradient_direction="ascent")
     checkpoint()
     made = ((vertices * step + low) * spacing).astype(np.float32)
-    return ParticleSurface(made, faces.astype(np.int32), normals.astype(np.float32), step > 1.0 / _NODES)
+    return ParticleSurface(made, faces.astype(np.int32), normals.astype(np.float32), step > 1.0 / _NODES, far)
 
 
 def _nothing(coarse: bool) -> ParticleSurface:

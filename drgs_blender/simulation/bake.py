@@ -119,6 +119,11 @@ def _resume(job: Job, cache: ParticleCache, header: Header, overwrite: bool) -> 
             )
         return None
     if state is None:
+        last = job.settings.last
+        if found.moves == job.moves and cache.lacking(first, last) is None:
+            return last  # nothing is left to do
+        if len(cache.frames()) > 1:
+            log.warning("%s: its state is missing or damaged; begins again", cache.folder)
         return None
     if (gone := cache.lacking(first, frame)) is not None:
         log.warning("%s: frame %d is missing or damaged; begins again", cache.folder, gone)

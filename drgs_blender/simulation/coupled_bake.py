@@ -109,7 +109,14 @@ def _resume(job: CoupledJob, caches: Sequence[ParticleCache], headers: Sequence[
             f"is missing: it belongs to the frames that are there of {names}",
             "Put the folder back, or bake all again (--overwrite)",
         )
-    if missing or state is None:
+    if missing:
+        return None
+    if state is None:
+        moves = all(a is not None and a.moves == b.moves for a, b in zip(found, headers, strict=True))
+        if moves and all(cache.lacking(first, last) is None for cache in caches):
+            return last  # nothing is left to do
+        if begun:
+            log.warning("%s: its state is missing or damaged; all bodies begin again", caches[0].folder)
         return None
     for body, cache in zip(job.bodies, caches, strict=True):
         if (gone := cache.lacking(first, frame)) is not None:

@@ -34,6 +34,14 @@ def test_water_in_a_box_has_its_volume_and_a_level_top():
     assert surface.normals[np.argmax(surface.vertices[:, 2])][2] > 0.9 and not surface.coarse
 
 
+def test_one_particle_that_flies_off_costs_the_others_nothing():
+    particles = box(14, 12, 10)
+    alone = particle_surface(particles, 1.0)
+    found = particle_surface(np.concatenate([particles, [[1e6, 0.0, 0.0]]]), 1.0)
+    assert (found.far, found.coarse, alone.far) == (1, False, 0)
+    assert np.array_equal(found.vertices, alone.vertices) and np.array_equal(found.faces, alone.faces)
+
+
 def test_every_particle_is_there():
     """Drops of one, two and five particles have surfaces of their own, of about their volume."""
     groups = [[[0, 0, 0]], [[9, 0, 0], [9, 1, 0]], [[0, 9, 0], [1, 9, 0], [0, 10, 0], [1, 10, 0], [0, 9, 1]]]

@@ -187,6 +187,17 @@ def test_a_frame_that_is_cut_off_is_named_and_baked_anew(tmp_path, whole, caplog
     assert content(tmp_path) == content(whole)
 
 
+def test_frames_outlive_their_state(tmp_path, whole, caplog):
+    """A state that is damaged costs nothing where all is there, and is told where all begins again."""
+    run(tmp_path)
+    (tmp_path / "top" / "state.drgp").write_bytes(b"gone")
+    kept = {path: path.read_bytes() for path in tmp_path.rglob("frame_*")}
+    assert run(tmp_path) == 0 and kept == {path: path.read_bytes() for path in tmp_path.rglob("frame_*")}
+    ParticleCache(tmp_path / "pile").path(5).unlink()
+    assert run(tmp_path) == 4 and "its state is missing or damaged" in caplog.text
+    assert content(tmp_path) == content(whole)
+
+
 def test_headers_say_which_lattice_particles_fill_also_those_of_an_earlier_version(tmp_path, whole):
     """Without it nothing that is torn is closed; baking again, which computes nothing anew, brings it."""
     wanted = [ParticleCache(whole / name).header().cells for name in ("top", "pile")]
