@@ -11,6 +11,8 @@ from ..core.asset import Asset
 from ..core.asset.model import Mesh
 from ..core.errors import AssetError, UsageError
 
+#: Times the surfels' size from which on a proxy is taken for one in another unit.
+_LARGE = 20
 HELP = "mesh at rest that carries the surfels of an asset without one, in its space, metres"
 
 
@@ -37,9 +39,16 @@ def read_proxy(path: Path, asset: Asset, subject: str) -> Mesh:
     vertices, faces = np.ascontiguousarray(file.vertices, np.float32), np.ascontiguousarray(file.faces, np.int32)
     if not len(faces) or not np.isfinite(vertices).all():
         raise AssetError(f"--proxy {path}", "has no faces, or vertices that are not finite", "Clean the mesh up")
-    centre = asset.surfels.centre
+    a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
+    if not np.cross(b - a, c - a).any():
+        raise AssetError(f"--proxy {path}", "has faces without area", "Choose a closed mesh around the surfels")
+    centre, used = asset.surfels.centre, vertices[np.unique(faces)]
     low, high = centre.min(axis=0), centre.max(axis=0)
-    if (vertices.max(axis=0) < low).any() or (vertices.min(axis=0) > high).any():
+    size, own = float(np.ptp(used, axis=0).max()), float((high - low).max())
+    if size > _LARGE * own:
+        problem = f"is {size:.3g} m large, the surfels of {subject} {own:.3g} m"
+        raise AssetError(f"--proxy {path}", problem, "Save it in metres")
+    if (used.max(axis=0) < low).any() or (used.min(axis=0) > high).any():
         remedy = "Save it in the space of the surfels, Z up"
         raise AssetError(f"--proxy {path}", f"is not where the surfels of {subject} are", remedy)
     grey = np.full((len(vertices), 3), 0.5, np.float32)

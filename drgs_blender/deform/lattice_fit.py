@@ -27,11 +27,35 @@ Array = np.ndarray
 
 #: Cells along the longest side, and cells at most.
 _CELLS, _MOST = 40, 6_000
+#: Cells from point to point on faces, and points on those of one size at most.
+_APART, _MOST_SAMPLES = 3, 50_000
 #: s and a; sums over points are those of the cells that have any.
 _SMOOTH, _ASIDE = 1e-2, 1e-6
 _CORNERS = np.array(list(product((0, 1), repeat=3)))
 #: One along each axis, and none.
 _STEPS = np.eye(4, 3, dtype=int)
+
+
+def _samples(rest: Array, faces: Array, side: float):  # type: ignore[no-untyped-def]
+    """Sparse (k, v): the vertices, and points on faces larger than `_APART` cells of a `side`, as far apart."""
+    rows, columns, values = ([np.arange(len(rest))], [np.arange(len(rest))], [np.ones(len(rest))])
+    count = len(rest)
+    corners = rest[faces] if len(faces) else np.zeros((0, 3, 3))
+    longest = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).max(axis=1, initial=0.0)
+    parts = np.minimum(np.ceil(np.nan_to_num(longest) / (_APART * side)), _CELLS).astype(int)
+    for n in np.unique(parts[parts > 1]):
+        large = faces[parts == n]
+        shares = np.array([(i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
+        shares = shares[(shares < 1).all(axis=1)]  # corners are there
+        if len(large) * len(shares) > _MOST_SAMPLES:
+            shares = shares[:: -(-len(large) * len(shares) // _MOST_SAMPLES)]
+        rows.append(np.repeat(count + np.arange(len(large) * len(shares)), 3))
+        columns.append(np.repeat(large[:, None], len(shares), axis=1).reshape(-1))
+        values.append(np.tile(shares.reshape(-1), len(large)))
+        count += len(large) * len(shares)
+    return sparse.csr_matrix(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (count, len(rest))
+    )
 
 
 class LatticeFit:
@@ -62,12 +86,16 @@ class LatticeFit:
         if not len(self._rest):
             raise UsageError("the proxy", "has no vertices", "Give it some")
         self._normals = VertexNormals(faces, len(self._rest)) if len(faces) else None
-        self._lay_out(self._rest, np.asarray(carried, np.float64))
+        carried = np.asarray(carried, np.float64)
+        self._side = max(float(np.ptp(np.concatenate([self._rest, carried]), axis=0).max()) / _CELLS, 1e-9)
+        self._samples = _samples(self._rest, np.asarray(faces), self._side)
+        points = self._samples @ self._rest
+        self._lay_out(points, carried)
         self.nodes = np.ascontiguousarray(self._origin + self._side * self._place, np.float32)
-        beside = self._beside(self._rest)
-        at, aside = self._trilinear(self._rest), self._trilinear(beside)
-        filled = len(np.unique((self._rest - self._origin) // self._side, axis=0))
-        weight = filled / len(self._rest)
+        beside = self._samples @ self._beside(self._rest)
+        at, aside = self._trilinear(points), self._trilinear(beside)
+        filled = len(np.unique((points - self._origin) // self._side, axis=0))
+        weight = filled / len(points)
         smooth = self._second_differences()
         moments = weight * (at.T @ at + _ASIDE * aside.T @ aside) + _SMOOTH * smooth.T @ smooth
         moments += 1e-14 * sparse.identity(moments.shape[0])
@@ -81,7 +109,8 @@ class LatticeFit:
         now = np.asarray(vertices, np.float64)
         lost = np.logical_not(np.isfinite(now).all(axis=1))
         now = np.where(lost[:, None], self._rest, now)
-        moved = self._solve(self._data @ np.concatenate([now - self._rest, self._beside(now) - self._rest_beside]))
+        sampled = self._samples @ np.concatenate([now - self._rest, self._beside(now)], axis=1)
+        moved = self._solve(self._data @ np.concatenate([sampled[:, :3], sampled[:, 3:] - self._rest_beside]))
         slopes = np.stack([difference @ moved for difference in self._differences], axis=2)
         gradients = np.ascontiguousarray(slopes + np.eye(3), np.float32)
         if lost.any():
@@ -99,7 +128,6 @@ class LatticeFit:
         """Choose cells, and number their corners."""
         every = np.concatenate([rest, carried])
         low, extent = every.min(axis=0), np.ptp(every, axis=0)
-        self._side = max(float(extent.max()) / _CELLS, 1e-9)
         while True:
             self._origin = low - 2.5 * self._side
             self._shape = np.ceil(extent / self._side).astype(int) + 6

@@ -154,6 +154,8 @@ def _skinned(item: CachedObject, skin: Skin, index: int) -> CachedObject:
     item.faults.append(f"{name}: shown by a surface of its particles, not by its surfels; Surface: Mesh shows these")
     if item.loaded.asset.mesh.textures is not None:
         item.faults.append(f"{name}: the surface of its particles has the materials of vertices, not images")
+    if skin.lost:
+        item.faults.append(f"{name}: {skin.lost} particles are not finite, and not seen. Bake again")
     if skin.surface.far:
         item.faults.append(f"{name}: {skin.surface.far} particles are much farther off than the others, and not seen")
     if skin.surface.coarse:

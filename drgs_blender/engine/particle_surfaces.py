@@ -39,11 +39,14 @@ class Skin(NamedTuple):
         Vertices of the asset's mesh whose materials each of its vertices has.
     share : (n, k) float32 array
         How much of each.
+    lost : int
+        Particles that are not finite.
     """
 
     surface: ParticleSurface
     vertex: Array
     share: Array
+    lost: int = 0
 
 
 class ParticleSurfaces:
@@ -81,7 +84,7 @@ class ParticleSurfaces:
         made = particle_surface(now, 1.0)
         usable = np.isfinite(now).all(axis=1)
         if not len(made.vertices):
-            return Skin(made, np.zeros((0, 1), np.int32), np.zeros((0, 1), np.float32))
+            return Skin(made, np.zeros((0, 1), np.int32), np.zeros((0, 1), np.float32), int((~usable).sum()))
         count = min(_NEAR, int(usable.sum()))
         checkpoint()
         distance, index = cKDTree(now[usable]).query(made.vertices, k=count, workers=-1)
@@ -97,7 +100,7 @@ class ParticleSurfaces:
             made.coarse, made.far,
         )  # fmt: skip
         vertex = self._vertices_of(loaded, particles.rest)[np.flatnonzero(usable)[index]]
-        return Skin(surface, vertex, share.astype(np.float32))
+        return Skin(surface, vertex, share.astype(np.float32), int((~usable).sum()))
 
     def _vertices_of(self, loaded: LoadedAsset, rest: Array) -> Array:
         from scipy.spatial import cKDTree  # an engine starts without

@@ -69,6 +69,18 @@ def test_an_affine_proxy_does_that_to_the_surfels(session, frame):
     assert np.einsum("nc,nc->n", found.normal, want.normal).min() > 0.99999
 
 
+@pytest.mark.parametrize("faces", [slice(None), slice(0, 8)])
+def test_a_proxy_of_few_corners_does_the_same(session, frame, faces):
+    """A box, whole and with open sides: its faces move what is inside, not its eight corners alone."""
+    box = trimesh.creation.box((2.4, 2.4, 2.4))
+    rest = np.ascontiguousarray(box.vertices, np.float32)
+    proxy = ProxyMesh(
+        rest, np.array(rest @ LINEAR.T + SHIFT, np.float32), np.ascontiguousarray(box.faces[faces], np.int32)
+    )
+    before = posed(session, frame).centre.copy()
+    assert np.abs(posed(session, frame, proxy=proxy).centre - (before @ LINEAR.T + SHIFT)).max() < 1e-4
+
+
 def test_a_twisted_proxy_twists_what_is_inside(session, frame):
     rest = posed(session, frame).centre.copy()
     found = posed(session, frame, proxy=proxy_of(bent)).centre

@@ -110,6 +110,8 @@ def test_matter_that_flows_carries_no_surfels(folder, relight, tmp_path):
     (("--proxy", "hull.ply", "--vertices", "few.npy"), "bare.drgs", "has 7 vertices"),
     (("--proxy", "hull.ply", "--vertices", "pose.npy", "--vertex-order", "asset"), "bare.drgs", "--vertex-order"),
     (("--proxy", "far.ply", "--vertices", "pose.npy"), "bare.drgs", "is not where"),
+    (("--proxy", "flat.ply", "--vertices", "pose.npy"), "bare.drgs", "without area"),
+    (("--proxy", "large.ply", "--vertices", "pose.npy"), "bare.drgs", "in metres"),
     (("--proxy", "points.ply", "--vertices", "pose.npy"), "bare.drgs", "points.ply"),
     (("--proxy", "nothing.ply", "--vertices", "pose.npy"), "bare.drgs", "nothing.ply"),
 ])  # fmt: skip
@@ -117,6 +119,8 @@ def test_what_carries_nothing_is_named(folder, relight, options, asset, said):
     np.save(folder / "pose.npy", hull(folder))
     np.save(folder / "few.npy", hull(folder)[:7])
     trimesh.creation.icosphere(subdivisions=2).apply_translation((9, 0, 0)).export(folder / "far.ply")
+    trimesh.creation.icosphere(subdivisions=2, radius=600).export(folder / "large.ply")
+    trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False).export(folder / "flat.ply")
     trimesh.PointCloud(hull(folder)).export(folder / "points.ply")
     words = [str(folder / word) if "." in word else word for word in options]
     code, told = relight(*words, asset=asset)
