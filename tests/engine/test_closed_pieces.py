@@ -180,7 +180,9 @@ def test_what_flows_is_shown_by_its_particles(session, make_frame, filling, surf
     assert [text for text in passes.warnings if "surface of its particles" in text]
     assert_same_bits(passes, fresh(asset_path, frame))
     frame.objects[0].particles = replace(state.particles, points=np.full_like(poured, np.nan, np.float32))
-    assert not session.render(frame)["Combined"][..., 3].any()
+    passes = session.render(frame)
+    assert not passes["Combined"][..., 3].any()
+    assert [text for text in passes.warnings if f"{count} particles are not finite" in text]
 
 
 def test_matter_that_was_posed_before_it_broke_is_closed(session, make_frame, filling):
