@@ -21,10 +21,13 @@ ROOT = Path(__file__).resolve().parents[2]
 SIZE, FOCAL, COUNT = (320, 240), 340.0, 9
 
 #: Runs the command of argv once for each ending: at a call of a phase, or before a file gets its name. Forks share what
-#: is imported. It prints, for each run, how it ended and (phase, part) of all its calls.
+#: is imported. It prints, for each run, how it ended and (phase, part) of all its calls. All on one core: threads work
+#: in any order, by which focal lengths of two runs on a busy machine have differed by 5e-4.
 PROGRAM = """
 import json, os, signal, sys
 from pathlib import Path
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
 from drgs_blender.capture import features, libraries, pipeline
 from drgs_blender.cli import capture, main
 libraries.load("pycolmap")
