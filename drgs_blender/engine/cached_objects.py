@@ -151,7 +151,9 @@ def _skinned(item: CachedObject, skin: Skin, index: int) -> CachedObject:
     """An object that is met by the surface of its particles."""
     name = item.state.name
     item.mesh, item.met, item.skin = skin_mesh(item.state, item.traced, skin, index), stub(item.traced), skin
-    item.faults.append(f"{name}: shown by a surface of its particles, not by its surfels; Surface: Mesh shows these")
+    item.faults.append(
+        f"{name}: shown by a surface of its particles, not by its surfels; Surface: Mesh (--surface mesh) shows these"
+    )
     if item.loaded.asset.mesh.textures is not None:
         item.faults.append(f"{name}: the surface of its particles has the materials of vertices, not images")
     if skin.lost:
