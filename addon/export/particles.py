@@ -61,8 +61,7 @@ def particles_of(
         header = cache.header()
         if header is None:
             return None  # told by `cache_playback.check`
-        automatic = physics.surface == "automatic" and header.is_fluid and not obj.drgs.captured_colours
-        skin = physics.surface == "particles" or automatic
+        skin = header.has_skin(physics.surface, obj.drgs.captured_colours)
         if skin and header.cells is None:
             warn(f'"{obj.name}": was baked before particles had a surface, so its mesh is shown, stretched. Bake again')
             skin = False

@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from ..core.phases import is_counted, is_preparing
@@ -197,3 +197,9 @@ def prepare_engine(args: argparse.Namespace, *jobs: str) -> None:
 
     with FractionBar(args, "preparing", programs=True) as show, interruptible() as stopped:
         prepare_kernels(jobs, show, stopped)
+
+
+def frames_on(bar: FractionBar, first: int, last: int) -> Callable[[int, float], None]:
+    """What shows on a bar the frame that is computed, of those after `first` up to `last`, and the part of it."""
+    count = max(last - first, 1)
+    return lambda frame, part: bar(f"frame {frame}", (frame - first - 1 + part) / count)

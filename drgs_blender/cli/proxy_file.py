@@ -13,12 +13,12 @@ from ..core.errors import AssetError, UsageError
 
 #: Times the surfels' size from which on a proxy is taken for one in another unit.
 _LARGE = 20
-HELP = "mesh at rest that carries the surfels of an asset without one, in its space, metres"
 
 
 def add_proxy(parser: argparse._ActionsContainer, more: str) -> None:
     """Declare the option; `more` says what the command does with it."""
-    parser.add_argument("--proxy", type=Path, metavar="MESH", help=f"{HELP}: {more}")
+    what = "mesh at rest that carries the surfels of an asset without one, in its space, metres"
+    parser.add_argument("--proxy", type=Path, metavar="MESH", help=f"{what}: {more}")
 
 
 def read_proxy(path: Path, asset: Asset, subject: str) -> Mesh:

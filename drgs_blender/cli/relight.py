@@ -314,9 +314,8 @@ def _poses(args: argparse.Namespace) -> tuple[Sequence[tuple[int, Callable[[], _
     if missing := sorted(set(frames) - set(cache.frames())):
         cache.read(missing[0])  # says which are there
     check_template(str(args.out), frames)
-    automatic = args.surface == "automatic" and header.is_fluid and not args.captured
-    driven, skin = args.driven_by, args.surface == "particles" or automatic
-    driven = driven if header.keeps_shape else "surface"
+    skin = header.has_skin(args.surface, args.captured)
+    driven = args.driven_by if header.keeps_shape else "surface"
     if skin and header.cells is None:
         problem = "was baked before particles had a surface"
         if args.surface == "particles":

@@ -21,7 +21,7 @@ from ..core.particle_cache import ParticleCache
 from .interrupt import interruptible
 from .json_file import read_json
 from .output import check_suffix, check_writable
-from .progress import FractionBar, clock, prepare_engine
+from .progress import FractionBar, clock, frames_on, prepare_engine
 from .proxy_file import add_proxy, read_proxy
 from .sampling import int_range
 
@@ -141,13 +141,14 @@ def run(args: argparse.Namespace) -> int:
     )
     warn(str(args.asset), report, steps)
     cache = ParticleCache(args.out)
-    count = settings.last - settings.first + 1
     with FractionBar(args, "simulating") as bar, interruptible() as stopped:
-
-        def progress(frame: int, part: float) -> None:
-            bar(f"frame {frame}", (frame - settings.first - 1 + part) / max(count - 1, 1))
-
-        done = bake(job, cache, overwrite=args.overwrite, cancelled=stopped, progress=progress)
+        done = bake(
+            job,
+            cache,
+            overwrite=args.overwrite,
+            cancelled=stopped,
+            progress=frames_on(bar, settings.first, settings.last),
+        )
     print(f"{args.out}: frames {settings.first} to {settings.last}, {done} of them computed now")
     _write_exports(args, cache, mesh, settings)
     return 0

@@ -12,7 +12,7 @@ from ..core.file_types import USD_SUFFIXES
 from ..core.particle_cache import ParticleCache
 from .interrupt import interruptible
 from .output import check_writable
-from .progress import FractionBar, clock, prepare_engine
+from .progress import FractionBar, clock, frames_on, prepare_engine
 
 #: Options that are of one body alone.
 _OF_ONE = (
@@ -76,13 +76,14 @@ def run_coupled(args: argparse.Namespace, data: Any, folder: Path) -> int:
     for i, (body, report) in enumerate(zip(job.bodies, reports, strict=True)):
         warn(f'body "{body.name}"', report, 0 if i else steps)
     caches = [ParticleCache(body.out) for body in job.bodies]
-    count = settings.last - settings.first + 1
     with FractionBar(args, "simulating") as bar, interruptible() as stopped:
-
-        def progress(frame: int, part: float) -> None:
-            bar(f"frame {frame}", (frame - settings.first - 1 + part) / max(count - 1, 1))
-
-        done = bake_coupled(job, caches, overwrite=args.overwrite, cancelled=stopped, progress=progress)
+        done = bake_coupled(
+            job,
+            caches,
+            overwrite=args.overwrite,
+            cancelled=stopped,
+            progress=frames_on(bar, settings.first, settings.last),
+        )
     names = ", ".join(body.name for body in job.bodies)
     print(f"{names}: frames {settings.first} to {settings.last}, {done} of them computed now")
     _write_exports(args, list(zip([b.name for b in job.bodies], meshes, caches, [j.settings for j in job.jobs])))

@@ -83,6 +83,17 @@ class Header:
         """Whether none of the matter flows: only then do its particles know how space around them deforms."""
         return all(isinstance(row, dict) and row.get("model") not in LOOSE for row in self._materials)
 
+    def has_skin(self, surface: str, captured: bool) -> bool:
+        """Whether an object is shown by a surface of its particles.
+
+        Parameters
+        ----------
+        surface : str
+            "particles", "mesh", or "automatic": of fluids, but where `captured` colours are shown, which it has not.
+        captured : bool
+        """
+        return surface == "particles" or (surface == "automatic" and self.is_fluid and not captured)
+
     @property
     def _materials(self) -> list[Any]:
         """That of the body and those of its regions, as far as they are known."""

@@ -18,6 +18,7 @@ from ..deform.mesh_driven import MeshDriven
 from ..deform.particle_driven import Frames, place
 from ..geometry.normals import VertexNormals
 from ..render.scene.trace_scene import ObjectMesh, TraceObject
+from .carrier_cache import still_used
 from .loaded_assets import LoadedAsset
 
 #: Layers of faces that replace others: albedo; roughness and metallic.
@@ -48,14 +49,10 @@ class BrokenMatter:
     def begin(self, states: Iterable[ObjectState]) -> None:
         """A frame begins: what none of its objects has is forgotten."""
         rests = [state.particles.rest for state in states if state.particles is not None and state.inside is not None]
-        self._known = [
-            known
-            for known in self._known
-            if known.loaded() is not None and any(_same(rest, known.rest) for rest in rests)
-        ]
+        self._known = still_used(self._known, rests)
         begun = [known.began for known in self._known]
         self._frames = [
-            frames for frames in self._frames if frames[0]() is not None and any(_same(frames[1], b) for b in begun)
+            frames for frames in self._frames if frames[0]() is not None and any(same_bits(frames[1], b) for b in begun)
         ]
 
     def closed(self, loaded: LoadedAsset, state: ObjectState) -> ClosedMatter | None:
@@ -78,7 +75,7 @@ class BrokenMatter:
         rest = particles.rest, particles.cells, _began(loaded, state)
         for known in self._known:
             both = zip(rest, (known.rest, known.cells, known.began))
-            if known.loaded() is loaded and all(_same(a, b) for a, b in both):
+            if known.loaded() is loaded and all(same_bits(a, b) for a, b in both):
                 matter = known.matter
                 break
         else:
@@ -112,15 +109,11 @@ class BrokenMatter:
     def _at_rest(self, loaded: LoadedAsset, state: ObjectState, driven: MeshDriven) -> Frames:
         began = _began(loaded, state)
         for known, places, frames in self._frames:
-            if known() is loaded and _same(places, began):
+            if known() is loaded and same_bits(places, began):
                 return frames
         frames = Frames.of(driven.pose(began))
         self._frames.append((weakref.ref(loaded), began, frames))
         return frames
-
-
-def _same(a: Array, b: Array) -> bool:
-    return a is b or same_bits(a, b)
 
 
 def _began(loaded: LoadedAsset, state: ObjectState) -> Array:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -26,6 +26,24 @@ class _Known(NamedTuple):
     carrier: ParticleDriven
 
 
+class _Bound(Protocol):
+    """What is known of an asset and of particles at rest."""
+
+    @property
+    def loaded(self) -> weakref.ref[LoadedAsset]: ...
+
+    @property
+    def rest(self) -> Array: ...
+
+
+_B = TypeVar("_B", bound=_Bound)
+
+
+def still_used(known: Iterable[_B], rests: Sequence[Array]) -> list[_B]:
+    """Those of `known` whose asset is loaded, and whose particles at rest are among `rests`."""
+    return [one for one in known if one.loaded() is not None and any(same_bits(rest, one.rest) for rest in rests)]
+
+
 class CarrierCache:
     """Binds surfels to particles; keeps what objects of the frame can use, at any level of detail."""
 
@@ -35,11 +53,7 @@ class CarrierCache:
     def begin(self, states: Iterable[ObjectState]) -> None:
         """A frame begins: bindings to particles that none of its objects has are forgotten."""
         rests = [state.particles.rest for state in states if state.particles is not None and state.particles.surfels]
-        self._known = [
-            known
-            for known in self._known
-            if known.loaded() is not None and any(_same(rest, known.rest) for rest in rests)
-        ]
+        self._known = still_used(self._known, rests)
 
     def carrier(self, loaded: LoadedAsset, state: ObjectState) -> ParticleDriven | None:
         """What carries an object's surfels besides its faces; None where it has no particles.
@@ -53,7 +67,7 @@ class CarrierCache:
         if particles is None or not particles.surfels:
             return None
         for known in self._known:
-            if known.loaded() is loaded and known.all == particles.all and _same(known.rest, particles.rest):
+            if known.loaded() is loaded and known.all == particles.all and same_bits(known.rest, particles.rest):
                 return known.carrier
         if loaded.larger is not None:
             whole = self.carrier(loaded.larger, state)
@@ -63,10 +77,6 @@ class CarrierCache:
             found = _bound(loaded, state, particles)
         self._known.append(_Known(weakref.ref(loaded), particles.rest, particles.all, found))
         return found
-
-
-def _same(a: Array, b: Array) -> bool:
-    return a is b or same_bits(a, b)
 
 
 def _bound(loaded: LoadedAsset, state: ObjectState, particles: Particles) -> ParticleDriven:

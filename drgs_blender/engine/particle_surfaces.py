@@ -14,6 +14,7 @@ from ..core.frame import ObjectState
 from ..geometry.particle_surface import ParticleSurface, particle_surface
 from ..render.scene.trace_scene import ObjectMesh, TraceObject
 from .broken_matter import LAYERED, check_particles, material_layers, of_layers
+from .carrier_cache import still_used
 from .loaded_assets import LoadedAsset
 
 #: Particles whose materials a place of the surface has, and how far they count, in spacings.
@@ -58,11 +59,7 @@ class ParticleSurfaces:
     def begin(self, states: Iterable[ObjectState]) -> None:
         """A frame begins: what none of its objects has is forgotten."""
         rests = [state.particles.rest for state in states if state.particles is not None and state.particles.skin]
-        self._known = [
-            known
-            for known in self._known
-            if known.loaded() is not None and any(rest is known.rest or same_bits(rest, known.rest) for rest in rests)
-        ]
+        self._known = still_used(self._known, rests)
 
     def skin(self, loaded: LoadedAsset, state: ObjectState) -> Skin | None:
         """The surface of an object's particles; None where it is to be shown by its mesh.
@@ -106,7 +103,7 @@ class ParticleSurfaces:
         from scipy.spatial import cKDTree  # an engine starts without
 
         for known in self._known:
-            if known.loaded() is loaded and (known.rest is rest or same_bits(known.rest, rest)):
+            if known.loaded() is loaded and same_bits(known.rest, rest):
                 return known.vertex
         mesh = loaded.asset.mesh
         used = np.unique(mesh.faces)

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, Protocol
 
 from ..core.errors import UsageError
 from ..core.particle_cache import Header, ParticleCache, ParticleFrame
 from .input_digest import same_until
 from .job import Job
+from .settings import Settings
 
 log = logging.getLogger(__name__)
 
 #: Seconds of computing that an interruption may cost.
-SAVE_EVERY = 5.0
+_SAVE_EVERY = 5.0
 
 
 def bake(
@@ -55,30 +56,53 @@ def bake(
     Cancelled, WriteError
         What was done stays.
     """
-    settings, solver = job.settings, job.solver
-    rest = job.rest()
+    settings, rest = job.settings, job.rest()
     header = header_of(job, rest, asdict(settings))
     start = _resume(job, cache, header, overwrite)
     if start is None:
         cache.create(header, rest)
         cache.write(settings.first, rest)
         start = settings.first
+    return compute(job, [(cache, job)], start, cancelled, progress)
+
+
+class Simulation(Protocol):
+    """What moves one body or several, a `Job` or a `coupled_job.CoupledJob`."""
+
+    @property
+    def settings(self) -> Settings: ...
+
+    @property
+    def solver(self) -> Any: ...
+
+    def pin_targets(self, frame: int) -> Any: ...
+
+
+def compute(
+    simulation: Simulation,
+    bodies: Sequence[tuple[ParticleCache, Job]],
+    start: int,
+    cancelled: Callable[[], bool] | None,
+    progress: Callable[[int, float], None] | None,
+) -> int:
+    """Compute the frames after `start` into the caches of all bodies, the state into the first; how many these are."""
+    settings, solver = simulation.settings, simulation.solver
     done, kept, kept_at = 0, start, time.monotonic()
-    frame = start
     try:
         for frame in range(start + 1, settings.last + 1):
             report = None if progress is None else (lambda part, f=frame: progress(f, part))
-            solver.advance(1 / settings.fps, job.pin_targets(frame - settings.first), cancelled, report)
-            check_owner(cache, job)
-            cache.write(frame, job.now())
+            solver.advance(1 / settings.fps, simulation.pin_targets(frame - settings.first), cancelled, report)
+            for cache, job in bodies:
+                _check_owner(cache, job)
+                cache.write(frame, job.now())
             done += 1
-            if time.monotonic() - kept_at > SAVE_EVERY:
-                cache.write_state(frame, solver.arrays())
+            if time.monotonic() - kept_at > _SAVE_EVERY:
+                bodies[0][0].write_state(frame, solver.arrays())
                 kept, kept_at = frame, time.monotonic()
     finally:
         now = settings.first + solver.frame
-        if now > kept and cache.path(now).exists() and owned(cache, job):
-            cache.write_state(now, solver.arrays())
+        if now > kept and all(cache.path(now).exists() and _owned(cache, job) for cache, job in bodies):
+            bodies[0][0].write_state(now, solver.arrays())
     return done
 
 
@@ -91,14 +115,14 @@ def header_of(job: Job, rest: ParticleFrame, settings: dict[str, Any]) -> Header
     )  # fmt: skip
 
 
-def owned(cache: ParticleCache, job: Job) -> bool:
+def _owned(cache: ParticleCache, job: Job) -> bool:
     header = cache.header()
     return header is not None and (header.digest, header.moves) == (job.digest, job.moves)
 
 
-def check_owner(cache: ParticleCache, job: Job) -> None:
+def _check_owner(cache: ParticleCache, job: Job) -> None:
     """Frames of two simulations must never lie in one folder."""
-    if not owned(cache, job):
+    if not _owned(cache, job):
         raise UsageError(
             str(cache.folder), "was given to another simulation, or emptied, meanwhile", "Bake again, one at a time"
         )

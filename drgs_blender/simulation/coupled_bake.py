@@ -6,12 +6,11 @@ What is needed to go on lies in the cache of the first body alone, so that it is
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Sequence
 
 from ..core.errors import UsageError
 from ..core.particle_cache import Header, ParticleCache
-from .bake import SAVE_EVERY, check_owner, go_on, header_of, owned
+from .bake import compute, go_on, header_of
 from .coupled_job import CoupledJob, about_others
 from .input_digest import same_until
 
@@ -54,7 +53,7 @@ def bake_coupled(
     Cancelled, WriteError
         What was done stays.
     """
-    settings, solver, jobs = job.settings, job.solver, job.jobs
+    settings, jobs = job.settings, job.jobs
     rests = [one.rest() for one in jobs]
     headers = [
         header_of(one, rest, about_others(job, i)) for i, (one, rest) in enumerate(zip(jobs, rests, strict=True))
@@ -67,24 +66,7 @@ def bake_coupled(
             cache.create(header, rest)
             cache.write(settings.first, rest)
         start = settings.first
-    done, kept, kept_at = 0, start, time.monotonic()
-    try:
-        for frame in range(start + 1, settings.last + 1):
-            report = None if progress is None else (lambda part, f=frame: progress(f, part))
-            solver.advance(1 / settings.fps, job.pin_targets(frame - settings.first), cancelled, report)
-            for cache, one in zip(caches, jobs, strict=True):
-                check_owner(cache, one)
-                cache.write(frame, one.now())
-            done += 1
-            if time.monotonic() - kept_at > SAVE_EVERY:
-                caches[0].write_state(frame, solver.arrays())
-                kept, kept_at = frame, time.monotonic()
-    finally:
-        now = settings.first + solver.frame
-        there = all(cache.path(now).exists() and owned(cache, one) for cache, one in zip(caches, jobs, strict=True))
-        if now > kept and there:
-            caches[0].write_state(now, solver.arrays())
-    return done
+    return compute(job, list(zip(caches, jobs, strict=True)), start, cancelled, progress)
 
 
 def _resume(job: CoupledJob, caches: Sequence[ParticleCache], headers: Sequence[Header], overwrite: bool) -> int | None:
