@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Collection
 
 import bpy
@@ -12,6 +11,8 @@ from ..drgs_blender.core.asset import BASE_CHANNELS, OPTIONAL_CHANNELS
 NAME = "DR-GS"
 #: Custom property of images and materials of textures: what they were made of, and the optional channels they show.
 KEY = "drgs_textures"
+#: Custom property of images: their name in the asset that they came from.
+IMAGE = "drgs_image"
 #: Custom property of materials of textures: optional channels of which they have images, which their attributes leave.
 PICTURED = "drgs_pictured"
 #: Material channel -> (output of its attribute, input of the Principled BSDF).
@@ -89,23 +90,3 @@ def _show(material: bpy.types.Material, channels: Collection[str], glows: bool =
         attribute.attribute_name = attribute.label = channel
         attribute.location = (surface.location.x - 300, surface.location.y - 180 * row)
         links.new(attribute.outputs[output], surface.inputs[target])
-
-
-#: Hash of an image of an asset as imported, and the size of its packed file -> whether that is another one.
-_painted: dict[tuple[str, int], bool] = {}
-
-
-def painted_images(obj: bpy.types.Object) -> list[str]:
-    """Names of the images of an asset on `obj` whose pixels are others than its asset's."""
-    trees = [slot.material.node_tree for slot in obj.material_slots if slot.material and slot.material.node_tree]
-    images = {node.image for tree in trees for node in tree.nodes if node.type == "TEX_IMAGE" and node.image}
-    return sorted(image.name for image in images if KEY in image and _is_painted(image))
-
-
-def _is_painted(image: bpy.types.Image) -> bool:
-    if image.is_dirty or image.packed_file is None:
-        return image.is_dirty
-    digest, size = image[KEY].split()[0], image.packed_file.size
-    if (digest, size) not in _painted:
-        _painted[digest, size] = hashlib.sha256(image.packed_file.data).hexdigest() != digest
-    return _painted[digest, size]

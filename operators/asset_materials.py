@@ -7,7 +7,7 @@ import hashlib
 import bpy
 import numpy as np
 
-from ..addon.viewport_material import KEY, PICTURED, update_viewport_material
+from ..addon.viewport_material import IMAGE, KEY, PICTURED, update_viewport_material
 from ..drgs_blender.core.asset.textures import (
     ALBEDO,
     COAT,
@@ -169,5 +169,5 @@ def _image(textures: MeshTextures, number: int, space: str) -> bpy.types.Image:
     image.source = "FILE"
     image.colorspace_settings.name = space
     image.alpha_mode = "CHANNEL_PACKED"
-    image[KEY] = key
+    image[KEY], image[IMAGE] = key, list(textures.images)[number]
     return image

@@ -12,11 +12,13 @@ from bpy.props import BoolProperty, StringProperty
 
 from ..addon import assets, blend_paths, mesh_arrays, messages, surfel_points
 from ..addon.export.objects import appearance_of
+from ..addon.export.painted_images import with_painted_images
 from ..addon.export.topology_check import check_topology
 from ..addon.viewport_material import update_viewport_material
 from ..drgs_blender.core.asset.container import write_asset
 from ..drgs_blender.core.errors import UsageError
 from ..drgs_blender.core.material_adjustments import edited_asset
+from ..drgs_blender.core.repainted_textures import carried_paint
 from ..drgs_blender.core.texture_adjustments import edited_textures
 from . import selection
 from .base import DrgsOperator
@@ -101,7 +103,10 @@ def save(obj: bpy.types.Object, path: Path, depsgraph: bpy.types.Depsgraph) -> i
     """
     source = assets.file_of(obj)
     asset = assets.load(source)
-    asset, _, painted, adjustment, _ = appearance_of(obj.evaluated_get(depsgraph), asset, messages.Warnings())
+    told = messages.Warnings()
+    asset, _, painted, adjustment, _ = appearance_of(obj.evaluated_get(depsgraph), asset, told)
+    repainted = with_painted_images(obj, asset, told)
+    painted, asset = carried_paint(asset.mesh, repainted.mesh, painted), repainted
     if not len(asset.surfels) and not len(asset.mesh.faces):
         raise UsageError(f'Object "{obj.name}"', "has nothing left of its asset", "Undo the edit, or show some of it")
     edited = edited_asset(asset, painted, adjustment)

@@ -13,18 +13,18 @@ import numpy as np
 
 from ...drgs_blender.core.asset import MATERIAL_CHANNELS, Asset
 from ...drgs_blender.core.asset.part import Part, has_surfels, part_of, whole_of
-from ...drgs_blender.core.errors import first_of
 from ...drgs_blender.core.frame import Adjustment, ObjectState, ProxyMesh
 from ...drgs_blender.core.materials import ShaderAOV
 from ...drgs_blender.core.passes import Pass
 from .. import assets, cache_playback, cage_nodes, mesh_arrays, point_caches, proxies, surfel_points
-from ..viewport_material import is_viewport_material, painted_images
+from ..viewport_material import is_viewport_material
 from .aov_nodes import aov_values
 from .export_cache import ExportCache, uid
 from .holdouts import Holdouts
 from .instances import Key, Visible, terminator_offset
 from .materials import finite
 from .meshes import check_normals
+from .painted_images import painted_images
 from .particles import particles_of
 from .surface_nodes import SurfaceWalker
 from .topology_check import Fit, check_modifiers, check_topology
@@ -104,6 +104,7 @@ class DrgsObjects:
             self._warn(f'"{obj.name}": {lack}; it is left out')
             return
         material = obj.material_slots[0].material if obj.material_slots else None
+        painted = [] if obj.drgs.show_captured else painted_images(obj, assets.load(assets.file_of(obj)), self._warn)
         visibility = self._holdouts.cut_out(item, [material], lambda: None).visibility
         self.states.append(
             replace(
@@ -112,6 +113,7 @@ class DrgsObjects:
                 pass_index=obj.pass_index,
                 material_pass_index=0 if material is None else material.pass_index,
                 visibility=visibility,
+                images=painted,
                 captured_colours=obj.drgs.captured_colours,
                 light_group=obj.lightgroup,
                 terminator_offset=terminator_offset(obj, self._warn),
@@ -119,11 +121,6 @@ class DrgsObjects:
             )
         )
         _check_shown(obj, material, shape, self._warn)
-        if images := painted_images(obj.original):
-            self._warn(
-                f'"{obj.name}": {first_of(images)} as painted is not rendered, but the asset\'s own. Paint vertices '
-                "(sidebar > DR-GS > Object), or the images before the asset is made"
-            )
         self.keys.append(item.key)
 
 

@@ -258,6 +258,8 @@ class ObjectState:
     inside : Inside, optional
         Where the particles know of their lattice: pieces that have come apart are closed, by faces of this material
         inside; None: they are open shells.
+    images : list of Image
+        Bytes in place of images of the asset's textures, which have their names; colours where they are "srgb".
     """
 
     name: str
@@ -286,6 +288,7 @@ class ObjectState:
     particles: Particles | None = None
     proxy: ProxyMesh | None = None
     inside: Inside | None = None
+    images: list[Image] = field(default_factory=list)
 
 
 @dataclass(slots=True)

@@ -126,6 +126,12 @@ class MeshDriven:
         rest = (binding.face, binding.barycentric, offset, rest_edge, binding.normal, coordinates)
         self.rest = Rest(*map(plain, (*rest, span, in_span)))
 
+    def repainted(self, mesh: Mesh, surfels: Surfels) -> MeshDriven:
+        """The same for the same mesh and surfels with other materials."""
+        other = copy.copy(self)
+        other.mesh, other.surfels = mesh, surfels
+        return other
+
     def first(self, count: int) -> MeshDriven:
         """The same of the first `count` surfels alone."""
         few, rest = copy.copy(self), self.rest

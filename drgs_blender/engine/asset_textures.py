@@ -52,7 +52,7 @@ class TexturedAsset:
         for number in np.unique(slots[slots >= 0]):
             uses = slots == number
             try:
-                pixels = _decoded(files[number][1], f"{self.key}, image {files[number][0]}")
+                pixels = decoded(files[number][1], f"{self.key}, image {files[number][0]}")
             except AssetError as error:
                 self.faults.append(f"{str(error).rstrip('.')}; the materials of its vertices are shown")
                 slots[uses] = -1
@@ -98,7 +98,7 @@ class TexturedAsset:
         return self._vertices
 
 
-def _decoded(data: Array, subject: str) -> Array:
+def decoded(data: Array, subject: str) -> Array:
     """(h, w, 4) uint8 pixels of an image file, frozen."""
     from ..formats.images import decode_image  # with Pillow, that most frames do without
 

@@ -32,6 +32,8 @@ class LoadedAsset:
         Its textures.
     faults : list of str
         What of the file could not be used.
+    painting : int
+        Number of the images painted over its own, unlike those of other objects of the file; 0: none are.
     levels : dict of int to LoadedAsset
         Its most needed surfels by their number, see `first`.
     larger : LoadedAsset, optional
@@ -44,6 +46,7 @@ class LoadedAsset:
     glow: Glow | None = None
     textured: TexturedAsset | None = None
     faults: list[str] = field(default_factory=list)
+    painting: int = 0
     levels: dict[int, LoadedAsset] = field(default_factory=dict)
     larger: LoadedAsset | None = None
     _detail: Detail | None = None
@@ -68,13 +71,13 @@ class LoadedAsset:
                 self.levels.clear()
                 largest = min(max(count, _AT_FIRST), len(self.asset.surfels))
                 order = self.detail.order[:largest]
-                self.levels[largest] = LoadedAsset(with_surfels(self.asset, order), self.stamp)
+                self.levels[largest] = LoadedAsset(with_surfels(self.asset, order), self.stamp, painting=self.painting)
             if count < largest:
                 whole = self.levels[largest]
                 if whole.driven is None and whole.asset.binding is not None and len(whole.asset.mesh.faces):
                     whole.driven = MeshDriven(whole.asset.mesh, whole.asset.surfels, whole.asset.binding)
                 some = slice(count)
-                few = LoadedAsset(with_surfels(whole.asset, some), self.stamp, larger=whole)
+                few = LoadedAsset(with_surfels(whole.asset, some), self.stamp, painting=self.painting, larger=whole)
                 few.driven = None if whole.driven is None else whole.driven.first(count)
                 self.levels[count] = few
         return self.levels[count]
@@ -100,5 +103,5 @@ class LoadedAsset:
     def textured_of(self, key: str) -> TexturedAsset:
         """Its textures, decoded when an object first needs them."""
         if self.textured is None:
-            self.textured = TexturedAsset(self.asset, key)
+            self.textured = TexturedAsset(self.asset, f"{key} (painting {self.painting})" if self.painting else key)
         return self.textured

@@ -43,6 +43,7 @@ from .optional_channels import channel_faults, may_need, surfel_emission
 from .part_cache import PartCache
 from .particle_surfaces import ParticleSurfaces
 from .proxy_meshes import ProxyMeshes
+from .repainted_assets import RepaintedAssets
 from .scene_objects import check_surface, in_asset_order, join, posed_surfels
 from .surfel_sheets import meets_sheets, sheet_mesh
 from .surfel_states import state_at, state_now
@@ -88,7 +89,7 @@ class SceneCache:
 
     def __init__(self) -> None:
         self._assets: dict[str, LoadedAsset] = {}
-        self._parts = PartCache()
+        self._parts, self._repainted = PartCache(), RepaintedAssets()
         self._carriers, self._proxies, self._broken = CarrierCache(), ProxyMeshes(), BrokenMatter()
         self._skins = ParticleSurfaces()
         self.objects: list[CachedObject] = []
@@ -176,6 +177,7 @@ class SceneCache:
         objects: list[CachedObject] = []
         faults: list[str] = []
         self._parts.begin()
+        self._repainted.begin()
         states = self._proxies.carried(frame.objects, self._assets)
         self._carriers.begin(states)
         self._broken.begin(states)
@@ -189,6 +191,7 @@ class SceneCache:
                     "Link the object to its file again",
                 )
             loaded = self._parts.loaded(loaded, state)
+            loaded, state = self._repainted.loaded(loaded, state)
             skinned = state.particles is not None and state.particles.skin
             shown = not skinned and shows_captured(state, loaded.asset, frame)
             check_surface(state, loaded.asset, frame.settings, shown)

@@ -62,19 +62,80 @@ def read(path):
     return part("drgs_blender.core.asset.container").read_asset(path).mesh.textures
 
 
-def test_painted_images_are_told(ball, export):
-    """Until they are as imported again; before they are saved, and after."""
-    told = lambda: [w for w in export()[1] if "as painted" in w]  # noqa: E731
-    image = next(i for i in bpy.data.images if i.packed_file)
-    assert not told()
+def image_of(name):
+    return next(i for i in bpy.data.images if i.get("drgs_image") == name)
+
+
+def paint(image, colour):
+    """All of an image, as a brush does: in memory, not saved."""
+    image.pixels.foreach_set(np.tile(np.float32((*colour, 1)), image.size[0] * image.size[1]))
+    image.update()
+
+
+def test_painted_images_are_sent_until_they_are_as_imported_again(ball, export):
+    """Before they are saved, and after."""
+    sent = lambda: {i.name: i.pixels for i in export()[0].objects[0].images}  # noqa: E731
+    image = image_of("albedo")
+    assert not sent()
     before = image.packed_file.data
-    image.pixels[0] = 0.5 * image.pixels[0] + 0.25
-    assert len(told()) == 1 and image.name in told()[0]
+    paint(image, (0.8, 0.4, 0.2))
+    assert sent().keys() == {"albedo"}
+    np.testing.assert_array_equal(sent()["albedo"][0, 0, :3], (204, 102, 51))
     image.pack()
-    assert not image.is_dirty and len(told()) == 1
+    assert not image.is_dirty and sent().keys() == {"albedo"}
+    ball.drgs.show_captured = True
+    assert not sent()
+    ball.drgs.show_captured = False
     image.pack(data=before, data_len=len(before))
     image.reload()
-    assert not told()
+    assert not sent()
+
+
+def test_images_that_are_not_the_assets_are_told(ball, export):
+    image = image_of("albedo")
+    image["drgs_image"], image["drgs_textures"] = "another", "0 sRGB"
+    assert not [w for w in export()[1] if "of another asset" in w] and not export()[0].objects[0].images
+    paint(image, (1, 0, 0))
+    assert [w for w in export()[1] if image.name in w and "of another asset" in w]
+
+
+def test_what_is_painted_looks_as_in_cycles(scene, ball):
+    """Through the transform of its texture, on the lower half; the normals are painted flat."""
+    parity.light(scene)
+    parity.set_up(scene, 64, samples=128, bounces=1)
+    scene.camera.location.y = -3.4
+    plain = parity.pictures(scene, "DRGS")
+    image = image_of("albedo")
+    pixels = np.ones((image.size[1], image.size[0], 4), np.float32)
+    pixels[..., :3] = (0.9, 0.1, 0.2)
+    pixels[::2, :, :3] = (0.1, 0.3, 0.9)
+    image.pixels.foreach_set(pixels.ravel())
+    image.update()
+    paint(image_of("bumps"), (0.5, 0.5, 1))
+    ours, theirs = parity.pictures(scene, "DRGS"), parity.pictures(scene, "CYCLES")
+    assert parity.psnr(ours, theirs) > 40 > parity.psnr(plain, theirs) + 15
+
+
+def test_an_asset_is_saved_as_it_is_painted(ball, tmp_path, export):
+    """Its images, and what vertices have of them; linked to the new file there is nothing painted any more."""
+    image = image_of("albedo")
+    paint(image, (0.8, 0.4, 0.2))
+    path = tmp_path / "painted.drgs"
+    assert bpy.ops.drgs.save_asset(filepath=str(path), use_saved=True) == {"FINISHED"}
+    asset = part("drgs_blender.core.asset.container").read_asset(path)
+    before = textured_ball()
+    assert list(asset.mesh.textures.images) == list(before.mesh.textures.images)
+    data = asset.mesh.textures.images["albedo"].tobytes()
+    assert data == image.packed_file.data != before.mesh.textures.images["albedo"].tobytes()
+    assert asset.mesh.textures.images["surface"].tobytes() == before.mesh.textures.images["surface"].tobytes()
+    linear = ((np.array([0.8, 0.4, 0.2]) + 0.055) / 1.055) ** 2.4
+    above = before.mesh.faces[before.mesh.textures.material == 1]
+    rows = np.setdiff1d(above, before.mesh.faces[before.mesh.textures.material == 0])
+    np.testing.assert_allclose(asset.mesh.albedo[rows], np.broadcast_to(linear, (len(rows), 3)), atol=5e-3)
+    frame, warnings = export()
+    assert not frame.objects[0].images and frame.objects[0].albedo is None and not warnings
+    paint(image, (0.1, 0.1, 0.1))
+    assert [i.name for i in export()[0].objects[0].images] == ["albedo"], "its name is known, though not its content"
 
 
 def test_an_import_has_uvs_materials_and_packed_images_once(ball, tmp_path):

@@ -8,9 +8,10 @@ import trimesh
 
 from drgs_blender.build.make import _net, make_asset, mesh_with_materials
 from drgs_blender.build.refine import _TextureFit
-from drgs_blender.build.texture import CHANNELS, Materials, Pyramid
+from drgs_blender.build.texture import CHANNELS, Materials
 from drgs_blender.build.topology import Net, close_marks, edge_lengths, edges, subdivide, survivors, weld
 from drgs_blender.core.errors import AssetError
+from drgs_blender.core.mip_pyramid import Pyramid
 from drgs_blender.formats.files import Image, MaterialFile, MeshFile
 
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from drgs_blender.build.texture import Pyramid
 from drgs_blender.core.color import linear_to_srgb, srgb_to_linear, to_unit
 from drgs_blender.core.errors import AssetError
+from drgs_blender.core.mip_pyramid import Pyramid
 from drgs_blender.formats.files import Image
 from drgs_blender.formats.images import decode_image, image_size, load_image
 from drgs_blender.formats.registry import read_environment_file

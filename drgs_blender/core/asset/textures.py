@@ -104,7 +104,7 @@ class MeshTextures:
     def channel(self, slot: int, number: int) -> str:
         """Channel that counts of image `number` in a slot: "rgb", "r", "g", "b" or "a"."""
         if slot in (OPACITY, SPECULAR):
-            return "a" if _has_alpha(self.files[number][1].tobytes()) else "r"
+            return "a" if has_alpha(self.files[number][1].tobytes()) else "r"
         return {ROUGHNESS: "g", METALLIC: "b", COAT: "r"}.get(slot, "rgb")
 
     @property
@@ -168,7 +168,7 @@ def image_suffix(data: Array | bytes) -> str:
     return next((suffix for suffix, magic in _MAGIC.items() if bytes(data[: len(magic)]) == magic), "")
 
 
-def _has_alpha(data: bytes) -> bool:
+def has_alpha(data: bytes) -> bool:
     """Whether an image file has alpha: of PNG (RFC 2083) the type of its colours says it, or a chunk before these."""
     if not data.startswith(_MAGIC[".png"]) or len(data) < 26:
         return False
