@@ -28,8 +28,9 @@ _TINY = 1e-30
 
 
 class _Points(NamedTuple):
-    """Points on a textured mesh: their materials (n,), texture coordinates (n, 2) and the width (n, 2) they cover."""
+    """Rows (n,) of a mesh or surfels: their materials (n,), texture coordinates and the width they cover (n, 2)."""
 
+    row: Array
     material: Array
     uvs: Array
     width: Array
@@ -84,8 +85,11 @@ def repainted(asset: Asset, before: Pictures, now: Pictures, files: Mapping[tupl
     """
     mesh, surfels, textures = asset.mesh, asset.surfels, asset.mesh.textures
     assert textures is not None
-    at_vertices = _at_vertices(mesh, textures)
-    at_surfels = None if asset.binding is None else _at_surfels(asset, textures)
+    painted = np.zeros(len(textures.names) + 1, bool)  # the last is that of faces without a material
+    painted[[k for _, k, key in _painted(textures, now) if key in before]] = True
+    on_face = painted[textures.material]
+    at_vertices = _at_vertices(mesh, textures, on_face)
+    at_surfels = None if asset.binding is None else _at_surfels(asset, textures, on_face)
     of_mesh: dict[str, Any] = {}
     of_surfels: dict[str, Any] = {}
     for slot, k, key in _painted(textures, now):
@@ -97,9 +101,11 @@ def repainted(asset: Asset, before: Pictures, now: Pictures, files: Mapping[tupl
             own = found.get(name, getattr(part, name, None))
             if own is None or points is None or (part is surfels and name == "opacity"):
                 continue
-            rows = np.flatnonzero(points.material == k)
-            given = points.uvs[rows], points.width[rows]
-            then, value = (p.look_up(p.taps_at(*given), slice(len(factors))).T * factors for p in pyramids)
+            of_material = points.material == k
+            given, rows = (points.uvs[of_material], points.width[of_material]), points.row[of_material]
+            taps = [pyramids[0].taps_at(*given)]
+            taps += taps if pyramids[0].layout == pyramids[1].layout else [pyramids[1].taps_at(*given)]
+            then, value = (p.look_up(t, slice(len(factors))).T * factors for p, t in zip(pyramids, taps, strict=True))
             changed = (np.abs(value - then) > _CHANGED).any(axis=1)
             if not changed.any():
                 continue
@@ -159,26 +165,33 @@ def _pyramid(textures: MeshTextures, k: int, slot: int, key: tuple[str, bool], p
     return Pyramid(_Picture(pixels, key[1], textures.transforms[k, slot], (wrap, wrap)))
 
 
-def _at_vertices(mesh: Mesh, textures: MeshTextures) -> _Points:
-    """The vertices, each by one of its textured faces; those without any have the material -1."""
-    n = len(mesh.vertices)
-    material, uvs, width = np.full(n, -1), np.zeros((n, 2), np.float32), np.zeros((n, 2), np.float32)
-    faces = np.flatnonzero(textures.material >= 0)
-    span = np.ptp(textures.uvs[faces], axis=1) / 2
-    for corner in range(3):
-        rows = mesh.faces[faces, corner]
-        material[rows], uvs[rows], width[rows] = textures.material[faces], textures.uvs[faces, corner], span
-    return _Points(material, uvs, width)
+def _at_vertices(mesh: Mesh, textures: MeshTextures, on_face: Array) -> _Points:
+    """The vertices of faces, (m,) bool, each by one of them."""
+    faces = np.flatnonzero(on_face)
+    face, corner = np.full(len(mesh.vertices), -1), np.zeros(len(mesh.vertices), np.int8)
+    for k in range(3):
+        face[mesh.faces[faces, k]], corner[mesh.faces[faces, k]] = faces, k
+    row = np.flatnonzero(face >= 0)
+    face, corner = face[row], corner[row]
+    uvs = textures.uvs[face]
+    return _Points(row, textures.material[face], uvs[np.arange(len(row)), corner], _extent(uvs) / 2)
 
 
-def _at_surfels(asset: Asset, textures: MeshTextures) -> _Points:
-    """The surfels, as wide in the image as twice their larger axis on the face."""
+def _at_surfels(asset: Asset, textures: MeshTextures, on_face: Array) -> _Points:
+    """The surfels of faces, (m,) bool, as wide in the image as twice their larger axis on the face."""
     binding, mesh = asset.binding, asset.mesh
     assert binding is not None
-    corners, uvs = mesh.vertices[mesh.faces].astype(np.float64), textures.uvs
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    per_metre = np.ptp(uvs, axis=1) / np.maximum(longest, _TINY)[:, None]
-    face = binding.face
-    at = np.einsum("nk,nkc->nc", binding.barycentric, uvs[face])
-    width = 2 * asset.surfels.scale.max(axis=1)[:, None] * per_metre[face]
-    return _Points(textures.material[face], at.astype(np.float32), width)
+    row = np.flatnonzero(on_face[binding.face])
+    face = binding.face[row]
+    corners, uvs = mesh.vertices[mesh.faces[face]], textures.uvs[face]
+    longest = np.sqrt(np.max([((corners[:, k] - corners[:, k - 1]) ** 2).sum(axis=1) for k in range(3)], axis=0))
+    at = np.einsum("nk,nkc->nc", binding.barycentric[row], uvs)
+    width = 2 * asset.surfels.scale[row].max(axis=1) / np.maximum(longest, _TINY)
+    return _Points(row, textures.material[face], at, width[:, None] * _extent(uvs))
+
+
+def _extent(uvs: Array) -> Array:
+    """(n, 2): how far (n, 3, 2) texture coordinates of corners are apart."""
+    a, b, c = uvs.transpose(1, 0, 2)
+    extent: Array = np.maximum(np.maximum(a, b), c) - np.minimum(np.minimum(a, b), c)
+    return extent

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import InitVar, dataclass, field, replace
 
 import numpy as np
 
@@ -29,19 +29,22 @@ class TexturedAsset:
 
     Attributes
     ----------
+    alike : TexturedAsset, optional
+        Of an asset that shares image files with it, whose pixels are taken.
     faults : list of str
         Images that cannot be used; values of vertices stand for them.
     """
 
     asset: Asset
     key: str
+    alike: InitVar[TexturedAsset | None] = None
     textures: MeshTextures = field(init=False)
     faults: list[str] = field(default_factory=list)
     _vertices: Array = field(init=False)
     _images: dict[tuple[object, ...], Image] = field(default_factory=dict)
     _local: Array | None = None
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, alike: TexturedAsset | None) -> None:
         mesh = self.asset.mesh
         assert mesh.textures is not None
         given, self._vertices = mesh.textures, keep(mesh.vertices)
@@ -52,7 +55,9 @@ class TexturedAsset:
         for number in np.unique(slots[slots >= 0]):
             uses = slots == number
             try:
-                pixels = decoded(files[number][1], f"{self.key}, image {files[number][0]}")
+                pixels = alike.pixels_of(files[number]) if alike is not None else None
+                if pixels is None:
+                    pixels = decoded(files[number][1], f"{self.key}, image {files[number][0]}")
             except AssetError as error:
                 self.faults.append(f"{str(error).rstrip('.')}; the materials of its vertices are shown")
                 slots[uses] = -1
@@ -62,6 +67,13 @@ class TexturedAsset:
                 name = f"{self.key}, {files[number][0]}, {encoding}"
                 self._images[int(number), coloured] = Image(name, pixels, encoding)  # type: ignore[arg-type]
         self.textures = replace(self.textures, slots=slots)
+
+    def pixels_of(self, file: tuple[str, Array]) -> Array | None:
+        """(h, w, 4) uint8 pixels of an image file that it has decoded; None of another."""
+        for number, (name, data) in enumerate(self.textures.files):
+            if name == file[0] and data is file[1]:
+                return next((i.pixels for key, i in self._images.items() if key[0] == number and len(key) == 2), None)
+        return None
 
     def image(self, number: int, slot: int) -> Image:
         """An image as it is for a slot."""

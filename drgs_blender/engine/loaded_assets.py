@@ -34,6 +34,8 @@ class LoadedAsset:
         What of the file could not be used.
     painting : int
         Number of the images painted over its own, unlike those of other objects of the file; 0: none are.
+    alike : TexturedAsset, optional
+        Textures that share images with its own.
     levels : dict of int to LoadedAsset
         Its most needed surfels by their number, see `first`.
     larger : LoadedAsset, optional
@@ -47,6 +49,7 @@ class LoadedAsset:
     textured: TexturedAsset | None = None
     faults: list[str] = field(default_factory=list)
     painting: int = 0
+    alike: TexturedAsset | None = None
     levels: dict[int, LoadedAsset] = field(default_factory=dict)
     larger: LoadedAsset | None = None
     _detail: Detail | None = None
@@ -103,5 +106,6 @@ class LoadedAsset:
     def textured_of(self, key: str) -> TexturedAsset:
         """Its textures, decoded when an object first needs them."""
         if self.textured is None:
-            self.textured = TexturedAsset(self.asset, f"{key} (painting {self.painting})" if self.painting else key)
+            name = f"{key} (painting {self.painting})" if self.painting else key
+            self.textured = TexturedAsset(self.asset, name, self.alike)
         return self.textured

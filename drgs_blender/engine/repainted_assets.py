@@ -84,9 +84,19 @@ def _made(whole: LoadedAsset, state: ObjectState) -> LoadedAsset:
         data = textures.images[name]
         files[name, coloured] = _encoded(pixels if has_alpha(data.tobytes()) else pixels[..., :3])
         with contextlib.suppress(AssetError):  # a damaged file; what is painted over it is shown all the same
-            before[name, coloured] = decoded(data, f"{state.asset}, image {name}")
+            before[name, coloured] = _pixels(whole, name, state.asset)
     made = repainted(whole.asset, before, now, files)
-    return LoadedAsset(made, whole.stamp, faults=[*whole.faults, *faults], painting=next(_paintings))
+    number, alike = next(_paintings), whole.textured_of(state.asset)
+    return LoadedAsset(made, whole.stamp, faults=[*whole.faults, *faults], painting=number, alike=alike)
+
+
+def _pixels(whole: LoadedAsset, name: str, key: str) -> Array:
+    """(h, w, 4) uint8 pixels of an image as its file has them."""
+    textures = whole.asset.mesh.textures
+    assert textures is not None
+    file = textures.files[list(textures.images).index(name)]
+    known = whole.textured_of(key).pixels_of(file)
+    return decoded(file[1], f"{key}, image {name}") if known is None else known
 
 
 def _encoded(pixels: Array) -> Array:
