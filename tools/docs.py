@@ -24,6 +24,7 @@ BUILD = ROOT / "build" / "docs"
 NAVIGATION = {
     "Start": (
         "docs/user-guide.md",
+        "docs/expectations.md",
         "docs/scripting.md",
         "docs/command-line.md",
         "examples/README.md",

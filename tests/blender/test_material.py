@@ -370,3 +370,24 @@ def test_the_asset_of_a_library_is_not_written_over(ball, tmp_path):
     with pytest.raises(RuntimeError, match=r'"theirs": is made of .*would be lost'):
         bpy.ops.drgs.save_asset(filepath=str(theirs))
     assert theirs.read_bytes() == before
+
+
+def test_geometry_nodes_compute_materials(ball, export):
+    """A number stored on the points counts as if it were painted, and follows its keyframes."""
+    tree = bpy.data.node_groups.new("Rust", "GeometryNodeTree")
+    for way in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    kinds = ("NodeGroupInput", "GeometryNodeStoreNamedAttribute", "NodeGroupOutput")
+    first, store, last = (tree.nodes.new(kind) for kind in kinds)
+    store.inputs["Name"].default_value = "roughness"
+    tree.links.new(first.outputs[0], store.inputs["Geometry"])
+    tree.links.new(store.outputs[0], last.inputs[0])
+    ball.modifiers.new("Rust", "NODES").node_group = tree
+    for frame, value in ((1, 0.25), (11, 0.75)):
+        store.inputs["Value"].default_value = value
+        store.inputs["Value"].keyframe_insert("default_value", frame=frame)
+    for frame, value in ((1, 0.25), (6, 0.5), (11, 0.75)):
+        bpy.context.scene.frame_set(frame)
+        (state,), warnings = export()[0].objects, export()[1]
+        np.testing.assert_allclose(state.roughness, value, atol=1e-6)
+        assert state.albedo is None and not warnings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 import pytest
-from scenes import asset_of, part, read_exr, select, sphere
+from scenes import asset_of, mesh_object, part, read_exr, select, sphere
 from test_render import light
 
 pytestmark = pytest.mark.blender_api
@@ -178,6 +178,21 @@ def test_modifiers_that_copy_or_split(ball, export, kind, copies, foreign):
         assert f"{m} faces are not in its asset" in warnings[0]
         radius = np.linalg.norm(state.vertices[state.part.faces], axis=2)
         assert radius.min() > 0.999
+
+
+def test_a_boolean_leaves_whole_faces_and_tells_of_cut_ones(ball, export):
+    """The box takes a corner away: faces outside of it stay with their surfels, those that it cuts have none."""
+    corners = [(x, y, z) for x in (0.3, 2) for y in (-2, 2) for z in (-2, 2)]
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    cutter = mesh_object("Cutter", corners, sides)
+    cutter.hide_render = True
+    modifier = ball.modifiers.new("Boolean", "BOOLEAN")
+    modifier.object, modifier.operation = cutter, "DIFFERENCE"
+    (state,), warnings = export()[0].objects, export()[1]
+    vertices, faces = sphere()
+    outside = np.flatnonzero((vertices[faces][..., 0] < 0.3).all(axis=1))
+    assert 0 < len(outside) < len(faces) and sorted(state.part.face) == outside.tolist()
+    assert len(warnings) == 1 and "faces are not in its asset and are not rendered" in warnings[0]
 
 
 def test_a_cut_object_is_saved_and_is_whole_again(ball, export, tmp_path, ball_file):

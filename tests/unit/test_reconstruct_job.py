@@ -18,7 +18,9 @@ from capture_cases import balls, colour_of_balls, distance_to_balls, write  # no
 from drgs_blender.core.asset.container import read_asset, write_asset  # noqa: E402
 from drgs_blender.core.color import linear_to_srgb  # noqa: E402
 from drgs_blender.core.errors import AssetError, Cancelled, UsageError, WriteError  # noqa: E402
+from drgs_blender.core.frame import Frame, ObjectState, RenderSettings  # noqa: E402
 from drgs_blender.deform.binding import clamp_weights  # noqa: E402
+from drgs_blender.engine.session import Session  # noqa: E402
 from drgs_blender.geometry.normals import VertexNormals  # noqa: E402
 from drgs_blender.reconstruct import pipeline  # noqa: E402
 from drgs_blender.reconstruct.capture.capture import Capture  # noqa: E402
@@ -79,6 +81,22 @@ def test_mesh_is_closed_faces_outwards_and_lies_on_the_surface(asset, capture):
 def test_views_left_out_are_predicted(asset):
     report = asset.provenance["report"]
     assert report["left_out"] == 3 and report["psnr"] > 27 and report["ssim"] > 0.93
+
+
+@pytest.mark.slow
+def test_captured_colours_are_what_was_photographed(asset, capture, tmp_path):
+    """The renderer shows views that were left out: what differs is little of what the object has of colours."""
+    write_asset(tmp_path / "balls.drgs", asset)
+    session = Session()
+    session.load_asset(tmp_path / "balls.drgs")
+    shown = ObjectState("Balls", str(tmp_path / "balls.drgs"), captured_colours=True)
+    for view in capture.testing:
+        settings = RenderSettings(samples=16, subpixel_samples=16, film_transparent=True)
+        picture = session.render(Frame(1, view.camera, [shown], settings=settings))
+        assert not picture.warnings
+        inside = view.mask > 0.999
+        colour, seen = linear_to_srgb(picture["Combined"][inside, :3]), view.colour[inside]
+        assert np.mean((colour - seen) ** 2) < np.mean((seen - seen.mean(0)) ** 2) / 8
 
 
 def test_the_views_that_were_learned_from_are_recorded(asset, capture):
