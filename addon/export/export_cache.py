@@ -18,7 +18,7 @@ T = TypeVar("T")
 #: Types of datablocks on which the shading of surfaces and of the world depends.
 SHADING_MODELS = (bpy.types.Material, bpy.types.NodeTree, bpy.types.Image, bpy.types.Texture, bpy.types.World)
 #: First items of the keys of entries that depend on such datablocks.
-SHADED = ("mesh", "world")
+SHADED = ("mesh", "world", "painted")
 
 
 def uid(datablock: bpy.types.ID | None) -> int:

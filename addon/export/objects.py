@@ -14,7 +14,7 @@ import numpy as np
 from ...drgs_blender.core.asset import MATERIAL_CHANNELS, Asset
 from ...drgs_blender.core.asset.part import Part, has_surfels, part_of, whole_of
 from ...drgs_blender.core.frame import Adjustment, ObjectState, ProxyMesh
-from ...drgs_blender.core.materials import ShaderAOV
+from ...drgs_blender.core.materials import Image, ShaderAOV
 from ...drgs_blender.core.passes import Pass
 from .. import assets, cache_playback, cage_nodes, mesh_arrays, point_caches, proxies, surfel_points
 from ..viewport_material import is_viewport_material
@@ -104,7 +104,7 @@ class DrgsObjects:
             self._warn(f'"{obj.name}": {lack}; it is left out')
             return
         material = obj.material_slots[0].material if obj.material_slots else None
-        painted = [] if obj.drgs.show_captured else painted_images(obj, assets.load(assets.file_of(obj)), self._warn)
+        painted = [] if obj.drgs.show_captured else self._painted(obj)
         visibility = self._holdouts.cut_out(item, [material], lambda: None).visibility
         self.states.append(
             replace(
@@ -122,6 +122,19 @@ class DrgsObjects:
         )
         _check_shown(obj, material, shape, self._warn)
         self.keys.append(item.key)
+
+    def _painted(self, obj: bpy.types.Object) -> list[Image]:
+        """Images of its asset that are painted over."""
+        path = assets.file_of(obj)
+        said: list[str] = []
+        found, told = self._cache.get(
+            ("painted", uid(obj), str(path)),
+            (uid(obj), uid(obj.data)),
+            lambda: (painted_images(obj, assets.load(path), said.append), said),
+        )
+        for text in told:
+            self._warn(text)
+        return found
 
 
 def _lack(obj: bpy.types.Object, part: Part | None, settings: bpy.types.PropertyGroup) -> str | None:

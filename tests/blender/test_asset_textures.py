@@ -70,6 +70,7 @@ def paint(image, colour):
     """All of an image, as a brush does: in memory, not saved."""
     image.pixels.foreach_set(np.tile(np.float32((*colour, 1)), image.size[0] * image.size[1]))
     image.update()
+    image.update_tag()
 
 
 def test_painted_images_are_sent_until_they_are_as_imported_again(ball, export):
@@ -97,6 +98,25 @@ def test_images_that_are_not_the_assets_are_told(ball, export):
     assert not [w for w in export()[1] if "of another asset" in w] and not export()[0].objects[0].images
     paint(image, (1, 0, 0))
     assert [w for w in export()[1] if image.name in w and "of another asset" in w]
+
+
+def test_viewports_read_what_is_painted_once_and_again_after_each_stroke(ball, monkeypatch):
+    """Not when something else moves: an image that is not saved is read whole."""
+    exported = lambda: part("addon.viewport.scenes").exported(bpy.context.evaluated_depsgraph_get())  # noqa: E731
+    pixels, reads = part("addon.export.image_pixels"), []
+    original = pixels.straight
+    monkeypatch.setattr(pixels, "straight", lambda image: (reads.append(image.name), original(image))[1])
+    image = image_of("albedo")
+    exported()
+    for value in (0.25, 0.75):
+        reads.clear()
+        paint(image, (value, value, value))
+        bpy.context.view_layer.update()
+        (sent,) = exported().frame.objects[0].images
+        assert sent.pixels[0, 0, 0] == round(255 * value) and len(reads) == 1
+        ball.location.x += 1
+        bpy.context.view_layer.update()
+        assert exported().frame.objects[0].images[0].pixels is sent.pixels and len(reads) == 1
 
 
 def test_what_is_painted_looks_as_in_cycles(scene, ball):
