@@ -1,10 +1,10 @@
-"""The main job, end to end: make and import assets, rig them in Blender, relight and render 24 frames.
+"""The main job, end to end: captured objects are rigged, simulated and painted in Blender, relit and rendered.
 
     python3.11 tools/dev.py demo [--out out/demo] [--frames 1-24]      # or make demo, which makes the environments too
     .venv/bin/python examples/demo.py [--out out/demo] [--frames 1-24]
 
-Writes the assets, the .blend, an EXR a frame, a contact sheet (PNG) and an animated picture (WebP). Steps that do not
-wait for each other run side by side; of a demo before, assets and scene are taken where nothing changed that they are
+Writes the .blend with its simulation, an EXR per frame, a contact sheet (PNG) and an animated picture (WebP). Steps
+that do not wait for each other run side by side; of a demo before, the scene is taken where nothing changed that it is
 made of. Frames are always rendered again.
 """
 
@@ -32,15 +32,7 @@ def steps(out: Path, frames: str) -> list[Step]:
     """All that follows the environments; seconds are those of two processors."""
     engine, blender = environments.python_of(environments.ENGINE), environments.blender()
     drgs = [engine, "-m", "drgs_blender.cli.main"]
-    package = ROOT / "drgs_blender"
-    assets = {name: out / f"{name}.drgs" for name in ("robot", "helmet", "playbot")}
     extension, scene = out / "extension.zip", out / "demo.blend"
-    started = [environments.FOR_ENGINE]
-
-    def asset(name: str, source: Path, seconds: float, *options: str, command: str = "make", after: str = "") -> Step:
-        words = [*drgs, command, source, *options, "--out", assets[name]]
-        before = (*started, *([after] if after else []))
-        return Step(name, f"Making {name}.drgs", words, seconds, before, assets[name], (source.parent, package))
 
     def rendered(line: str) -> tuple[str, float] | None:
         nonlocal done
@@ -53,32 +45,19 @@ def steps(out: Path, frames: str) -> list[Step]:
     done, count = 0, _count(frames)
     building = [environments.python_of(environments.ENGINE), ROOT / "tools/extension.py", "--out", extension]
     pattern = out / "frames" / "####.exr"
-    # The last of a list of what Blender needs: the .blend remembers where the assets are.
-    setting = [blender, "-P", EXAMPLES / "demo_scene.py", extension, out, scene]
-    of_scene = (*assets.values(), extension, EXAMPLES / "demo_scene.py", EXAMPLES / "robot")
+    setting = [blender, "-P", EXAMPLES / "demo_scene.py", extension, scene]
+    of_scene = (EXAMPLES / "captured", extension, EXAMPLES / "demo_scene.py", EXAMPLES / "blender_scenes.py")
     blenders = () if os.environ.get("DRGS_BLENDER") else (environments.FOR_BLENDER,)
     return [
-        # Those of an asset first; what is not compiled when it is needed is waited for.
-        environments.kernels("kernels", "import", "frame", "denoise", seconds=40.0),
-        asset("robot", EXAMPLES / "robot/RobotExpressive.glb", 2.0),
-        # Props of a hundred pixels: surfels and voxels of a pixel each will do.
-        asset("helmet", EXAMPLES / "helmet/FlightHelmet.gltf", 5.0, "--max-triangles=100000", "--density=80"),
-        asset(
-            "playbot",
-            EXAMPLES / "playbot/playbot.ply",
-            10.0,
-            "--up=-y",
-            "--resolution=128",
-            command="import",
-            after="helmet",
-        ),
+        # Those of the simulation first; what is not compiled when it is needed is waited for.
+        environments.kernels("kernels", "simulate", "frame", "mesh", "lights", "denoise", seconds=45.0),
         Step("extension", "Building the extension", building, 0.5, (environments.FOR_ENGINE,)),
-        Step("scene", "Setting the scene", setting, 4.0, (*assets, "extension", *blenders), scene, of_scene),
+        Step("scene", "Setting the scene", setting, 20.0, ("extension", *blenders), scene, of_scene),
         Step(
             "frames",
             "Starting Blender",
             [*drgs, "render", scene, "--frames", frames, "--out", pattern, "--denoise", "svgf", "--overwrite"],
-            4.0 + 1.3 * count,
+            4.0 + 2.2 * count,
             ("scene",),
             count=rendered,
             before=partial(shutil.rmtree, out / "frames", ignore_errors=True),
@@ -119,7 +98,7 @@ def run(out: Path, frames: str, before: Sequence[Step] = ()) -> None:
     print(f"Done in {seconds:.0f} s. Look at {out / 'contact-sheet.png'} and {out / 'animation.webp'}")
 
 
-def publish(frames: list[Path], out: Path, fps: int = 24) -> None:
+def publish(frames: list[Path], out: Path, fps: int = 12) -> None:
     """The contact sheet and the animated picture."""
     import numpy as np
     from PIL import Image
@@ -140,7 +119,13 @@ def publish(frames: list[Path], out: Path, fps: int = 24) -> None:
         sheet.paste(one, (i % 4 * width, i // 4 * height))
     sheet.save(out / "contact-sheet.png")
     pictures[0].save(
-        out / "animation.webp", save_all=True, append_images=pictures[1:], duration=1000 // fps, loop=0, quality=90
+        out / "animation.webp",
+        save_all=True,
+        append_images=pictures[1:],
+        duration=1000 // fps,
+        loop=0,
+        quality=80,
+        method=6,
     )
 
 

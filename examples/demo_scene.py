@@ -1,152 +1,226 @@
 """Builds the demo's .blend inside Blender, with the operators an artist would click.
 
-    .venv-blender/bin/python examples/demo_scene.py EXTENSION.zip ASSET_FOLDER SCENE.blend
+    .venv-blender/bin/python examples/demo_scene.py EXTENSION.zip SCENE.blend
 
-A robot with its skeleton, dance and facial shape keys; a flight helmet that turns; a captured toy; an HDRI of
-Blender's own that turns once around them in 24 frames.
+Four objects that were reconstructed from photographs, with their materials separated from the light of that day: a
+robot dances on a skeleton, a cow is jelly that sways, a cat is painted gold, a fern stands behind them. The sun goes
+from noon to evening over 24 frames, and a lamp of Blender's is switched on.
 """
 
 from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
-from mathutils import Vector
+import numpy as np
+from mathutils import Euler, Vector
 
-EXAMPLES = Path(__file__).resolve().parent
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from blender_scenes import (
+    add_camera,
+    add_material,
+    add_mesh,
+    add_world,
+    environment,
+    import_drgs,
+    install,
+    select,
+    stand,
+    turned,
+)
+
+#: Reconstructed from photographs, see `make_captured.py`.
+CAPTURED = Path(__file__).resolve().parent / "captured"
 FRAMES = 24
-SIZE = 480
-#: One of Blender's own, of which the camera sees nothing that is blown out: edges before it would be jagged.
-WORLD = "forest.exr"
+SIZE = 720, 405
+#: One of Blender's own: soft light from above, which fills the sun's shadows.
+WORLD = "courtyard.exr"
+#: Degrees above the horizon, azimuth, W/m2 and colour of the sun, and strength and colour of the sky, at noon and at
+#: the end.
+NOON = (56.0, -52.0, 2.9, (1.0, 0.95, 0.88), 0.48, (1.0, 1.0, 1.0))
+EVENING = (11.0, 40.0, 2.2, (1.0, 0.4, 0.14), 0.11, (0.6, 0.75, 1.0))
+#: Frame at which the lamp goes on.
+DUSK = 15
+#: Where the cat stands.
+CAT = Vector((1.5, 0.3, 0.0))
+#: Bones of the robot in the space of its asset: parent, head and tail; feet stay where they are.
+BONES: dict[str, tuple[str | None, tuple[float, float, float], tuple[float, float, float]]] = {
+    "hips": (None, (0.0, 0.08, -0.36), (0.0, 0.08, -0.2)),
+    "torso": ("hips", (0.0, 0.08, -0.2), (0.0, 0.08, 0.1)),
+    "head": ("torso", (0.0, 0.08, 0.1), (-0.05, 0.1, 0.8)),
+    "upper arm.L": ("torso", (0.25, 0.14, 0.03), (0.46, 0.12, 0.03)),
+    "forearm.L": ("upper arm.L", (0.46, 0.12, 0.03), (0.72, 0.2, -0.5)),
+    "upper arm.R": ("torso", (-0.4, 0.12, 0.04), (-0.53, 0.12, -0.1)),
+    "forearm.R": ("upper arm.R", (-0.53, 0.12, -0.1), (-0.66, 0.16, -0.55)),
+    **{
+        f"{name}.{side}": (parent and parent.replace("*", side), (x, *head), (x, *tail))
+        for side, x in (("L", 0.24), ("R", -0.22))
+        for name, parent, head, tail in (
+            ("thigh", "hips", (0.12, -0.32), (0.1, -0.5)),
+            ("shin", "thigh.*", (0.1, -0.5), (0.12, -0.74)),
+            ("foot", None, (0.12, -0.74), (-0.02, -0.82)),
+        )
+    },
+}
+#: Turns of bones in degrees about axes of the asset: how far at most, and the part of a beat by which they lag.
+DANCE = {
+    "hips": ((6, 0.0), (0, 0), (10, 0.0)), "torso": ((5, 0.25), (9, 0.0), (0, 0)),
+    "head": ((8, 0.3), (16, 0.12), (12, 0.1)),
+    "upper arm.L": ((0, 0), (28, 0.5), (0, 0)), "forearm.L": ((18, 0.6), (30, 0.62), (0, 0)),
+    "upper arm.R": ((0, 0), (28, 0.0), (0, 0)), "forearm.R": ((18, 0.1), (30, 0.12), (0, 0)),
+}  # fmt: skip
 
 
-def install(zip_path: Path) -> None:
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    bpy.ops.extensions.package_install_files(filepath=str(zip_path), repo="user_default", enable_on_install=True)
-
-
-def import_drgs(path: Path) -> bpy.types.Object:
-    bpy.ops.import_scene.drgs(filepath=str(path))
-    return bpy.context.view_layer.objects.active
-
-
-def add_robot(assets: Path) -> bpy.types.Object:
-    """The robot: Blender's importer brings the rig, DR-GS the relightable object; binding joins them."""
-    bpy.ops.import_scene.gltf(filepath=str(EXAMPLES / "robot" / "RobotExpressive.glb"))
-    rig = next(o for o in bpy.context.selected_objects if o.type == "ARMATURE")
-    sources = [o for o in rig.children_recursive if o.type == "MESH"]
-    robot = import_drgs(assets / "robot.drgs")
-    bpy.ops.object.select_all(action="DESELECT")
-    for source in sources:
-        source.select_set(True)
-    robot.select_set(True)
-    bpy.context.view_layer.objects.active = robot
-    bpy.ops.drgs.bind_to_rig()
-    put_rigid_parts_back(robot, rig)
-    for source in sources:
-        bpy.data.objects.remove(source)
-    # Materials are attributes like any other: this robot gets a coat of metallic paint.
-    count = len(robot.data.vertices)
-    for name, value in (("metallic", 0.85), ("roughness", 0.28)):
-        robot.data.attributes[name].data.foreach_set("value", [value] * count)
-    rig.animation_data.action = next(a for a in bpy.data.actions if a.name.startswith("Dance"))
-    for track in rig.animation_data.nla_tracks:
-        track.mute = True
-    keys = robot.data.shape_keys
-    if keys:
-        surprised = keys.key_blocks.get("Surprised") or keys.key_blocks[-1]
-        for frame, value in ((1, 0.0), (12, 1.0), (FRAMES, 0.0)):
-            surprised.value = value
-            surprised.keyframe_insert("value", frame=frame)
+def add_robot(height: float, at: Vector, turn: float) -> bpy.types.Object:
+    """The robot on a skeleton of its own, with automatic weights, dances two beats."""
+    robot = import_drgs(CAPTURED / "robot.drgs")
+    stand(robot, height, at, turn)
+    data = bpy.data.armatures.new("Skeleton")
+    rig = bpy.data.objects.new("Skeleton", data)
+    bpy.context.collection.objects.link(rig)
+    rig.matrix_world = robot.matrix_world
+    select(rig)
+    bpy.ops.object.mode_set(mode="EDIT")
+    for name, (parent, head, tail) in BONES.items():
+        bone = data.edit_bones.new(name)
+        bone.head, bone.tail = head, tail
+        bone.parent = data.edit_bones[parent] if parent else None
+    bpy.ops.object.mode_set(mode="OBJECT")
+    select(rig, robot)
+    bpy.ops.drgs.bind_to_armature()
+    # The brows hang on nothing: heat does not reach them, and what is nearest need not be the head.
+    above = [v.index for v in robot.data.vertices if v.co.z > 0.2]
+    for group in robot.vertex_groups:
+        if group.name == "head":
+            group.add(above, 1.0, "REPLACE")
+        else:
+            group.remove(above)
+    for side in "LR":
+        follow = rig.pose.bones[f"shin.{side}"].constraints.new("IK")
+        follow.target, follow.subtarget, follow.chain_count = rig, f"foot.{side}", 2
+    for frame in range(1, FRAMES + 1):
+        beat = 2 * math.pi * (frame - 1) / (FRAMES / 2)
+        for name, turns in DANCE.items():
+            bone = rig.pose.bones[name]
+            angles = [math.radians(most * math.sin(beat - 2 * math.pi * lag)) for most, lag in turns]
+            turned = Euler(angles).to_matrix()
+            to_bone = bone.bone.matrix_local.to_3x3()
+            bone.rotation_quaternion = (to_bone.inverted() @ turned @ to_bone).to_quaternion()
+            bone.keyframe_insert("rotation_quaternion", frame=frame)
+        hips = rig.pose.bones["hips"]
+        sway = Vector((0.05 * math.sin(beat), 0.0, -0.035 - 0.035 * math.cos(2 * beat)))
+        hips.location = hips.bone.matrix_local.to_3x3().inverted() @ sway
+        hips.keyframe_insert("location", frame=frame)
     return robot
 
 
-def put_rigid_parts_back(robot: bpy.types.Object, rig: bpy.types.Object) -> None:
-    """Move the robot's rigid parts to where their file has them.
-
-    The armature is scaled by 100, and Blender's glTF importer then sets objects that hang on bones one bone too low.
-    The parts are vertex groups by now: moving vertices is an edit like any other, the surfels follow.
-    """
-    scale = rig.matrix_world.to_scale().y
-    to_robot = robot.matrix_world.inverted().to_3x3() @ rig.matrix_world.to_3x3()
-    moves = {}
-    parts = [c for c in rig.children if any(o.type == "MESH" for o in (c, *c.children_recursive))]
-    for name in {part.parent_bone for part in parts if part.parent_type == "BONE"}:
-        bone, group = rig.data.bones[name], robot.vertex_groups.get(name)
-        if group:
-            moves[group.index] = to_robot @ bone.matrix_local.to_3x3() @ Vector((0, bone.length * (scale - 1), 0))
-    keys = robot.data.shape_keys
-    shapes = [robot.data.vertices, *([block.data for block in keys.key_blocks] if keys else [])]
-    for vertex in robot.data.vertices:
-        move = next((moves[g.group] for g in vertex.groups if g.group in moves and g.weight > 0.99), None)
-        if move:
-            for points in shapes:
-                points[vertex.index].co += move
+def add_cow(height: float, at: Vector, turn: float) -> bpy.types.Object:
+    """The cow is jelly, held at its hooves and pushed; particles carry it."""
+    cow = import_drgs(CAPTURED / "spot.drgs")
+    stand(cow, height, at, turn)
+    heights = [(cow.matrix_world @ vertex.co).z for vertex in cow.data.vertices]
+    cow.vertex_groups.new(name="hooves").add([i for i, z in enumerate(heights) if z < 0.07], 1.0, "REPLACE")
+    physics = cow.drgs.physics
+    physics.use = True
+    physics.material, physics.youngs_modulus, physics.resolution = "jelly", 1.0e5, 28
+    physics.pin_group, physics.velocity, physics.damping = "hooves", (1.3, 0.0, 0.5), 0.5
+    physics.use_floor, physics.floor = True, 0.0
+    physics.frame_start, physics.frame_end = 1, FRAMES
+    select(cow)
+    bpy.ops.drgs.bake_physics()
+    return cow
 
 
-def stand(subject: bpy.types.Object, height: float, at: Vector, turn: float = 0.0) -> None:
-    """Scale `subject` to `height` metres and stand it on the ground at `at`."""
-    corners = [Vector(c) for c in subject.bound_box]
-    low, high = min(c.z for c in corners), max(c.z for c in corners)
-    subject.scale = (height / (high - low),) * 3
-    middle = sum(corners, Vector()) / 8
-    subject.rotation_euler = (0, 0, turn)
-    bpy.context.view_layer.update()
-    foot = subject.matrix_world @ Vector((middle.x, middle.y, low))
-    subject.location += at - foot
+def add_stage() -> None:
+    """A sheet that curves up behind everything, and a plinth for the cat."""
+    depth, bend = 3.2, 2.0
+    curve = [(-12.0, 0.0), (depth, 0.0)]
+    curve += [(depth + bend * math.sin(a), bend * (1 - math.cos(a))) for a in np.linspace(0, math.pi / 2, 17)[1:]]
+    curve.append((depth + bend, 9.0))
+    vertices = np.array([(x, y, z) for y, z in curve for x in (-14.0, 14.0)])
+    faces = [[2 * k, 2 * k + 1, 2 * k + 3, 2 * k + 2] for k in range(len(curve) - 1)]
+    add_mesh("Sheet", vertices, faces, add_material("Paper", (0.62, 0.58, 0.53), roughness=0.7))
+    profile = [(0.0, 0.3), (0.31, 0.3), (0.33, 0.28), (0.33, 0.03), (0.36, 0.0)]
+    plinth = add_mesh("Plinth", *turned(profile[::-1]), add_material("Stone", (0.09, 0.1, 0.12), roughness=0.25))
+    plinth.location = CAT
 
 
-def add_turning_world(name: str) -> None:
-    scene = bpy.context.scene
-    world = bpy.data.worlds.new("World")
-    scene.world = world
-    world.use_nodes = True
+def add_lamp(at: Vector) -> None:
+    """A lamp of Blender's: a stem, and a ball of glass that begins to glow at dusk."""
+    stem = [(0.16, 0.0), (0.16, 0.02), (0.02, 0.04), (0.015, 0.62), (0.05, 0.64), (0.0, 0.64)]
+    add_mesh(
+        "Stem", *turned(stem), add_material("Brass", (0.8, 0.55, 0.25), metallic=1.0, roughness=0.25)
+    ).location = at
+    glow = add_material("Bulb", (0.9, 0.9, 0.88), roughness=0.15)
+    shader = glow.node_tree.nodes["Principled BSDF"]
+    shader.inputs["Emission Color"].default_value = (1.0, 0.62, 0.3, 1)
+    strength = shader.inputs["Emission Strength"]
+    for frame, value in ((DUSK - 3, 0.0), (DUSK + 2, 22.0)):
+        strength.default_value = value
+        strength.keyframe_insert("default_value", frame=frame)
+    angles = np.linspace(0, math.pi, 25)
+    ball = [(0.13 * math.sin(a), -0.13 * math.cos(a)) for a in angles]
+    add_mesh("Bulb", *turned(ball), glow).location = at + Vector((0, 0, 0.75))
+
+
+def add_day() -> None:
+    """The sun and the sky from noon to evening."""
+    sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
+    sun.data.angle = math.radians(2.5)
+    bpy.context.collection.objects.link(sun)
+    world = add_world()
     nodes, links = world.node_tree.nodes, world.node_tree.links
-    image, mapping = nodes.new("ShaderNodeTexEnvironment"), nodes.new("ShaderNodeMapping")
-    coordinate = nodes.new("ShaderNodeTexCoord")
-    folder = Path(bpy.utils.system_resource("DATAFILES")) / "studiolights" / "world"
-    image.image = bpy.data.images.load(str(folder / name))
-    links.new(coordinate.outputs["Generated"], mapping.inputs["Vector"])
-    links.new(mapping.outputs["Vector"], image.inputs["Vector"])
-    links.new(image.outputs["Color"], nodes["Background"].inputs["Color"])
-    rotation = mapping.inputs["Rotation"]
-    for frame, degrees in ((1, 0), (FRAMES + 1, 360)):
-        rotation.default_value = (0, 0, math.radians(degrees))
-        rotation.keyframe_insert("default_value", index=2, frame=frame)
+    image, tint = nodes.new("ShaderNodeTexEnvironment"), nodes.new("ShaderNodeMix")
+    tint.data_type, tint.blend_type = "RGBA", "MULTIPLY"
+    tint.inputs["Factor"].default_value = 1.0
+    image.image = environment(WORLD)
+    links.new(image.outputs["Color"], tint.inputs[6])
+    links.new(tint.outputs[2], nodes["Background"].inputs["Color"])
+    for frame in range(1, FRAMES + 1):
+        part = (frame - 1) / (FRAMES - 1)
+        part = part * part * (3 - 2 * part)
+        height, azimuth, power, colour, sky, sky_colour = (mix(a, b, part) for a, b in zip(NOON, EVENING))
+        sun.rotation_euler = (math.radians(90 - height), 0, math.radians(azimuth))
+        sun.data.energy, sun.data.color = power, colour
+        tint.inputs[7].default_value = (*sky_colour, 1)
+        nodes["Background"].inputs["Strength"].default_value = sky
+        sun.keyframe_insert("rotation_euler", frame=frame)
+        sun.data.keyframe_insert("energy", frame=frame)
+        sun.data.keyframe_insert("color", frame=frame)
+        tint.inputs[7].keyframe_insert("default_value", frame=frame)
+        nodes["Background"].inputs["Strength"].keyframe_insert("default_value", frame=frame)
 
 
-def add_camera(target: Vector, distance: float, height: float = 0.28) -> None:
-    data = bpy.data.cameras.new("Camera")
-    data.lens = 50
-    camera = bpy.data.objects.new("Camera", data)
-    bpy.context.collection.objects.link(camera)
-    direction = Vector((0.25, -1.0, height)).normalized()
-    camera.location = target + direction * distance
-    camera.rotation_euler = direction.to_track_quat("Z", "Y").to_euler()
-    bpy.context.scene.camera = camera
+def mix(a: float | Sequence[float], b: float | Sequence[float], part: float) -> float | tuple[float, ...]:
+    """`a` and `b` blended, numbers or colours."""
+    if isinstance(a, Sequence) and isinstance(b, Sequence):
+        return tuple((1 - part) * x + part * y for x, y in zip(a, b))
+    return (1 - part) * a + part * b
 
 
-def main(zip_path: Path, assets: Path, blend: Path) -> None:
+def main(zip_path: Path, blend: Path) -> None:
     install(zip_path)
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, FRAMES
-    bpy.ops.wm.save_as_mainfile(filepath=str(blend))
-    add_robot(assets)
-    helmet = import_drgs(assets / "helmet.drgs")
-    stand(helmet, 3.2, Vector((4.3, 0.5, 0.0)))
-    for frame, degrees in ((1, -30), (FRAMES, 60)):
-        helmet.rotation_euler = (0, 0, math.radians(degrees))
-        helmet.keyframe_insert("rotation_euler", frame=frame)
-    stand(import_drgs(assets / "playbot.drgs"), 2.4, Vector((-4.4, 0.8, 0.0)), math.radians(-15))
-    add_turning_world(WORLD)
-    add_camera(Vector((0.25, 0.0, 1.9)), 16.5)
     scene.render.engine = "DRGS"
-    scene.render.resolution_x = scene.render.resolution_y = SIZE
+    scene.render.resolution_x, scene.render.resolution_y = SIZE
+    bpy.ops.wm.save_as_mainfile(filepath=str(blend))  # caches lie beside it
+    add_stage()
+    add_robot(1.5, Vector((-0.05, 0.35, 0.0)), math.radians(8))
+    cat = import_drgs(CAPTURED / "cat.drgs")
+    stand(cat, 0.95, CAT + Vector((0, 0, 0.3)), math.radians(-25))
+    bpy.ops.drgs.set_material(preset="GOLD")
+    stand(import_drgs(CAPTURED / "fern.drgs"), 0.75, Vector((-1.75, 1.35, 0.0)), math.radians(20))
+    add_cow(0.8, Vector((-1.4, -0.25, 0.0)), math.radians(-40))
+    add_lamp(Vector((1.02, 1.5, 0.0)))
+    add_day()
+    add_camera(Vector((-0.05, 0.2, 0.68)), Vector((0.55, -6.5, 1.5)), 55.0)
     scene.drgs.subpixel_samples = 8
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
 
 
 if __name__ == "__main__":
-    main(*(Path(argument).resolve() for argument in sys.argv[-3:]))
+    main(*(Path(argument).resolve() for argument in sys.argv[-2:]))

@@ -18,32 +18,16 @@ import numpy as np
 from mathutils import Vector
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from demo_scene import add_camera, add_turning_world, import_drgs, install, stand
+from blender_scenes import add_camera, add_material, add_mesh, add_turning_world, import_drgs, install, stand
 
 FRAMES = 48
 #: Young's moduli of the two cows, Pa.
 SOFT, FIRM = 2e5, 8e5
 
 
-def add_mesh(name: str, vertices: np.ndarray, faces: Sequence[Sequence[int]], grey: float) -> bpy.types.Object:
-    """An ordinary mesh, smooth, with a plain material."""
-    mesh = bpy.data.meshes.new(name)
-    mesh.from_pydata(vertices.tolist(), [], [list(face) for face in faces])
-    mesh.polygons.foreach_set("use_smooth", [True] * len(mesh.polygons))
-    material = bpy.data.materials.new(name)
-    material.use_nodes = True
-    shader = material.node_tree.nodes["Principled BSDF"]
-    shader.inputs["Base Color"].default_value = (grey, grey, grey, 1)
-    shader.inputs["Roughness"].default_value = 0.6
-    mesh.materials.append(material)
-    obj = bpy.data.objects.new(name, mesh)
-    bpy.context.collection.objects.link(obj)
-    return obj
-
-
 def add_ground(grey: float = 0.25) -> bpy.types.Object:
     corners = np.array([[-40, -40, 0], [40, -40, 0], [40, 40, 0], [-40, 40, 0]], float)
-    return add_mesh("Ground", corners, [(0, 1, 2, 3)], grey)
+    return add_mesh("Ground", corners, [[0, 1, 2, 3]], add_material("Ground", (grey,) * 3, roughness=0.6))
 
 
 def add_dishes(
@@ -65,13 +49,18 @@ def add_dishes(
         low, high = start + len(circles), start + len(circles) + 1
         for k in range(around):
             n = (k + 1) % around
-            faces.append((low, start + k, start + n))
+            faces.append([low, start + k, start + n])
             for c in range(len(middle) - 1):
                 a, b = start + c * around, start + (c + 1) * around
-                faces.append((a + k, b + k, b + n, a + n))
+                faces.append([a + k, b + k, b + n, a + n])
             last = start + (len(middle) - 1) * around
-            faces.append((last + k, high, last + n))
-    return add_mesh("Dishes", np.concatenate(vertices), faces, 0.35)
+            faces.append([last + k, high, last + n])
+    return add_mesh("Dishes", np.concatenate(vertices), faces, add_material("Dishes", (0.35,) * 3, roughness=0.6))
+
+
+def seen_from(target: Vector, distance: float, height: float = 0.28) -> tuple[Vector, Vector]:
+    """What a camera looks at, and where it stands."""
+    return target, target + Vector((0.25, -1.0, height)).normalized() * distance
 
 
 def paint(obj: bpy.types.Object, colour: Sequence[float] | None = None, **values: float) -> None:
@@ -121,8 +110,8 @@ def droop(assets: Path) -> None:
         bake(
             cow, "jelly", youngs_modulus=youngs_modulus, pin_group="hooves", damping=1.5, resolution=32, use_floor=True
         )
-    add_turning_world("courtyard.exr")
-    add_camera(Vector((0.2, 0, 0.8)), 8.5)
+    add_turning_world("courtyard.exr", FRAMES)
+    add_camera(*seen_from(Vector((0.2, 0, 0.8)), 8.5))
     bpy.ops.wm.save_mainfile()
 
 
@@ -144,8 +133,8 @@ def fall(assets: Path) -> None:
         stand(cat, 2.2, Vector((x, 0, 0.9)), math.radians(-25))
         paint(cat, **look)
         bake(cat, name, dishes, resolution=32, use_floor=True, **more)
-    add_turning_world("courtyard.exr")
-    add_camera(Vector((0.4, 0, 0.6)), 15.5, height=0.6)
+    add_turning_world("courtyard.exr", FRAMES)
+    add_camera(*seen_from(Vector((0.4, 0, 0.6)), 15.5, height=0.6))
     bpy.ops.wm.save_mainfile()
 
 

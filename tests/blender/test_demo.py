@@ -1,0 +1,68 @@
+"""The demo's scene: who moves in it, and that what the artist set reaches every frame."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Vector
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+
+@pytest.fixture(scope="module")
+def demo():
+    sys.path.insert(0, str(EXAMPLES))
+    specification = importlib.util.spec_from_file_location("demo_scene", EXAMPLES / "demo_scene.py")
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    yield module
+    sys.path.remove(str(EXAMPLES))
+
+
+def points(obj, frame):
+    """(n, 3) vertices of an object at a frame, in the world."""
+    bpy.context.scene.frame_set(frame)
+    evaluated = obj.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    found = np.empty((len(evaluated.data.vertices), 3), np.float32)
+    evaluated.data.vertices.foreach_get("co", found.ravel())
+    matrix = np.array(evaluated.matrix_world)
+    return found @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+@pytest.mark.slow
+def test_the_robot_dances_on_its_feet_and_keeps_its_brows(scene, demo):
+    robot = demo.add_robot(1.5, Vector((0, 0, 0)), 0.0)
+    rest, low = points(robot, 1), None
+    feet = rest[:, 2] < 0.08
+    head = [v.index for v in robot.data.vertices if v.co.z > 0.2]
+    apart = lambda p: np.linalg.norm(p[head] - p[head].mean(axis=0), axis=1)  # noqa: E731
+    moved = []
+    for frame in (4, 7, 10):
+        now = points(robot, frame)
+        moved.append(np.linalg.norm(now - rest, axis=1))
+        low = moved[-1][feet].max()
+        assert low < 0.05, "feet stay on the ground"
+        np.testing.assert_allclose(apart(now), apart(rest), atol=2e-3, err_msg="the head is rigid, brows and all")
+    assert np.max(moved) > 0.3
+
+
+@pytest.mark.slow
+def test_day_becomes_evening_and_the_lamp_goes_on(scene, demo, export):
+    demo.add_stage()
+    demo.add_lamp(Vector((1, 1, 0)))
+    demo.add_day()
+    frames = {}
+    for frame in (1, demo.FRAMES):
+        scene.frame_set(frame)
+        frames[frame], warnings = export()
+        assert not warnings
+    noon, evening = frames.values()
+    down = [np.asarray(f.lights[0].matrix_world)[:3, 2][2] for f in (noon, evening)]
+    assert down[0] > 0.8 and 0.1 < down[1] < 0.3, "the sun sinks"
+    glow = [max(max(m.emission) for mesh in f.meshes for m in mesh.materials) for f in (noon, evening)]
+    assert glow[0] == 0 and glow[1] > 5
