@@ -22,8 +22,8 @@ _CLOSE = 1e-4
 _PROBES = 4096
 #: A mesh is flat where it is thinner than this part of its size.
 _FLAT = 1e-6
-#: Particles and vertices at rest by folder and digest of their cache, and how many caches are known at most.
-_rests: dict[tuple[str, str], tuple[Array, Array]] = {}
+#: What is at rest by folder, digest and version of its cache, and how many caches are known at most.
+_rests: dict[tuple[str, str, int], ParticleFrame] = {}
 _MOST = 16
 
 
@@ -79,11 +79,17 @@ def particles_of(
                 return None
         played = cache_playback.Played(path, header)
         frame = _frame_of(modifier, header, depsgraph.scene_eval)
-        points, began = _rest_of(cache, header)
-        particles, shown = cache.driving(frame, points, last=played.last, place=_placing(played))
+        still = _rest_of(cache, header)
+        if closes and header.cells is not None and still.broken is None:
+            warn(
+                f'"{obj.name}": was baked before frames knew what had broken until then, so cracks may close again. '
+                "Bake again"
+            )
+        particles, shown = cache.driving(frame, still, last=played.last, place=_placing(played))
     except (DrgsError, OSError) as error:
         warn(f'"{obj.name}": {follow}, as particles cannot be read: {error}')
         return None
+    began = still.vertices
     posed = not skin and not _same_places(began, rest)
     if posed and wanted == "particles":
         warn(
@@ -122,15 +128,16 @@ def _same_places(a: Array, b: Array) -> bool:
     return bool(np.abs(a[known] - b[known]).max() <= _CLOSE * float(np.ptp(b[known], axis=0).max()))
 
 
-def _rest_of(cache: ParticleCache, header: Header) -> tuple[Array, Array]:
+def _rest_of(cache: ParticleCache, header: Header) -> ParticleFrame:
     """Particles and vertices of a cache at rest, read once."""
-    key = str(cache.folder), header.digest
+    key = str(cache.folder), header.digest, header.version
     if key in _rests:
         return _rests[key]
     read = cache.rest()
-    rest = np.array(read.points), np.array(read.vertices)
+    broken = None if read.broken is None else np.array(read.broken)
+    rest = ParticleFrame(*(np.array(array) for array in (read.points, read.gradients, read.vertices)), broken)
     now = cache.header()
-    if now is None or now.digest != header.digest:
+    if now is None or (now.digest, now.version) != (header.digest, header.version):
         raise AssetError(str(cache.folder), "is being baked again", "Wait for the first frames")
     if len(_rests) >= _MOST:
         _rests.clear()
@@ -149,7 +156,7 @@ def _placing(played: cache_playback.Played) -> Callable[[int, ParticleFrame], Pa
         moved = _moved(particles, _affine(frame.vertices, vertices))
         if moved is None:
             raise AssetError(str(played.path), f"does not hold frame {number} of its cache", "Bake again")
-        return ParticleFrame(moved.points, moved.gradients, vertices)
+        return replace(frame, points=moved.points, gradients=moved.gradients, vertices=vertices)
 
     return place
 

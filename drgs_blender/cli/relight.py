@@ -26,7 +26,7 @@ from ..core.errors import UsageError
 from ..core.frame import Camera, Frame, Inside, ObjectState, Particles, ProxyMesh, RenderSettings, World
 from ..core.frame_sequences import frame_path
 from ..core.loading import many_imports
-from ..core.particle_cache import ParticleCache
+from ..core.particle_cache import ParticleCache, ParticleFrame
 from . import sampling
 from .camera_file import LARGEST_SIDE, read_camera
 from .frame_range import check_template, parse_frames
@@ -328,10 +328,15 @@ def _poses(args: argparse.Namespace) -> tuple[Sequence[tuple[int, Callable[[], _
     if driven == "surface" and not skin and (not closes or header.cells is None):
         give = [(frame, partial(_by_mesh, partial(_vertices, cache, frame))) for frame in frames]
     else:
-        rest = np.array(cache.rest().points)
+        rest = cache.rest()
+        if closes and header.cells is not None and rest.broken is None:
+            problem = "was baked before frames knew what had broken until then: cracks may close again. Bake again"
+            logger.warning("%s %s", args.cache, problem)
+        rest = replace(rest, points=np.array(rest.points))
         cells = None if header.cells is None else np.array(header.cells, np.float64)
-        shown = Particles(rest, rest, rest, driven == "particles", cells, driven != "surface", skin)
-        give = [(frame, partial(_simulated, cache, frame, shown)) for frame in frames]
+        own = rest.points, rest.points, rest.gradients
+        shown = Particles(*own, driven == "particles", cells, driven != "surface", skin)
+        give = [(frame, partial(_simulated, cache, frame, rest, shown)) for frame in frames]
     return give, (header.tear, header.grain)
 
 
@@ -343,9 +348,10 @@ def _vertices(cache: ParticleCache, frame: int) -> np.ndarray:
     return cache.read(frame).vertices
 
 
-def _simulated(cache: ParticleCache, frame: int, shown: Particles) -> _Pose:
-    particles, vertices = cache.driving(frame, shown.rest)
-    return vertices, replace(shown, points=particles.points, gradients=particles.gradients)
+def _simulated(cache: ParticleCache, frame: int, rest: ParticleFrame, shown: Particles) -> _Pose:
+    particles, vertices = cache.driving(frame, rest)
+    now = {name: getattr(particles, name) for name in ("points", "gradients", "broken")}
+    return vertices, replace(shown, **now)
 
 
 def read_environment(args: argparse.Namespace, asset: Asset) -> np.ndarray:

@@ -156,6 +156,9 @@ class Particles:
         Metres, vertices of the object's mesh when the particles were at rest; None: as in the asset.
     skin : bool
         Whether camera and rays meet a surface around them in place of mesh and surfels, as of fluids; needs ``cells``.
+    broken : (bytes,) uint8 array, optional
+        Which bonds between neighbours have broken until now, see `deform.bonds.Bonds.packed`; None: those that now are
+        apart.
     """
 
     rest: Array
@@ -166,6 +169,7 @@ class Particles:
     surfels: bool = True
     skin: bool = False
     began: Array | None = None
+    broken: Array | None = None
 
 
 @dataclass(slots=True)

@@ -2,7 +2,8 @@
 
     CACHE/cache.json            what was simulated: settings, their digest, counts, frames a second
     CACHE/rest.drgp             points and vertices at rest
-    CACHE/frame_000012.drgp     points (float32), their deformation gradients (float16), vertices (float32)
+    CACHE/frame_000012.drgp     points (float32), their deformation gradients (float16), vertices (float32), and of
+                                matter that can break which bonds have broken until then (bits)
     CACHE/state.drgp            all that the next frame depends on, to go on after an interruption
 
 Positions are in the space that `cache.json` names: that of the object. The files are stored zips (asset.archive); numpy
@@ -16,7 +17,7 @@ import os
 import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,8 @@ from .sim_materials import LOOSE
 
 Array = np.ndarray
 
-VERSION = 2
+#: 3: frames know what has broken until then.
+VERSION = 3
 HEADER, _REST, _STATE = "cache.json", "rest.drgp", "state.drgp"
 _NAME = re.compile(r"frame_(-?\d+)\.drgp")
 _AGAIN = "Bake again"
@@ -83,6 +85,12 @@ class Header:
         """Whether none of the matter flows: only then do its particles know how space around them deforms."""
         return all(isinstance(row, dict) and row.get("model") not in LOOSE for row in self._materials)
 
+    @property
+    def breaks(self) -> bool:
+        """Whether its matter can break, so that frames keep what has broken."""
+        rigid = isinstance(self.settings, dict) and self.settings.get("solver") == "rigid"
+        return self.keeps_shape and not rigid and self.tear > 0 and self.cells is not None
+
     def has_skin(self, surface: str, captured: bool) -> bool:
         """Whether an object is shown by a surface of its particles.
 
@@ -114,11 +122,14 @@ class ParticleFrame:
         Deformation gradient of each since rest.
     vertices : (k, 3) float32 array
         Metres: the mesh.
+    broken : (bytes,) uint8 array, optional
+        What has broken until then, see `frame.Particles`; not of matter that cannot break, nor of caches of before.
     """
 
     points: Array
     gradients: Array
     vertices: Array
+    broken: Array | None = None
 
 
 class ParticleCache:
@@ -152,8 +163,12 @@ class ParticleCache:
                 str(self.folder), f"cannot be made ({error.strerror or error})", "Choose another folder"
             ) from error
         self.clear()
-        _write(self.folder / _REST, _members_of(rest))
+        self.write_rest(rest)
         self.describe(header)
+
+    def write_rest(self, rest: ParticleFrame) -> None:
+        """Write particles and mesh at rest."""
+        _write(self.folder / _REST, _members_of(rest))
 
     def extend(self, header: Header, last: int) -> None:
         """Go on under another header: frames after `last` are removed."""
@@ -202,7 +217,7 @@ class ParticleCache:
             raise AssetError(
                 str(path), "is not the header of a particle cache", "Remove this file, and bake again"
             ) from error
-        if header.version not in (1, VERSION):
+        if header.version not in range(1, VERSION + 1):
             raise AssetError(str(path), f"is of version {header.version}, not {VERSION}", "Use the DR-GS that baked it")
         return header
 
@@ -214,7 +229,10 @@ class ParticleCache:
         return sorted(int(match[1]) for match in names if match)
 
     def lacking(self, first: int, last: int) -> int | None:
-        """The first of some frames that is missing, or cut off: all have as many bytes; None: none is."""
+        """The first of some frames that is missing, or cut off: all have as many bytes; None: none is.
+
+        The last one, from which all goes on, is read.
+        """
         sizes = []
         for frame in range(first, last + 1):
             try:
@@ -222,7 +240,13 @@ class ParticleCache:
             except OSError:
                 return frame
         whole = max(sizes, default=0)
-        return next((first + i for i, size in enumerate(sizes) if size != whole), None)
+        if (gone := next((first + i for i, size in enumerate(sizes) if size != whole), None)) is not None:
+            return gone
+        try:
+            self.read(last)
+        except (AssetError, UsageError):
+            return last
+        return None
 
     def rest(self) -> ParticleFrame:
         """Particles and mesh at rest."""
@@ -251,7 +275,7 @@ class ParticleCache:
     def driving(
         self,
         frame: float,
-        rest: Array | None = None,
+        rest: ParticleFrame | None = None,
         *,
         last: int | None = None,
         place: Callable[[int, ParticleFrame], ParticleFrame] | None = None,
@@ -261,9 +285,10 @@ class ParticleCache:
         Parameters
         ----------
         frame : float
-            Between two frames all moves straight from one to the next, beyond those that are there nothing moves.
-        rest : (s, 3) float32 array, optional
-            Particles at rest, where they have been read before.
+            Between two frames all moves straight from one to the next, and what has broken in the next is broken;
+            beyond those that are there nothing moves.
+        rest : ParticleFrame, optional
+            All at rest, where it has been read before.
         last : int, optional
             Frames after it count as not there.
         place : callable, optional
@@ -285,21 +310,25 @@ class ParticleCache:
         at = min(max(frame, there[0]), there[-1]) if there else frame
         first = int(np.floor(at))
         shown = [_single(self.read(first + k)) for k in range(2 if at > first else 1)]
-        rest = np.array(self.rest().points) if rest is None else rest
+        rest = self.rest() if rest is None else rest
         for number, read in enumerate(shown, first):
-            if len(read.points) != len(rest):
-                raise AssetError(
-                    str(self.path(number)), f"has {len(read.points)} particles, {len(rest)} at rest", _AGAIN
-                )
+            for what, found, wanted in (
+                ("particles", len(read.points), len(rest.points)),
+                ("bytes of what has broken", *(0 if of.broken is None else len(of.broken) for of in (read, rest))),
+            ):
+                if found != wanted:
+                    raise AssetError(str(self.path(number)), f"has {found} {what}, {wanted} at rest", _AGAIN)
+        broken = None if shown[-1].broken is None else np.array(shown[-1].broken)
         shown = shown if place is None else [place(number, read) for number, read in enumerate(shown, first)]
         points, gradients, vertices = (np.array(a) for a in (shown[0].points, shown[0].gradients, shown[0].vertices))
         if len(shown) > 1:
             part, then = np.float32(at - first), shown[1]
             for now, later in ((points, then.points), (gradients, then.gradients), (vertices, then.vertices)):
                 now += part * (later - now)
-        for array in (rest, points, gradients, vertices):
+        began = np.array(rest.points) if rest.points.base is not None else rest.points
+        for array in (began, points, gradients, vertices, *([] if broken is None else [broken])):
             array.flags.writeable = False  # so that the engine's client need not copy it
-        return Particles(rest, points, gradients), vertices
+        return Particles(began, points, gradients, broken=broken), vertices
 
     def write(self, frame: int, particles: ParticleFrame) -> None:
         """Write a frame in one step: a reader sees all of it or nothing."""
@@ -321,16 +350,17 @@ class ParticleCache:
 def _single(frame: ParticleFrame) -> ParticleFrame:
     """A frame with gradients in single precision."""
     gradients = _SINGLE[np.ascontiguousarray(frame.gradients, np.float16).view(np.uint16)]
-    return ParticleFrame(frame.points, gradients, frame.vertices)
+    return replace(frame, gradients=gradients)
 
 
 def _members_of(particles: ParticleFrame) -> dict[str, Array]:
     top = float(np.finfo(np.float16).max)
-    return {
+    members = {
         "points": np.ascontiguousarray(particles.points, np.float32),
         "gradients": np.clip(particles.gradients, -top, top).astype(np.float16),
         "vertices": np.ascontiguousarray(particles.vertices, np.float32),
     }
+    return members if particles.broken is None else members | {"broken": particles.broken}
 
 
 def _frame(path: Path) -> ParticleFrame:
@@ -341,7 +371,10 @@ def _frame(path: Path) -> ParticleFrame:
         raise AssetError(str(path), f"lacks {error.args[0]}", _AGAIN) from error
     if points.ndim != 2 or points.shape[1:] != (3,) or gradients.shape != (len(points), 3, 3):
         raise AssetError(str(path), "holds arrays that do not fit each other", _AGAIN)
-    return ParticleFrame(points, gradients, vertices)
+    broken = arrays.get("broken")
+    if broken is not None and (broken.dtype != np.uint8 or broken.ndim != 1 or 8 * len(broken) < 3 * len(points)):
+        raise AssetError(str(path), f"does not say of {len(points)} particles what has broken", _AGAIN)
+    return ParticleFrame(points, gradients, vertices, broken)
 
 
 def _write(path: Path, arrays: dict[str, Array]) -> None:

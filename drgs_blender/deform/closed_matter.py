@@ -144,7 +144,7 @@ class Breakable:
         self._normals: Array | None = None
 
     def closed(
-        self, vertices: Array, points: Array, gradients: Array, gap: float, band: float = 0.0
+        self, vertices: Array, points: Array, gradients: Array, gap: float, band: float = 0.0, bits: Array | None = None
     ) -> ClosedMatter | None:
         """The mesh with closed pieces; None where nothing has broken that the mesh shows.
 
@@ -160,14 +160,21 @@ class Breakable:
             Metres by which neighbours have moved apart at least where they have broken, see `fracture.torn_faces`.
         band : float
             Metres: faces that are no farther than this from a crack are replaced as well, by themselves.
+        bits : (bytes,) uint8 array, optional
+            What has broken until now, see `Bonds.packed`; without, that counts as broken which now is apart.
+
+        Raises
+        ------
+        ValueError
+            The bits are of other bonds.
         """
         bonds = self.bonds
         size = abs(float(np.linalg.det(self._linear))) ** (1 / 3)
         now = bonds.placed(points)
-        broken = bonds.broken(now, gap * size)
-        if not broken.any():
+        broken = bonds.broken(now, gap * size) if bits is None else bonds.unpacked(bits)
+        if not broken.up.any():
             return None
-        zone = bonds.zone(now, broken, gap * size)
+        zone = bonds.zone(broken)
         nodes = smoothed_nodes(zone)
         places = self.places + _BESIDE
         warp(places, zone.size + 1, *nodes)
@@ -187,8 +194,8 @@ class Breakable:
         row, axis = open_faces(pieces, zone)
         own_f = self._linear @ np.asarray(gradients, np.float64) @ np.linalg.inv(self._linear)
         some = np.unique(zone.owner[zone.owner >= 0])
-        own_f[some] = _believable(own_f[some], bonds.stretch(now, broken, some))
-        sides = Sides(bonds, zone, nodes, broken, now, own_f)
+        own_f[some] = _believable(own_f[some], bonds.stretch(now, broken.up, some))
+        sides = Sides(bonds, zone, nodes, broken.up, now, own_f)
         moved, aside = self._parted_vertices(places, bonds.placed(vertices), sides)
         shown = np.array(vertices, np.float32)
         shown[aside] = bonds.returned(moved[aside])

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..compute.jit import njit
-from .bonds import Cells, find, key_of
+from .bond_kernels import find, key_of
+from .bonds import Cells
 
 Array = np.ndarray
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from ..compute.jit import njit
 from ..geometry.distinct_rows import distinct_row_indices
-from .bonds import Cells, find, key_of
+from .bond_kernels import find, key_of
+from .bonds import Cells
 
 Array = np.ndarray
 

@@ -82,7 +82,11 @@ class BrokenMatter:
             matter = Breakable(rest[2], mesh.faces, *rest[:2])
             self._known.append(_Known(weakref.ref(loaded), *rest, matter))
         given = vertices, particles.points, particles.gradients, state.tear
-        return matter.closed(*given, 2 * _extent(loaded))
+        try:
+            return matter.closed(*given, 2 * _extent(loaded), particles.broken)
+        except ValueError as error:
+            problem = f"what has broken of it is not of its particles ({error})"
+            raise AssetError(f"object {state.name}", problem, "Bake it again") from error
 
     def carry(
         self, loaded: LoadedAsset, state: ObjectState, driven: MeshDriven, closed: ClosedMatter, posed: PosedSurfels

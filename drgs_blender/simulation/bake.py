@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any, Protocol
 
 from ..core.errors import UsageError
 from ..core.particle_cache import Header, ParticleCache, ParticleFrame
+from .cracks import cracks_of, cracks_until, renewed
 from .input_digest import same_until
 from .job import Job
 from .settings import Settings
@@ -60,10 +61,17 @@ def bake(
     header = header_of(job, rest, asdict(settings))
     start = _resume(job, cache, header, overwrite)
     if start is None:
-        cache.create(header, rest)
-        cache.write(settings.first, rest)
+        begin(cache, header, rest)
         start = settings.first
     return compute(job, [(cache, job)], start, cancelled, progress)
+
+
+def begin(cache: ParticleCache, header: Header, rest: ParticleFrame) -> None:
+    """Begin a cache: its header, and its first frame, in which all is at rest."""
+    cracks = cracks_of(header, rest)
+    rest = rest if cracks is None else cracks.add(rest)
+    cache.create(header, rest)
+    cache.write(header.first, rest)
 
 
 class Simulation(Protocol):
@@ -88,13 +96,14 @@ def compute(
     """Compute the frames after `start` into the caches of all bodies, the state into the first; how many these are."""
     settings, solver = simulation.settings, simulation.solver
     done, kept, kept_at = 0, start, time.monotonic()
+    cracks = [cracks_until(cache, start) if start < settings.last else None for cache, _ in bodies]
     try:
         for frame in range(start + 1, settings.last + 1):
             report = None if progress is None else (lambda part, f=frame: progress(f, part))
             solver.advance(1 / settings.fps, simulation.pin_targets(frame - settings.first), cancelled, report)
-            for cache, job in bodies:
+            for (cache, job), known in zip(bodies, cracks, strict=True):
                 _check_owner(cache, job)
-                cache.write(frame, job.now())
+                cache.write(frame, job.now() if known is None else known.add(job.now()))
             done += 1
             if time.monotonic() - kept_at > _SAVE_EVERY:
                 bodies[0][0].write_state(frame, solver.arrays())
@@ -142,6 +151,10 @@ def _resume(job: Job, cache: ParticleCache, header: Header, overwrite: bool) -> 
                 str(cache.folder), "holds another simulation", "Choose another folder, or overwrite it (--overwrite)"
             )
         return None
+    found = renewed(cache, found, header)
+    if found is None:
+        log.warning("%s: one of its frames is damaged; begins again", cache.folder)
+        return None
     if state is None:
         last = job.settings.last
         if found.moves == job.moves and cache.lacking(first, last) is None:
@@ -163,5 +176,3 @@ def go_on(cache: ParticleCache, found: Header, header: Header, frame: int, last:
     """Bring the header of a cache, `found`, up to date with what is to go on after `frame`."""
     if frame < last and found.moves != header.moves:
         cache.extend(header, frame)
-    elif found.cells != header.cells:  # of an earlier version, which did not know them
-        cache.describe(replace(found, cells=header.cells))

@@ -10,8 +10,9 @@ from collections.abc import Callable, Sequence
 
 from ..core.errors import UsageError
 from ..core.particle_cache import Header, ParticleCache
-from .bake import compute, go_on, header_of
+from .bake import begin, compute, go_on, header_of
 from .coupled_job import CoupledJob, about_others
+from .cracks import renewed
 from .input_digest import same_until
 
 log = logging.getLogger(__name__)
@@ -63,8 +64,7 @@ def bake_coupled(
         for cache in caches:
             cache.clear()  # all before any: none of them is left with frames of before
         for cache, header, rest in zip(caches, headers, rests, strict=True):
-            cache.create(header, rest)
-            cache.write(settings.first, rest)
+            begin(cache, header, rest)
         start = settings.first
     return compute(job, list(zip(caches, jobs, strict=True)), start, cancelled, progress)
 
@@ -92,6 +92,10 @@ def _resume(job: CoupledJob, caches: Sequence[ParticleCache], headers: Sequence[
             "Put the folder back, or bake all again (--overwrite)",
         )
     if missing:
+        return None
+    found = [a and renewed(cache, a, b) for cache, a, b in zip(caches, found, headers, strict=True)]
+    if None in found:
+        log.warning("%s: one of its frames is damaged; all bodies begin again", caches[found.index(None)].folder)
         return None
     if state is None:
         moves = all(a is not None and a.moves == b.moves for a, b in zip(found, headers, strict=True))
