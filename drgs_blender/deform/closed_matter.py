@@ -5,7 +5,8 @@ triangles across it are cut along it, and what of it lies inside of the mesh bec
 at a corner and is still joined there shares it (as the virtual nodes of Molino et al. 2004), so that walls and cut
 surface close each piece, and a crack ends where matter holds. Each corner is carried by the particles of its own side
 alone. Before anything is cut, corners of open faces move towards their neighbours' (surface nets, Gibson 1998), so that
-cracks are smooth instead of stairs; both sides of a crack still fit.
+cracks are smooth instead of stairs; both sides of a crack still fit. Sides that are pressed together again have their
+walls in one place, and no line between them.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 
 from ..geometry.normals import VertexNormals
 from .bonds import Bonds, Cells
-from .crack_nodes import cells_of, joined_at, node_keys, node_places, rows_of, smoothed_nodes, warp
+from .crack_nodes import cells_of, joined_at, node_keys, node_places, press_together, rows_of, smoothed_nodes, warp
 from .cut_faces import EDGE, FACE, VERTEX, Pieces, cut, near_open, open_faces
 from .gmls import carry
 from .wall_faces import walls
@@ -71,7 +72,9 @@ class ClosedMatter:
     near : (m,) bool array
         These, and faces with vertices that their own side carries.
     crack : (k, 3) float32 array
-        Places at rest along which the mesh is cut, and corners of walls, object space.
+        Places at rest along which the mesh is cut, and corners of walls, object space; not those that are together.
+    opening : (k,) float32 array
+        How far each is open, up to 1.
     sides : Sides
         Carries other points.
     points : (c, 3) float32 array
@@ -92,6 +95,7 @@ class ClosedMatter:
     cut: Array
     near: Array
     crack: Array
+    opening: Array
     sides: Sides
     points: Array
     rim: Array
@@ -200,9 +204,8 @@ class Breakable:
         shown = np.array(vertices, np.float32)
         shown[aside] = bonds.returned(moved[aside])
         near = replaced | aside[self.faces].any(axis=1)
-        inner, *made = self._assembled(pieces, (row, axis), places, moved, sides)
-        crack = bonds.returned(np.concatenate([crack, inner]))
-        return ClosedMatter(shown, replaced, near, crack, sides, *made)
+        open_at, opening, *made = self._assembled(pieces, (row, axis), places, moved, sides)
+        return ClosedMatter(shown, replaced, near, bonds.returned(open_at), opening, sides, *made)
 
     def _beside(self, crack: Array, band: float) -> Array:
         """(m,) bool: faces with a vertex that is less than `band` cells from a crack."""
@@ -232,7 +235,7 @@ class Breakable:
     def _assembled(
         self, pieces: Pieces, on_open: tuple[Array, Array], places: Array, moved: Array, sides: Sides
     ) -> tuple[Array, ...]:
-        """Corners of walls at rest, in cells, and of `ClosedMatter` all from `points` to `walls`."""
+        """Corners at rest that are open, in cells, how far, and of `ClosedMatter` all from `points` to `walls`."""
         zone, nodes = sides.zone, sides.nodes
         corner = pieces.corner_ids()
         first = np.unique(corner, return_index=True)[1]
@@ -261,13 +264,18 @@ class Breakable:
         rows, index = np.unique(np.stack([pair_corner, group], axis=1), axis=0, return_inverse=True)
         index = index.reshape(-1)
         at, turn = self._placed_corners(rows, corners, sides, moved, where, share)
+        opening = np.empty(len(rows))
+        press_together(rows[:, 0], at, turn, opening)
+        parted = np.flatnonzero(opening > 0)
+        parted = parted[np.unique(rows[parted, 0], return_index=True)[1]]
         split = np.cumsum([3 * len(triangles), 3 * len(wall)])
         rim, low, high = (i.reshape(-1, 3).astype(np.int32) for i in np.split(index, split))
         rim_face = pieces.face[of]
         rim_share = pieces.share[triangles]
         normals = self._rim_normals(rim, rim_face, rim_share, turn)
         made = self.bonds.returned(at), rim, rim_face.astype(np.int32), rim_share.astype(np.float32)
-        return rest[node_key >= 0], *made, normals, np.concatenate([low, high])
+        open_at = corners.rest[rows[parted, 0]], opening[parted].astype(np.float32)
+        return *open_at, *made, normals, np.concatenate([low, high])
 
     def _walls(
         self, pieces: Pieces, on_open: tuple[Array, Array], corner: Array, cut_at: Array, nodes: tuple[Array, Array],

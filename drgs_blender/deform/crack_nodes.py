@@ -1,4 +1,4 @@
-"""The corners of a lattice's cells where cracks run: how they move to smooth these, and what is joined around them."""
+"""Corners where cracks run: how they move to smooth these, what is joined around them, and what is pressed together."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ Array = np.ndarray
 _ROUNDS, _SHARE, _FARTHEST = 8, 0.6, 0.45
 #: Steps by which it is found where in the lattice a place then is.
 _INVERTED = 5
+#: Cells between both sides of a crack up to which it is shut, and from which it is open.
+_SHUT, _OPEN = 0.5, 1.0
 
 
 def cells_of(keys: Array, size: Array) -> Array:
@@ -166,3 +168,47 @@ def joined_at(planes, cell, zone, out):  # type: ignore[no-untyped-def]
                     if root[o] == b:
                         root[o] = a
         out[i] = key[root[own]]
+
+
+@njit
+def press_together(corner, at, turn, opening):  # type: ignore[no-untyped-def]
+    """Bring sides of a crack that are pressed together to one place, so that no line between them is seen.
+
+    Parameters
+    ----------
+    corner : (r,) int64 array
+        Ascending; rows of one corner are its sides.
+    at : (r, 3) float64 array
+        In cells; changed.
+    turn : (r, 3, 3) float64 array
+        Deformation gradients; changed.
+    opening : (r,) float64 array
+        From 0, where all sides of the corner are together, to 1; written.
+    """
+    place, gradient, weight = np.empty((8, 3)), np.empty((8, 3, 3)), np.empty((8, 8))
+    first = 0
+    while first < len(corner):
+        count = 1
+        while first + count < len(corner) and count < 8 and corner[first + count] == corner[first]:
+            count += 1
+        least = 1.0
+        for a in range(count):
+            place[a], gradient[a] = at[first + a], turn[first + a]
+            for b in range(count):
+                d = 0.0
+                for c in range(3):
+                    d += (at[first + a, c] - at[first + b, c]) ** 2
+                t = min(max((np.sqrt(d) - _SHUT) / (_OPEN - _SHUT), 0.0), 1.0)
+                weight[a, b] = 1.0 - t * t * (3.0 - 2.0 * t)
+                least = min(least, weight[a, b])
+        for a in range(count):
+            opening[first + a] = 1.0 - least
+            total = 0.0
+            at[first + a], turn[first + a] = 0.0, 0.0
+            for b in range(count):
+                total += weight[a, b]
+                at[first + a] += weight[a, b] * place[b]
+                turn[first + a] += weight[a, b] * gradient[b]
+            at[first + a] /= total
+            turn[first + a] /= total
+        first += count

@@ -93,7 +93,7 @@ class BrokenMatter:
     ) -> None:
         """Put surfels of faces that are cut, or near, where the matter on their own side takes them."""
         whole, near = self._at_rest(loaded, state, driven), closed.near[driven.binding.face]
-        keep = _shrunk(whole.centre, driven.surfels.scale, closed.crack)
+        keep = _shrunk(whole.centre, driven.surfels.scale, closed.crack, closed.opening)
         rows = np.flatnonzero(near | (keep < 1))
         if not len(rows):
             return
@@ -138,13 +138,16 @@ def _extent(loaded: LoadedAsset) -> float:
     return _ENDS * float(np.percentile(scale.max(axis=1), _MOST)) if len(scale) else 0.0
 
 
-def _shrunk(centre: Array, scale: Array, crack: Array) -> Array:
-    """(n,) float32 factors by which surfels, given at rest, end at a crack instead of hanging over it."""
+def _shrunk(centre: Array, scale: Array, crack: Array, opening: Array) -> Array:
+    """(n,) float32 factors by which surfels, given at rest, end at a crack that is open instead of hanging over it."""
     from scipy.spatial import cKDTree  # an engine starts without
 
+    if not len(crack):
+        return np.ones(len(centre), np.float32)
     reach = _ENDS * scale.max(axis=1)
-    distance = cKDTree(crack).query(centre, distance_upper_bound=float(reach.max()))[0]
-    return np.minimum(distance / np.maximum(reach, 1e-30), 1.0).astype(np.float32)
+    distance, nearest = cKDTree(crack).query(centre, distance_upper_bound=float(reach.max()))
+    over = 1.0 - np.minimum(distance / np.maximum(reach, 1e-30), 1.0)
+    return (1.0 - np.append(opening, 0.0)[nearest] * over).astype(np.float32)
 
 
 def check_particles(state: ObjectState) -> None:
