@@ -46,11 +46,11 @@ def particles_of(
         Told why particles that were asked for, or are there, carry nothing.
     """
     physics, modifier = obj.drgs.physics, cache_playback.modifier_of(obj)
-    wanted, closes = physics.driven_by, physics.tear and physics.inside != "open"
+    wanted, closes, hollow = physics.driven_by, physics.tear, physics.inside == "open"
     if (wanted == "surface" and not closes and physics.surface == "mesh") or modifier is None or not len(vertices):
         return None
     follow = "splats follow the mesh" if wanted != "surface" else "what it tears apart is hollow"
-    if closes and wanted != "surface":
+    if closes and not hollow and wanted != "surface":
         follow += ", and what is torn is hollow"
     ends = "Driven By: Surface and Inside: Hollow say so"
     if not (modifier.show_render if depsgraph.mode == "RENDER" else modifier.show_viewport):
@@ -74,7 +74,8 @@ def particles_of(
                 warn(f'"{obj.name}": its material flows, so no particle knows how it deforms; splats follow the mesh')
             return None
         if closes and header.cells is None:
-            warn(f'"{obj.name}": was baked before pieces were closed, so what is torn is hollow. Bake again')
+            if not hollow:
+                warn(f'"{obj.name}": was baked before pieces were closed, so what is torn is hollow. Bake again')
             if wanted == "surface":
                 return None
         played = cache_playback.Played(path, header)
@@ -99,6 +100,8 @@ def particles_of(
     if posed and (not closes or began.shape != vertices.shape):
         return None
     moved = _moved(particles, _affine(shown, vertices))
+    if moved is None and hollow and wanted == "surface" and not skin:
+        return None  # as it was asked for
     if moved is None:
         warn(
             f'"{obj.name}": its mesh is not as the simulation has it in this frame (modifiers after '

@@ -322,8 +322,8 @@ def _poses(args: argparse.Namespace) -> tuple[Sequence[tuple[int, Callable[[], _
             raise UsageError(f"--cache {args.cache}", problem, "Bake again")
         logger.warning("%s %s: the mesh is shown, stretched. Bake again", args.cache, problem)
         skin = False
-    closes = header.keeps_shape and args.inside is not None and not skin
-    if closes and header.cells is None:
+    closes = header.keeps_shape and header.tear > 0 and not skin
+    if closes and args.inside is not None and header.cells is None:
         logger.warning("%s was baked before pieces were closed: what is torn is hollow. Bake again", args.cache)
     if driven == "surface" and not skin and (not closes or header.cells is None):
         give = [(frame, partial(_by_mesh, partial(_vertices, cache, frame))) for frame in frames]

@@ -19,44 +19,15 @@ import numpy as np
 from ..geometry.normals import VertexNormals
 from .bonds import Bonds, Cells
 from .crack_nodes import cells_of, joined_at, node_keys, node_places, press_together, rows_of, smoothed_nodes, warp
+from .crack_sides import BESIDE, Sides, believable, within
 from .cut_faces import EDGE, FACE, VERTEX, Pieces, cut, near_open, open_faces
 from .gmls import carry
 from .wall_faces import walls
 
 Array = np.ndarray
 
-#: The lattice is put beside the vertices by this part of a cell, so that none lies on a plane of it.
-_BESIDE = np.array([1.2247449e-5, 1.4142135e-5, 1.7320508e-5])
 #: Cells below the surface that corners of cells stay near a crack.
 _BELOW = 0.05
-
-
-@dataclass(slots=True)
-class Sides:
-    """Carries points that are near a crack by the matter on their own side."""
-
-    bonds: Bonds
-    zone: Cells
-    nodes: tuple[Array, Array]
-    broken: Array
-    now: Array
-    gradients: Array
-
-    def carried(self, points: Array) -> tuple[Array, Array, Array]:
-        """Of (n, 3) points at rest: which have matter near, and of these places now and deformation gradients.
-
-        All object space.
-        """
-        bonds = self.bonds
-        rest = bonds.placed(points)
-        places = rest + _BESIDE
-        warp(places, self.zone.size + 1, *self.nodes)
-        cell = np.floor(places).astype(np.int64).clip(0, bonds.size - 1)
-        owner = bonds.owners((cell[:, 0] * bonds.size[1] + cell[:, 1]) * bonds.size[2] + cell[:, 2])
-        known = owner >= 0
-        weights, _ = bonds.carriers(rest[known], owner[known], self.broken)
-        at, turn, _ = carry(weights, self.now, self.gradients)
-        return known, bonds.returned(at), bonds.returned_gradients(turn)
 
 
 @dataclass(slots=True)
@@ -89,6 +60,8 @@ class ClosedMatter:
         Of its corners, unit, the same space.
     walls : (w, 3) int32 array
         Faces inside, among `points`, counter-clockwise seen from outside of the matter.
+    shut : (r + w,) bool array
+        Which of `rim`, then of `walls`, are at cracks that are pressed together, and not near others.
     """
 
     vertices: Array
@@ -103,6 +76,7 @@ class ClosedMatter:
     rim_share: Array
     rim_normals: Array
     walls: Array
+    shut: Array
 
 
 class _Corners(NamedTuple):
@@ -180,7 +154,7 @@ class Breakable:
             return None
         zone = bonds.zone(broken)
         nodes = smoothed_nodes(zone)
-        places = self.places + _BESIDE
+        places = self.places + BESIDE
         warp(places, zone.size + 1, *nodes)
         pieces = cut(places, self.faces, near_open(places, self.faces, zone))
         row, axis = open_faces(pieces, zone)
@@ -198,25 +172,18 @@ class Breakable:
         row, axis = open_faces(pieces, zone)
         own_f = self._linear @ np.asarray(gradients, np.float64) @ np.linalg.inv(self._linear)
         some = np.unique(zone.owner[zone.owner >= 0])
-        own_f[some] = _believable(own_f[some], bonds.stretch(now, broken.up, some))
+        own_f[some] = believable(own_f[some], bonds.stretch(now, broken.up, some))
         sides = Sides(bonds, zone, nodes, broken.up, now, own_f)
         moved, aside = self._parted_vertices(places, bonds.placed(vertices), sides)
         shown = np.array(vertices, np.float32)
         shown[aside] = bonds.returned(moved[aside])
         near = replaced | aside[self.faces].any(axis=1)
-        open_at, opening, *made = self._assembled(pieces, (row, axis), places, moved, sides)
+        open_at, opening, *made = self._assembled(pieces, (row, axis), places, moved, sides, band * size)
         return ClosedMatter(shown, replaced, near, bonds.returned(open_at), opening, sides, *made)
 
     def _beside(self, crack: Array, band: float) -> Array:
         """(m,) bool: faces with a vertex that is less than `band` cells from a crack."""
-        from scipy.spatial import cKDTree  # an engine starts without
-
-        low, high = crack.min(axis=0) - band, crack.max(axis=0) + band
-        some = np.flatnonzero(((self.places > low) & (self.places < high)).all(axis=1))
-        close = np.zeros(len(self.places), bool)
-        distance = cKDTree(crack).query(self.places[some], distance_upper_bound=band)[0]
-        close[some[distance < np.inf]] = True
-        return np.asarray(close[self.faces].any(axis=1))
+        return np.asarray(within(self.places, crack, band)[self.faces].any(axis=1))
 
     def _parted_vertices(self, places: Array, given: Array, sides: Sides) -> tuple[Array, Array]:
         """(n, 3) vertices now, and (n,) bool which of them are near a crack and are carried by their own side."""
@@ -233,9 +200,9 @@ class Breakable:
         return moved, aside
 
     def _assembled(
-        self, pieces: Pieces, on_open: tuple[Array, Array], places: Array, moved: Array, sides: Sides
+        self, pieces: Pieces, on_open: tuple[Array, Array], places: Array, moved: Array, sides: Sides, band: float
     ) -> tuple[Array, ...]:
-        """Corners at rest that are open, in cells, how far, and of `ClosedMatter` all from `points` to `walls`."""
+        """Corners at rest that are open, in cells, how far, and of `ClosedMatter` all from `points` on."""
         zone, nodes = sides.zone, sides.nodes
         corner = pieces.corner_ids()
         first = np.unique(corner, return_index=True)[1]
@@ -274,8 +241,12 @@ class Breakable:
         rim_share = pieces.share[triangles]
         normals = self._rim_normals(rim, rim_face, rim_share, turn)
         made = self.bonds.returned(at), rim, rim_face.astype(np.int32), rim_share.astype(np.float32)
-        open_at = corners.rest[rows[parted, 0]], opening[parted].astype(np.float32)
-        return *open_at, *made, normals, np.concatenate([low, high])
+        open_at, inner = corners.rest[rows[parted, 0]], np.concatenate([low, high])
+        near = opening > 0
+        if band > 0 and len(parted):
+            near |= within(corners.rest[rows[:, 0]], open_at, band)
+        shut = ~near[np.concatenate([rim, inner])].any(axis=1)
+        return open_at, opening[parted].astype(np.float32), *made, normals, inner, shut
 
     def _walls(
         self, pieces: Pieces, on_open: tuple[Array, Array], corner: Array, cut_at: Array, nodes: tuple[Array, Array],
@@ -318,7 +289,7 @@ class Breakable:
 
             given = cell[rest], axis[rest]
             corners = np.stack([node_keys(*given, np.full(len(rest), c), size) for c in range(4)])
-            middle = node_places(corners.reshape(-1), nodes, size + 1).reshape(4, -1, 3).mean(axis=0) - _BESIDE
+            middle = node_places(corners.reshape(-1), nodes, size + 1).reshape(4, -1, 3).mean(axis=0) - BESIDE
             number = igl.fast_winding_number(self.places, self.faces.astype(np.int64), middle)
             found[rest] = np.abs(number) >= 0.5
         return found
@@ -386,13 +357,3 @@ class Breakable:
         found = np.einsum("rcij,rcj->rci", cofactors, rest) @ self._linear
         length = np.linalg.norm(found, axis=-1, keepdims=True)
         return np.where(length > 1e-20, found / np.maximum(length, 1e-20), rest).astype(np.float32)
-
-
-def _believable(gradients: Array, most: Array) -> Array:
-    """(n, 3, 3) deformation gradients that stretch no more than the bonds that are left say.
-
-    Particles that have come apart keep counting what pulled them apart as stretch.
-    """
-    u, s, vt = np.linalg.svd(np.nan_to_num(gradients, posinf=0.0, neginf=0.0))
-    found: Array = (u * np.minimum(s, most[:, None])[:, None, :]) @ vt
-    return found

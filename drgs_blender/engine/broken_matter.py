@@ -48,7 +48,7 @@ class BrokenMatter:
 
     def begin(self, states: Iterable[ObjectState]) -> None:
         """A frame begins: what none of its objects has is forgotten."""
-        rests = [state.particles.rest for state in states if state.particles is not None and state.inside is not None]
+        rests = [state.particles.rest for state in states if state.particles is not None and state.tear > 0]
         self._known = still_used(self._known, rests)
         begun = [known.began for known in self._known]
         self._frames = [
@@ -56,7 +56,7 @@ class BrokenMatter:
         ]
 
     def closed(self, loaded: LoadedAsset, state: ObjectState) -> ClosedMatter | None:
-        """The object's mesh with closed pieces; None where it shows nothing that has broken, or is not to be closed.
+        """The object's mesh with closed pieces; None where it shows nothing that has broken.
 
         Raises
         ------
@@ -64,7 +64,7 @@ class BrokenMatter:
             Particles, or the lattice that they fill, are not what they must be; names the object.
         """
         particles, mesh = state.particles, loaded.asset.mesh
-        if particles is None or particles.cells is None or state.inside is None or state.tear <= 0:
+        if particles is None or particles.cells is None or state.tear <= 0:
             return None
         if particles.skin or not len(mesh.faces):
             return None
@@ -164,8 +164,10 @@ def check_particles(state: ObjectState) -> None:
         raise AssetError(f"object {state.name}", "the lattice of its particles is not finite", "Bake it again")
 
 
-def inside_mesh(state: ObjectState, traced: TraceObject, closed: ClosedMatter, owner: int) -> ObjectMesh:
-    """What replaces faces that are cut: what is left of them, in the object's materials, and the faces inside.
+def crack_meshes(state: ObjectState, traced: TraceObject, closed: ClosedMatter, owner: int) -> list[ObjectMesh]:
+    """What replaces faces that are cut: what is left of them, in the object's materials, and the faces inside, if any.
+
+    Where cracks are open the camera sees it between surfels; where they are shut surfels hide it, as all of the mesh.
 
     Parameters
     ----------
@@ -176,32 +178,40 @@ def inside_mesh(state: ObjectState, traced: TraceObject, closed: ClosedMatter, o
     owner : int
         Index of the object.
     """
-    walls = np.ascontiguousarray(closed.walls, np.int32)
+    count = len(closed.walls) if state.inside is not None else 0
+    walls = np.ascontiguousarray(closed.walls[:count], np.int32)
     faces = np.concatenate([closed.rim, walls])
     smooth = np.zeros(closed.points.shape, np.float32)
     VertexNormals(walls, len(closed.points)).into(closed.points, walls, smooth)
     normals = np.concatenate([closed.rim_normals, smooth[walls]])
     a, b, c = closed.points[faces].transpose(1, 0, 2)
     there: Array = np.asarray(np.cross(b - a, c - a).any(axis=1))
+    shut = closed.shut[: len(faces)]
     index = np.repeat(np.array([1, 0], np.int32), [len(closed.rim), len(walls)])
     values = np.concatenate([traced.albedo, traced.roughness[:, None], traced.metallic[:, None]], axis=1)
     corners = np.einsum("rck,rkd->rcd", closed.rim_share, values[traced_corners(state, traced)[closed.rim_face]])
     corners = np.concatenate([corners, np.zeros((len(walls), 3, 5))])
-    return ObjectMesh(
-        name=state.name,
-        vertices=closed.points,
-        faces=faces[there],
-        matrices=np.asarray(state.matrix_world, np.float64)[None],
-        pass_indices=np.array([state.pass_index], np.int32),
-        corner_normals=normals[there],
-        material_index=index[there],
-        materials=[_inside(state, traced), of_layers(state, LAYERED)],
-        layers=material_layers(corners, there),
-        visibility=state.visibility,
-        light_group=state.light_group,
-        owner=owner,
-        beside=True,
-    )
+    materials = [_inside(state, traced), of_layers(state, LAYERED)]
+    return [
+        ObjectMesh(
+            name=state.name,
+            vertices=closed.points,
+            faces=faces[which],
+            matrices=np.asarray(state.matrix_world, np.float64)[None],
+            pass_indices=np.array([state.pass_index], np.int32),
+            corner_normals=normals[which],
+            material_index=index[which],
+            materials=materials,
+            layers=material_layers(corners, which),
+            visibility=state.visibility,
+            light_group=state.light_group,
+            owner=owner,
+            seen_only=hidden and traced.seen_only,
+            beside=not hidden,
+        )
+        for hidden, which in ((False, there & ~shut), (True, there & shut))
+        if which.any()
+    ]
 
 
 def traced_corners(state: ObjectState, traced: TraceObject) -> Array:

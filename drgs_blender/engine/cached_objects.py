@@ -16,7 +16,7 @@ from ..deform.closed_matter import ClosedMatter
 from ..render.scene.ray_masks import CAMERA, group_mask
 from ..render.scene.trace_scene import ObjectMesh, TraceObject
 from ..render.surfels.captured import CapturedObject
-from .broken_matter import inside_mesh
+from .broken_matter import crack_meshes
 from .captured_objects import glowing_mesh
 from .loaded_assets import LoadedAsset
 from .object_meshes import channels_of, object_mesh, stub
@@ -33,7 +33,7 @@ class CachedObject:
     its own, or with `channels` that rays meet, has a `mesh` with `images` and the optional channels `shown`; `met` is
     what stands for the object in the scene. Of a thin one light meets `sheet`. Its surfels may have `emission` (n, 3).
     Of the surfels, `lost` are left out as the particles that carry them are not finite.
-    Where its matter has broken, `inside` are the faces made there, and `closed` says what else is different.
+    Where its matter has broken, `cracks` are the faces made there, and `closed` says what else is different.
     Where its particles have a `skin`, that is its `mesh`.
     It has `levels` of fewer surfels by their number; of these each has the `detail` by which they grow.
     """
@@ -53,7 +53,7 @@ class CachedObject:
     mesh: ObjectMesh | None = None
     images: list[Image] = field(default_factory=list)
     closed: ClosedMatter | None = None
-    inside: ObjectMesh | None = None
+    cracks: list[ObjectMesh] = field(default_factory=list)
     skin: Skin | None = None
     emission: Array | None = None
     channels: dict[str, Array] = field(default_factory=dict)
@@ -64,7 +64,7 @@ class CachedObject:
     @property
     def meshes(self) -> tuple[MeshState | None, ...]:
         """What is laid out as a mesh of it."""
-        return self.glowing, self.sheet, self.mesh, self.inside
+        return self.glowing, self.sheet, self.mesh, *self.cracks
 
     @property
     def sheeted(self) -> bool:
@@ -122,7 +122,7 @@ def begun(
     traced = traced_object(shape, asset, met or shown, sheeted and not channels, cut)
     item = CachedObject(state, loaded, traced, traced, mode=mode, closed=closed)
     if closed is not None:
-        item.inside = inside_mesh(state, traced, closed, index)
+        item.cracks = crack_meshes(state, traced, closed, index)
     item.faults = [*(f"{state.name}: {fault}" for fault in loaded.faults), *material_faults(state)]
     if shown:
         if len(asset.mesh.faces):

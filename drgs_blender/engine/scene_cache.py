@@ -231,7 +231,7 @@ class SceneCache:
             others = [*meshes, *(item.glowing for item in glowing if item.glowing is not None)]
             others += [item.sheet for item in objects if item.sheet is not None]
             others += [item.mesh for item in objects if item.mesh is not None]
-            others += [item.inside for item in objects if item.inside is not None]
+            others += [part for item in objects for part in item.cracks]
             textures = {image.name: image for item in objects for image in item.images}
             layout = self.scene.layout
             self.scene.update([item.met for item in objects], others, [*images, *glows.values(), *textures.values()])

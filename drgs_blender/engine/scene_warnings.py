@@ -39,8 +39,8 @@ def scene_warnings(cache: SceneCache, passes: Collection[str] = ()) -> list[str]
     for item in cache.objects:
         found += item.faults
         moving = [name for name in ("Vector", "Previous Position") if name in passes]
-        if (item.inside is not None or item.skin is not None) and moving:
-            what = "the faces inside of its pieces" if item.skin is None else "the surface of its particles"
+        if (item.cracks or item.skin is not None) and moving:
+            what = "the faces at its cracks" if item.skin is None else "the surface of its particles"
             found.append(f"{item.state.name}: {what} count as still in {' and '.join(moving)}")
         if item.lost:
             found.append(

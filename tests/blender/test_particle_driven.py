@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import bpy
 import numpy as np
 import pytest
-from physics_scenes import FRAMES, cache_of, vertices
+from physics_scenes import FRAMES, cache_of, particle_cache, vertices
 from scenes import part
 
 playback, core_frame = part("addon.cache_playback"), part("drgs_blender.core.frame")
@@ -42,6 +44,9 @@ def test_driven_by_chooses(baked, export):
     physics.driven_by = "surface"
     assert not state_at(baked, 3, export=export)[0].particles.surfels, "they say only what has broken"
     physics.inside = "open"
+    hollow = state_at(baked, 3, export=export)[0]
+    assert not hollow.particles.surfels and hollow.inside is None, "hollow pieces break as closed ones do"
+    physics.tear = False
     assert state_at(baked, 3, export=export)[0].particles is None
     physics.driven_by = "automatic"
     assert state_at(baked, 3, export=export)[0].particles is not None
@@ -58,14 +63,43 @@ def test_the_inside_reaches_the_engine(baked, export):
     assert state_at(baked, 3, export=export)[0].inside == core_frame.Inside((0.5, 0.25, 0.125), 0.25, 1.0)
     physics.inside = "open"
     state = state_at(baked, 3, export=export)[0]
-    assert state.inside is None and state.particles.cells is None
+    assert state.inside is None and np.array_equal(state.particles.cells, lattice)
     physics.inside, physics.tear = "own", False
-    assert state_at(baked, 3, export=export)[0].inside is None
+    state = state_at(baked, 3, export=export)[0]
+    assert state.inside is None and state.particles.cells is None
+
+
+def test_what_has_broken_reaches_the_engine_frame_by_frame(baked, export):
+    """In any order, between two as in the later one; of an earlier cache it is told that cracks may close."""
+    cache, physics = cache_of(baked), baked.drgs.physics
+    kept = {}
+    for frame in cache.frames():
+        read = cache.read(frame)
+        arrays = [np.array(a) for a in (read.points, read.gradients, read.vertices, read.broken)]
+        assert not arrays[3].any()
+        arrays[3][:frame] = 255
+        cache.write(frame, particle_cache.ParticleFrame(*arrays))
+        kept[frame] = arrays[3]
+    physics.driven_by = "surface"
+    for inside in ("automatic", "open"):
+        physics.inside = inside
+        for frame, between, shown in ((4, 0.0, 4), (2, 0.25, 3), (3, 0.0, 3), (1, 0.0, 1), (99, 0.0, FRAMES)):
+            state, told = state_at(baked, frame, between, export=export)
+            np.testing.assert_array_equal(state.particles.broken, kept[shown])
+            assert not [text for text in told if "may close again" in text]
+    for frame in (None, *cache.frames()):
+        read = cache.rest() if frame is None else cache.read(frame)
+        old = particle_cache.ParticleFrame(*(np.array(a) for a in (read.points, read.gradients, read.vertices)))
+        cache.write_rest(old) if frame is None else cache.write(frame, old)
+    cache.describe(replace(cache.header(), version=2))
+    state, told = state_at(baked, 3, export=export)
+    assert state.particles.broken is None
+    assert [text for text in told if baked.name in text and "cracks may close again. Bake again" in text]
 
 
 def test_the_surface_of_particles_reaches_the_engine(baked, export):
     physics = baked.drgs.physics
-    physics.inside, physics.driven_by = "open", "surface"
+    physics.tear, physics.driven_by = False, "surface"
     assert state_at(baked, 3, export=export)[0].particles is None, "of matter that keeps its shape the mesh is shown"
     physics.surface = "particles"
     particles = state_at(baked, 3, export=export)[0].particles

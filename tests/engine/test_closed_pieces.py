@@ -10,6 +10,7 @@ from pictures import assert_same_bits, fresh
 
 from drgs_blender.core.errors import AssetError
 from drgs_blender.core.frame import Inside, MotionStep, Particles, Pose
+from drgs_blender.deform.bonds import Bonds
 from drgs_blender.simulation.fill import fill
 
 GREEN = Inside((0.0, 1.0, 0.0), 1.0, 0.0)
@@ -37,6 +38,16 @@ def torn_frame(make_frame, filling, lifted, inside, **settings):
     state.vertices, state.tear, state.inside = moved(state.vertices), 2 * spacing, inside
     c, s = np.cos(0.7), np.sin(0.7)
     state.matrix_world = np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1.0]])
+    return frame
+
+
+def pushed_frame(make_frame, filling, lifted, inside=GREEN, **settings):
+    """The ball of `torn_frame` after it has been torn, wherever its upper part is now."""
+    frame = torn_frame(make_frame, filling, lifted, inside, **settings)
+    apart = torn_frame(make_frame, filling, 1.2, inside).objects[0].particles
+    bonds = Bonds(apart.rest, apart.cells)
+    state = frame.objects[0]
+    state.particles = replace(state.particles, broken=bonds.packed(bonds.broken(bonds.placed(apart.points), 2.0)))
     return frame
 
 
@@ -211,3 +222,40 @@ def test_matter_that_was_posed_before_it_broke_is_closed(session, make_frame, fi
     state.particles = replace(state.particles, began=began[1:])
     with pytest.raises(AssetError, match="began"):
         session.render(posed)
+
+
+@pytest.mark.parametrize("inside", [GREEN, None])
+@pytest.mark.parametrize("surface", ["mesh", "surfels"])
+def test_what_is_pushed_together_stays_broken_and_shows_no_seam(session, make_frame, filling, surface, inside):
+    """Also where a small gap is left: the picture is that of a body that has never broken."""
+    session.render(torn_frame(make_frame, filling, 1.2, inside))
+    apart = session._scene_cache.objects[0].closed
+    for lifted in (0.0, 0.04):  # of cells with sides of 0.1
+        options = {"camera_sees": surface, "rays_see": surface, "samples": 256}
+        whole = session.render(torn_frame(make_frame, filling, lifted, inside, **options))["Combined"]
+        assert session._scene_cache.objects[0].closed is None
+        seen = session.render(pushed_frame(make_frame, filling, lifted, inside, **options))["Combined"]
+        closed = session._scene_cache.objects[0].closed
+        assert len(closed.walls) == len(apart.walls) and not len(closed.crack)
+        seen, whole = (picture[..., :3].mean(axis=-1)[whole[..., 3] > 0.99] for picture in (seen, whole))
+        assert (seen / whole).min() > 0.8 and np.abs(seen / whole - 1).mean() < 0.01
+
+
+def test_what_had_broken_does_not_depend_on_frames_before(session, make_frame, filling, asset_path):
+    """Forwards, backwards and with leaps: each picture is that of a session that knows nothing of the others."""
+    for lifted, inside in ((1.2, GREEN), (0.0, GREEN), (0.3, GREEN), (0.0, None), (1.2, None), (0.0, GREEN)):
+        frame = pushed_frame(make_frame, filling, lifted, inside)
+        assert_same_bits(session.render(frame), fresh(asset_path, frame))
+    frame.objects[0].particles = replace(frame.objects[0].particles, broken=None)
+    session.render(frame)
+    assert session._scene_cache.objects[0].closed is None, "by where particles are nothing has broken"
+
+
+def test_bits_of_other_bonds_are_refused_by_name(session, make_frame, filling):
+    frame = pushed_frame(make_frame, filling, 1.2)
+    state = frame.objects[0]
+    bits = state.particles.broken
+    for wrong in (bits[:-1], bits[:0], np.append(bits, bits[:1]), bits.astype(np.float32), bits[None]):
+        state.particles = replace(state.particles, broken=wrong)
+        with pytest.raises(AssetError, match=rf"{state.name}: what has broken of it.*Bake it again"):
+            session.render(frame)
