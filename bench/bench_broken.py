@@ -2,7 +2,8 @@
 
 python bench/bench_broken.py --asset out/bench/assets/spot.drgs [--size 300]
 
-The capture is torn in two by its ends as jelly and as snow, and falls into a box as water.
+The capture is torn in two by its ends as jelly and as snow, of which one is pushed together again, and falls into a box
+as water.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 import trimesh
 from bench_matter_pictures import picture
 from bench_thin import save
+from crack_healing import and_back, cost, healed
 from judge import frame_camera
 from ours import SESSION
 from report import OUT, ROOT, table, write_section
@@ -27,16 +29,19 @@ from drgs_blender.core.particle_cache import ParticleCache
 from drgs_blender.deform.closed_matter import Breakable, ClosedMatter
 from drgs_blender.geometry.particle_surface import particle_surface
 from drgs_blender.simulation.bake import bake
-from drgs_blender.simulation.job import prepare
+from drgs_blender.simulation.job import Job, prepare
 from drgs_blender.simulation.settings import parse_settings
 
 Array = np.ndarray
 
 FIGURE = ROOT / "docs" / "images" / "broken.png"
+HEALING = FIGURE.with_name("cracks.png")
 FOLDER = OUT / "broken"
 LAST, AZIMUTH = 24, -40
 #: Views from which rays are cast, and rays of each along a side of the picture.
 VIEWS, RAYS = 12, 96
+#: Frames that are shown around that in which most heals, and how much around that, in parts of the object's size.
+BEFORE, AFTER, AROUND = 2, 4, 0.12
 #: Particles of the pools whose surface is timed, along each side.
 POOL = (50, 50, 40)
 
@@ -44,12 +49,16 @@ POOL = (50, 50, 40)
 def baked(name: str, mesh: Mesh, settings: dict[str, Any]) -> ParticleCache:
     """Frames of a simulation; those that are there are kept."""
     cache = ParticleCache(FOLDER / name)
-    bake(prepare(mesh, parse_settings({"last": LAST} | settings), name), cache)
+    bake(job_of(name, mesh, settings), cache)
     return cache
 
 
-def torn(name: str, mesh: Mesh, material: dict[str, Any], resolution: int) -> ParticleCache:
-    """The longest side of a mesh is pulled apart by its ends, by half its length."""
+def job_of(name: str, mesh: Mesh, settings: dict[str, Any]) -> Job:
+    return prepare(mesh, parse_settings({"last": LAST} | settings), name)
+
+
+def pulled(name: str, mesh: Mesh, material: dict[str, Any], resolution: int, back: bool = False) -> dict[str, Any]:
+    """Settings by which the longest side of a mesh is pulled apart by its ends, by half its length, and `back`."""
     low, high = mesh.vertices.min(axis=0).astype(float), mesh.vertices.max(axis=0).astype(float)
     size, axis = high - low, int(np.argmax(high - low))
     side = np.where(mesh.vertices[:, axis] > (low + high)[axis] / 2, 1.0, -1.0)
@@ -58,12 +67,12 @@ def torn(name: str, mesh: Mesh, material: dict[str, Any], resolution: int) -> Pa
         motion[frame, :, axis] += side * 0.25 * frame / (LAST - 1) * size[axis]
         motion[frame, :, (axis + 1) % 3] += side * 0.0375 * frame / (LAST - 1) * size[axis]
     FOLDER.mkdir(parents=True, exist_ok=True)
-    np.save(FOLDER / f"{name}.npy", motion)
+    np.save(FOLDER / f"{name}.npy", and_back(motion) if back else motion)
     ends = [[(low - 0.01 * size).tolist(), (high + 0.01 * size).tolist()] for _ in range(2)]
     ends[0][1][axis], ends[1][0][axis] = (float(low[axis] + part * size[axis]) for part in (0.36, 0.64))
     pins = [{"box": box} for box in ends]
     given = {"material": material, "resolution": resolution, "pins": pins, "gravity": [0, 0, -4.0]}
-    return baked(name, mesh, given | {"motion": str(FOLDER / f"{name}.npy")})
+    return given | {"motion": str(FOLDER / f"{name}.npy")}
 
 
 def poured(name: str, mesh: Mesh) -> ParticleCache:
@@ -156,6 +165,40 @@ def pool() -> list[object]:
     ]  # fmt: skip
 
 
+def healing(state: ObjectState, mesh: Mesh, motions: dict[str, dict[str, Any]], size: int, samples: int) -> str:
+    """A table of what heals in bakes by settings, and pictures of the first around where most does."""
+    rows, pictures = [], []
+    for title, given in motions.items():
+        name = f"{state.name}-{title}"
+        cache = baked(name, mesh, given)
+        alone, kept = healed(mesh, cache, False), healed(mesh, cache, True)
+        found = np.unpackbits(cache.read(LAST).broken).sum()
+        share = cost(job_of(name, mesh, given), cache)
+        told = [[of.bonds, of.faces, f"{100 * of.walls:.1f} %"] for of in (alone, kept)]
+        rows.append([title, int(found), *told[0], ", ".join(map(str, told[1])), *(f"{100 * s:.2f} %" for s in share)])
+        if pictures:
+            continue
+        frames = range(alone.at - BEFORE, min(alone.at + AFTER, LAST + 1))
+        near = AROUND * np.ptp(mesh.vertices, axis=0).max()
+        places = np.concatenate([alone.places - near, alone.places + near])
+        camera = frame_camera(places, size, azimuth=AZIMUTH, fill=0.9)
+        floor = min(float(cache.read(frame).vertices[:, 2].min()) for frame in cache.frames()) - 0.02
+        for known in (False, True):
+            row = []
+            for frame in frames:
+                now = shown(state, cache, frame, Inside())
+                if not known and now.particles is not None:
+                    now = replace(now, particles=replace(now.particles, broken=None))
+                row.append(picture(now, floor, camera, samples))
+            pictures.append(np.concatenate(row, axis=1))
+    save(HEALING, [np.concatenate(pictures, axis=0)])
+    columns = [
+        "matter", "bonds broken", "bonds heal", "cut faces heal", "walls heal", "these, kept", "of the bytes",
+        "of the time",
+    ]  # fmt: skip
+    return table(columns, rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--asset", type=Path, required=True)
@@ -164,11 +207,13 @@ def main() -> None:
     args = parser.parse_args()
     key = SESSION.load_asset(args.asset)
     mesh = SESSION.asset(key).mesh
-    state = ObjectState("capture", key)
+    state = ObjectState(args.asset.stem, key)
     pictures, rows = [], []
+    motions: dict[str, dict[str, Any]] = {}
     frames = {"jelly": (18, {"name": "jelly"}, 36), "snow": (16, {"name": "snow"}, 20)}
     for name, (frame, material, resolution) in frames.items():
-        cache = torn(f"{args.asset.stem}-{name}", mesh, material, resolution)
+        motions[name] = pulled(f"{args.asset.stem}-{name}", mesh, material, resolution)
+        cache = baked(f"{args.asset.stem}-{name}", mesh, motions[name])
         floor = float(cache.read(frame).vertices[:, 2].min()) - 0.02
         camera = frame_camera(cache.read(frame).vertices, args.size, azimuth=AZIMUTH, fill=0.82)
         seen = []
@@ -187,6 +232,9 @@ def main() -> None:
         camera = frame_camera(every, args.size, azimuth=AZIMUTH, fill=0.82)
         pictures.append(picture(shown(state, cache, frame, None), float(low) - 0.02, camera, args.samples))
     save(FIGURE, pictures)
+    again = "snow, pushed together"
+    motions[again] = pulled(f"{args.asset.stem}-{again}", mesh, frames["snow"][1], frames["snow"][2], back=True)
+    mended = healing(state, mesh, motions, args.size, args.samples)
     columns = [
         "matter",
         "particles",
@@ -203,7 +251,11 @@ def main() -> None:
         f"{table(columns, rows)}\n\nThe surface of {int(np.prod(POOL)):,} particles that fill a box in disorder; cells "
         "are those of the simulation's grid.\n\n"
         + table(["volume", "top, cells too high", "unevenness, cells", "s for 100,000 particles"], [pool()])
-        + "\n\n![Hollow and closed pieces, snow, and water](images/broken.png)"
+        + "\n\n![Hollow and closed pieces, snow, and water](images/broken.png)\n\n"
+        f"What heals from one frame to the next, summed over {LAST} frames, where each frame is judged by itself: "
+        "bonds, faces of the mesh that were cut, and faces inside (of the most that there are at once). *These, kept*: "
+        "the same by what caches keep, and what that costs: of a frame's bytes, and of the time that computes it."
+        f"\n\n{mended}\n\n![Frames in a row, judged each by itself, and as they are kept](images/cracks.png)"
     )
     write_section("broken", "Broken and flowing matter", body)
 

@@ -138,7 +138,7 @@ def _rest_of(cache: ParticleCache, header: Header) -> ParticleFrame:
         return _rests[key]
     read = cache.rest()
     broken = None if read.broken is None else np.array(read.broken)
-    rest = ParticleFrame(*(np.array(array) for array in (read.points, read.gradients, read.vertices)), broken)
+    rest = ParticleFrame(np.array(read.points), np.array(read.gradients), np.array(read.vertices), broken)
     now = cache.header()
     if now is None or (now.digest, now.version) != (header.digest, header.version):
         raise AssetError(str(cache.folder), "is being baked again", "Wait for the first frames")

@@ -227,5 +227,5 @@ def test_a_simulation_that_begins_posed_leaves_surfels_to_the_mesh(body, scene, 
     body.drgs.physics.driven_by = "particles"
     state, told = state_at(body, 3, export=export)
     assert not state.particles.surfels and [text for text in told if "begins with another shape" in text]
-    body.drgs.physics.inside = "open"
+    body.drgs.physics.tear = False
     assert state_at(body, 3, export=export)[0].particles is None
