@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..compute.jit import njit
+from .fracture import STRETCH
 
 #: Cells from one without a particle to the one that it belongs to, and to particles that carry a point, at most.
 REACH = 2
@@ -84,6 +85,31 @@ def find_owners(cells, keys, order, rest, size, out):  # type: ignore[no-untyped
                     row = find(keys, key_of(a, b, d, size))
                     if row >= 0:
                         best, out[c] = far, order[row]
+
+
+@njit
+def bonds_apart(a, b, rest, now, gap, out):  # type: ignore[no-untyped-def]
+    """Which bonds are broken: their ends are more than `gap` cells farther apart than at rest, and `STRETCH` times.
+
+    Parameters
+    ----------
+    a, b : (k,) int array
+        The ends of each; -1: it has none.
+    rest, now : (n, 3) float64 array
+        Particles, in cells.
+    gap : float
+    out : (k,) bool array
+        Written.
+    """
+    for i in range(len(a)):
+        p, q = a[i], b[i]
+        before = after = 0.0
+        if p >= 0 and q >= 0:
+            for c in range(3):
+                before += (rest[p, c] - rest[q, c]) ** 2
+                after += (now[p, c] - now[q, c]) ** 2
+        before = np.sqrt(before)
+        out[i] = np.sqrt(after) > max(before + gap, STRETCH * before)
 
 
 @njit

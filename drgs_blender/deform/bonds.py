@@ -15,8 +15,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .bond_kernels import REACH, SIDE, all_joined_to, bonds_across, find_owners, nearest_carriers, open_faces_of
-from .fracture import STRETCH
+from .bond_kernels import (
+    REACH,
+    SIDE,
+    all_joined_to,
+    bonds_across,
+    bonds_apart,
+    find_owners,
+    nearest_carriers,
+    open_faces_of,
+)
 from .gmls import NEIGHBOURS, Weights, _weigh
 
 Array = np.ndarray
@@ -133,16 +141,12 @@ class Bonds:
         gap : float
             Cells by which neighbours have moved apart at least.
         """
-
-        def apart(a: Array, b: Array) -> Array:
-            before, after = (np.linalg.norm(x[a] - x[b], axis=1) for x in (self.rest, now))
-            return np.asarray(after > np.maximum(before + gap, STRETCH * before))
-
-        found = np.zeros((len(now), 3), bool)
+        found, (p, q) = self.none(), np.divmod(self.across, len(self.rest))
+        rows = np.arange(len(self.rest))
         for axis in range(3):
-            a = np.flatnonzero(self.neighbour[:, 2 * axis + 1] >= 0)
-            found[a, axis] = apart(a, self.neighbour[a, 2 * axis + 1])
-        return Broken(found, apart(*np.divmod(self.across, len(self.rest))))
+            bonds_apart(rows, self.neighbour[:, 2 * axis + 1], self.rest, now, gap, found.up[:, axis])
+        bonds_apart(p, q, self.rest, now, gap, found.across)
+        return found
 
     def none(self) -> Broken:
         """That nothing has broken."""
