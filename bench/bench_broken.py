@@ -254,7 +254,8 @@ def main() -> None:
         + "\n\n![Hollow and closed pieces, snow, and water](images/broken.png)\n\n"
         f"What heals from one frame to the next, summed over {LAST} frames, where each frame is judged by itself: "
         "bonds, faces of the mesh that were cut, and faces inside (of the most that there are at once). *These, kept*: "
-        "the same by what caches keep, and what that costs: of a frame's bytes, and of the time that computes it."
+        "the same by what caches keep, and what that costs: of a frame's bytes, and of the time that computes it. Cut "
+        "faces are also others where a crack grows, whose line is smoothed."
         f"\n\n{mended}\n\n![Frames in a row, judged each by itself, and as they are kept](images/cracks.png)"
     )
     write_section("broken", "Broken and flowing matter", body)
