@@ -19,6 +19,7 @@ from drgs_blender.core.asset.model import Asset, Environment, Mesh
 from drgs_blender.core.particle_cache import Header, ParticleCache, ParticleFrame
 from drgs_blender.core.passes import BY_NAME
 from drgs_blender.deform.attach import attach
+from drgs_blender.deform.bonds import Bonds
 from drgs_blender.render.film.frame_files import read_frame
 
 # Stands at -Y and looks along +Y; the picture's right is +X.
@@ -153,6 +154,48 @@ def test_torn_and_flowing_matter_is_shown_as_it_is_asked_for(relight, folder, tm
     assert "Bake again" in capsys.readouterr().err
     for value in ("1,2,3", "red", "0.1,0.2"):
         assert main(["relight", str(folder / "lit.drgs"), "--out", "x.exr", *jelly, "--inside", value]) == 64
+
+
+@pytest.mark.parametrize("inside", ["0,1,0", "open"])
+def test_what_has_broken_stays_so_in_every_frame_that_is_rendered_alone(folder, tmp_path, capsys, inside):
+    """Torn and pushed together; a cache of before is told, and shows the last frame as if nothing had happened."""
+    mesh = read_asset(folder / "lit.drgs").mesh
+    axis = np.linspace(-1.4, 1.4, 8)
+    rest = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3).astype(np.float32)
+    still = np.tile(np.eye(3, dtype=np.float16), (len(rest), 1, 1))
+    cells = np.eye(4) / 0.4
+    cells[:3, 3], cells[3, 3] = 4.0, 1.0
+    bonds = Bonds(rest, cells)
+
+    def lifted(places, by):
+        return places + np.where(places[:, 2:] > 0, np.float32([[0, 0, by]]), 0)
+
+    torn = bonds.broken(bonds.placed(lifted(rest, 1.6)), 2.0)
+
+    def bake(name, known):
+        cache, settings = ParticleCache(tmp_path / name), {"material": {"model": "elastic"}, "regions": []}
+        header = Header("digest", len(rest), len(mesh.vertices), 1, 24.0, settings, tear=0.8, cells=cells.tolist())
+        for frame, by in enumerate((0.0, 0.0, 1.6, 0.1)):
+            broken = bonds.packed(torn if frame > 1 else bonds.none()) if known else None
+            now = ParticleFrame(lifted(rest, by), still, lifted(mesh.vertices, by), broken)
+            cache.write(frame, now) if frame else cache.create(header, now)
+        return str(cache.folder)
+
+    def picture(name, cache, frames):
+        common = ["--camera", str(folder / "front.json"), "--samples", "2", "--inside", inside, "--cache", cache]
+        out = str(tmp_path / name)
+        assert main(["relight", str(folder / "lit.drgs"), "--out", out, "--frames", frames, *common]) == 0
+        return "cracks may close again. Bake again" in capsys.readouterr().err
+
+    new, old = bake("new", True), bake("old", False)
+    assert not picture("all/#.exr", new, "1-3") and not picture("alone.exr", new, "3")
+    assert picture("old/#.exr", old, "2-3")
+    whole, alone, before = (
+        read_frame(tmp_path / path)[0]["Combined"] for path in ("all/3.exr", "alone.exr", "old/3.exr")
+    )
+    np.testing.assert_array_equal(whole, alone)
+    assert np.abs(whole - before).max() > 0
+    np.testing.assert_array_equal(*(read_frame(tmp_path / f"{of}/2.exr")[0]["Combined"] for of in ("all", "old")))
 
 
 def test_rotation_is_that_of_a_mapping_node(relight):
