@@ -168,6 +168,7 @@ def crack_meshes(state: ObjectState, traced: TraceObject, closed: ClosedMatter, 
     """What replaces faces that are cut: what is left of them, in the object's materials, and the faces inside, if any.
 
     Where cracks are open the camera sees it between surfels; where they are shut surfels hide it, as all of the mesh.
+    Surfels are tied to all but the faces inside.
 
     Parameters
     ----------
@@ -206,10 +207,15 @@ def crack_meshes(state: ObjectState, traced: TraceObject, closed: ClosedMatter, 
             visibility=state.visibility,
             light_group=state.light_group,
             owner=owner,
-            seen_only=hidden and traced.seen_only,
-            beside=not hidden,
+            seen_only=tied and traced.seen_only,
+            beside=beside,
+            tied=tied,
         )
-        for hidden, which in ((False, there & ~shut), (True, there & shut))
+        for beside, tied, which in (
+            (True, False, there & ~shut & (index == 0)),
+            (True, True, there & ~shut & (index == 1)),
+            (False, True, there & shut),
+        )
         if which.any()
     ]
 

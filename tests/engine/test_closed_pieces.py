@@ -11,6 +11,8 @@ from pictures import assert_same_bits, fresh
 from drgs_blender.core.errors import AssetError
 from drgs_blender.core.frame import Inside, MotionStep, Particles, Pose
 from drgs_blender.deform.bonds import Bonds
+from drgs_blender.render.scene.ray_masks import CAMERA, ORDINARY, SHADOW, SURFELS
+from drgs_blender.render.scene.trace_mesh import mask_of
 from drgs_blender.simulation.fill import fill
 
 GREEN = Inside((0.0, 1.0, 0.0), 1.0, 0.0)
@@ -258,3 +260,22 @@ def test_bits_of_other_bonds_are_refused_by_name(session, make_frame, filling):
         state.particles = replace(state.particles, broken=wrong)
         with pytest.raises(AssetError, match=rf"{state.name}: what has broken of it.*Bake it again"):
             session.render(frame)
+
+
+@pytest.mark.parametrize("rays", ["mesh", "surfels"])
+def test_surfels_are_tied_to_what_is_left_of_cut_faces_and_not_to_walls(session, make_frame, filling, rays):
+    """Where nothing tied them, those below the mesh were in its shadow: black flecks along cracks."""
+
+    def masks(frame):
+        session.render(frame)
+        cracks = session._scene_cache.objects[0].cracks
+        return {("wall", "rim")[int(mesh.material_index[0])]: mask_of(mesh) for mesh in cracks}
+
+    light = SHADOW if rays == "mesh" else 0
+    torn = masks(torn_frame(make_frame, filling, 1.2, GREEN, rays_see=rays))
+    assert torn["wall"] & (ORDINARY | SURFELS | SHADOW) == ORDINARY | SHADOW
+    assert torn["rim"] & (ORDINARY | SURFELS | SHADOW) == ORDINARY | SURFELS | light
+    shut = masks(pushed_frame(make_frame, filling, 0.0, GREEN, rays_see=rays))
+    assert len(shut) == 1
+    for mask in shut.values():
+        assert mask & (ORDINARY | SURFELS | SHADOW | CAMERA) == SURFELS | light | CAMERA

@@ -18,12 +18,15 @@ class ObjectMesh(MeshState):
     seen_only : bool
         As of `TraceObject`.
     beside : bool
-        Whether the camera meets it next to the surfels, which are not tied to it.
+        Whether the camera meets it next to the surfels.
+    tied : bool
+        Whether surfels are tied to it even so.
     """
 
     owner: int = 0
     seen_only: bool = False
     beside: bool = False
+    tied: bool = False
 
     @property
     def clear(self) -> bool:

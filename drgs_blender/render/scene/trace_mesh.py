@@ -19,7 +19,7 @@ from ...geometry.normals import VertexNormals
 from ..surfel_columns import NORMAL
 from .instances import Instances, flattens, normal_matrices
 from .object_mesh import ObjectMesh
-from .ray_masks import group_mask
+from .ray_masks import ORDINARY, group_mask
 from .trace_kernels import (
     FARTHEST,
     copy_materials,
@@ -212,6 +212,8 @@ def mask_of(item: TraceObject | MeshState) -> int:
     """Group mask of an object or a mesh."""
     if isinstance(item, TraceObject) or (isinstance(item, ObjectMesh) and not item.ordinary):
         return group_mask(item.visibility, True, item.seen_only)
+    if isinstance(item, ObjectMesh) and item.tied:
+        return group_mask(item.visibility, True, item.seen_only) | ORDINARY * item.visibility.camera
     return group_mask(item.visibility, False, clear=any(material.clear for material in item.materials))
 
 
