@@ -107,7 +107,10 @@ class Header:
         """That of the body and those of its regions, as far as they are known."""
         settings = self.settings if isinstance(self.settings, dict) else {}
         regions = settings.get("regions") or ()
-        return [settings.get("material"), *(row[-1] if isinstance(row, list) and row else None for row in regions)]
+        return [
+            settings.get("material"),
+            *(row[-1] if isinstance(row, list | tuple) and row else None for row in regions),
+        ]
 
 
 @dataclass(slots=True)

@@ -250,6 +250,14 @@ def test_what_cannot_break_keeps_nothing(tmp_path, motion, given):
     assert cache.read(2).broken is None and cache.driving(1.5)[0].broken is None
 
 
+def test_bodies_of_several_materials_keep_what_has_broken_where_none_flows(tmp_path, motion):
+    for material, keeps in (("clay", True), ("sand", False)):
+        cache = ParticleCache(tmp_path / material)
+        bake(job_of(motion, 3, regions=[ENDS[0] | {"material": material}]), cache)
+        assert cache.header().breaks == keeps
+        assert all((cache.read(frame).broken is not None) == keeps for frame in cache.frames())
+
+
 def test_coupled_bodies_each_know_what_has_broken(tmp_path, torn, motion):
     scene = {
         "bodies": [
