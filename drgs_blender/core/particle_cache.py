@@ -106,11 +106,9 @@ class Header:
     def _materials(self) -> list[Any]:
         """That of the body and those of its regions, as far as they are known."""
         settings = self.settings if isinstance(self.settings, dict) else {}
-        regions = settings.get("regions") or ()
-        return [
-            settings.get("material"),
-            *(row[-1] if isinstance(row, list | tuple) and row else None for row in regions),
-        ]
+        rows = settings.get("regions") or ()
+        kept = [row[-1] if isinstance(row, list | tuple) and row else None for row in rows]
+        return [settings.get("material"), *kept]
 
 
 @dataclass(slots=True)
@@ -232,10 +230,7 @@ class ParticleCache:
         return sorted(int(match[1]) for match in names if match)
 
     def lacking(self, first: int, last: int) -> int | None:
-        """The first of some frames that is missing, or cut off: all have as many bytes; None: none is.
-
-        The last one, from which all goes on, is read.
-        """
+        """The first of some frames that is missing or cut off, or None: all have as many bytes; the last is read."""
         sizes = []
         for frame in range(first, last + 1):
             try:
