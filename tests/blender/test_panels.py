@@ -208,6 +208,7 @@ def test_the_bake_button_says_of_how_many_objects_and_what_is_waited_for(scene, 
 def test_the_newest_problem_is_in_the_header_of_viewports(scene, monkeypatch):
     messages = part("addon.messages")
     monkeypatch.setattr(messages, "history", type(messages.history)(maxlen=3))
+    monkeypatch.setattr(part("addon.preferences"), "read", lambda name, default: True)  # the sidebar is known
     (draw,) = (f for f in bpy.types.VIEW3D_HT_header.draw._draw_funcs if f.__module__.startswith(PACKAGE))
     told = []
 
