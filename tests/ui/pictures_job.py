@@ -10,15 +10,14 @@ from pathlib import Path
 import bpy
 from mathutils import Vector
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "examples"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "examples"))
 sys.path.insert(0, str(Path(__file__).parent))
 
 import hands
 from blender_scenes import add_material, import_drgs, stand
 from hands import found, move, photograph, settled, where
 
-CAPTURED = ROOT / "examples" / "captured"
+CAPTURED = Path(__file__).resolve().parents[2] / "examples" / "captured"
 found["boxes"] = {}
 
 
