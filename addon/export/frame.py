@@ -18,7 +18,7 @@ from ..view_layer_passes import enabled, not_rendered
 from .camera import export_camera, picture_of
 from .export_cache import ExportCache, uid
 from .images import begin_export, end_export
-from .instances import UNRENDERED, Key, Keys, Unrendered, Visible, uncancelled, visible
+from .instances import Key, Keys, Unrendered, Visible, uncancelled, visible
 from .light_links import LightLinks
 from .lights import export_light
 from .materials import Materials
@@ -101,7 +101,7 @@ def export_frame(
                 shining.append(item.key)
                 light = replace(light, **links.numbers_of(item))
                 lights.append(light if others == "SEEN" else replace(light, camera=False))
-        elif item.object.type in UNRENDERED:
+        elif not item.is_rendered:
             unrendered.add(item.object)
         elif item.is_hair:
             meshes.add(item)

@@ -1,6 +1,7 @@
-"""Hair: Curves objects, and the particle hair of others, as tubes that `meshes` exports like any mesh.
+"""Hair: Curves objects, and the particle hair of others, as tubes; point clouds as spheres. `meshes` exports them all.
 
-What is hair, how thick and of which material is as Cycles reads it (Blender's intern/cycles/blender/curves.cpp).
+What is hair, how thick and of which material is as Cycles reads it (Blender's intern/cycles/blender/curves.cpp, and
+pointcloud.cpp). A point is a strand of one point here.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import bpy
 import numpy as np
 from mathutils.bvhtree import BVHTree
 
+from ...drgs_blender.core.spheres import FINEST, sphere_faces, spheres
 from ...drgs_blender.core.strands import MOST_TRIANGLES, SEGMENTS, SIDES, Tubes, triangle_count, tubes
 from .. import mesh_arrays
 from .layers import HAIR_INFO, LayerRef, attribute_values
@@ -22,6 +24,8 @@ Warn = Callable[[str], None]
 
 #: Of hair curves without a radius, in object space.
 _RADIUS = 0.005
+#: Of points without one.
+_POINT_RADIUS = 0.01
 _POLY = 1
 #: Modes in which the strands of an object are edited, and not rendered.
 _EDITED = ("EDIT", "PARTICLE_EDIT")
@@ -40,6 +44,8 @@ class Strands:
         Material slot of each.
     linear : bool
         Straight between their points.
+    are_points : bool
+        Spheres.
     """
 
     points: Array
@@ -47,9 +53,12 @@ class Strands:
     offsets: Array
     slot: Array
     linear: bool = False
+    are_points: bool = False
 
     def tubes(self, name: str = "", warn: Warn = lambda text: None) -> Tubes:
         """As a mesh; coarser where it would be too large, with a warning that has the object's `name`."""
+        if self.are_points:
+            return self._spheres(name, warn)
         count, details = len(self.slot), [(1 if self.linear else SEGMENTS, SIDES), (1, SIDES), (1, 3)]
         wanted = [triangle_count(self.offsets, *detail) for detail in details]
         best = next((i for i, triangles in enumerate(wanted) if triangles <= MOST_TRIANGLES), len(details) - 1)
@@ -70,6 +79,19 @@ class Strands:
             warn(f'"{name}": {empty:,} of its {count:,} strands have no length or no thickness; they are left out')
         return made
 
+    def _spheres(self, name: str, warn: Warn) -> Tubes:
+        """Of points, the finer the fewer they are."""
+        count = len(self.points)
+        level = next((k for k in range(FINEST, 0, -1) if count * sphere_faces(k) <= MOST_TRIANGLES), 0)
+        made = spheres(self.points, self.radii, level)
+        if count * sphere_faces(level) > MOST_TRIANGLES:
+            warn(f'"{name}": its {count:,} points are {len(made.faces):,} triangles. Fewer take less memory and time')
+        if bad := int(made.bad.sum()):
+            warn(f'"{name}": {bad:,} of its {count:,} points have a number that is not finite; they are left out')
+        if empty := int((self.radii <= 0).sum()):
+            warn(f'"{name}": {empty:,} of its {count:,} points have no radius; they are left out')
+        return made
+
 
 def systems(obj: bpy.types.Object, mode: str) -> Iterator[Any]:
     """Modifiers of an evaluated object whose particles are hair, drawn as such by a depsgraph of that mode."""
@@ -84,8 +106,23 @@ def systems(obj: bpy.types.Object, mode: str) -> Iterator[Any]:
 
 
 def read_strands(obj: bpy.types.Object, mode: str) -> Strands:
-    """Of an evaluated object of type Curves, or of the particles on another, for a depsgraph of a mode."""
+    """Of an evaluated Curves or Point Cloud object, or of the particles on another, for a depsgraph of a mode."""
+    if obj.type == "POINTCLOUD":
+        return _of_points(obj.data)
     return _of_curves(obj.data) if obj.type == "CURVES" else _of_particles(obj, mode)
+
+
+def _of_points(data: Any) -> Strands:
+    count = len(data.points)
+    points = np.zeros((count, 3), np.float32)
+    if count:
+        data.attributes["position"].data.foreach_get("vector", points.ravel())
+    radii = np.full(count, _POINT_RADIUS, np.float32)
+    attribute = data.attributes.get("radius")
+    if attribute is not None and attribute.data_type == "FLOAT" and len(attribute.data) == count:
+        attribute.data.foreach_get("value", radii)
+    offsets = np.arange(count + 1, dtype=np.int32)
+    return Strands(points, radii, offsets, np.zeros(count, np.int32), are_points=True)
 
 
 def _of_curves(data: Any) -> Strands:
@@ -161,7 +198,7 @@ class Hair:
         self._places: tuple[tuple[Array, ...], Array] | None = None
         self.strands, self.tubes, self.name = strands, made, obj.data.name
         self.polygons = range(len(made.faces))
-        self._is_curves = obj.type == "CURVES"
+        self._is_curves = obj.type != "MESH"  # or points: values are its own
         self.color_attributes: Any = () if self._is_curves else self._data.color_attributes
 
     def as_pointer(self) -> int:

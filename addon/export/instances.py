@@ -18,9 +18,9 @@ T = TypeVar("T")
 Warn = Callable[[str], None]
 
 #: What has a surface that a picture without it would lack, by the type of the object.
-UNRENDERED = {"POINTCLOUD": "point cloud", "VOLUME": "volume"}
+UNRENDERED = {"VOLUME": "volume"}
 #: What of it is rendered.
-RENDERED = ("MESH", "LIGHT", "CURVES")
+RENDERED = ("MESH", "LIGHT", "CURVES", "POINTCLOUD")
 #: At the end of the number in an instance's key: the hair on it.
 _HAIR = -1
 _SPLATS = "splat"
@@ -60,8 +60,14 @@ class Visible:
 
     @property
     def is_hair(self) -> bool:
-        """Whether it consists of strands."""
-        return self.is_particle_hair or self.object.type == "CURVES"
+        """Whether it consists of strands, or of points."""
+        return self.is_particle_hair or self.object.type in ("CURVES", "POINTCLOUD")
+
+    @property
+    def is_rendered(self) -> bool:
+        """Whether it is something that can be rendered."""
+        obj = self.object
+        return obj.type not in UNRENDERED and not (obj.type == "POINTCLOUD" and splat_attributes.is_splats(obj.data))
 
 
 def visible(depsgraph: bpy.types.Depsgraph) -> Iterator[Visible]:
