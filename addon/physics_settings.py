@@ -304,7 +304,8 @@ class DrgsPhysicsSettings(MaterialNumbers, bpy.types.PropertyGroup):
     )
     folder: StringProperty(
         name="Cache Folder",
-        description="Folder of the frames; empty is drgs_cache/OBJECT beside the .blend. One folder per object",
+        description="Folder of the frames; empty is drgs_cache/BLEND/OBJECT beside the .blend. One folder per object "
+        "of one .blend",
         subtype="DIR_PATH",
         options=blend_paths.RELATIVE,
     )

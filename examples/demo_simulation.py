@@ -53,7 +53,7 @@ def main() -> int:
     blender = os.environ.get("DRGS_BLENDER", ROOT / ".venv-blender" / BIN / f"python{EXE}")
     os.environ.update(BLENDER_USER_RESOURCES=str(out / "blender"), DRGS_ENGINE=sys.executable)
     run(blender, "-P", ROOT / "examples" / "demo_simulation_scene.py", out / "extension.zip", out)
-    sunk = {name: droop(out / "drgs_cache" / name) for name in ("soft", "firm")}
+    sunk = {name: droop(out / "drgs_cache" / "droop" / name) for name in ("soft", "firm")}
     print(", ".join(f"{name}: has sunk by {value:.1%} of its height" for name, value in sunk.items()))
     if not sunk["soft"] > sunk["firm"] > 0:
         print("The softer body should have sunk more than the firmer one, and both some", file=sys.stderr)

@@ -290,7 +290,8 @@ class DRGS_OT_free_physics(DrgsOperator, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context) -> set[str]:
         selection.editable(coupling.members(context.object), vertices=False)
-        cache_state.free(context.object)
+        for text in cache_state.free(context.object):
+            self.warn(text)
         return {"FINISHED"}
 
 

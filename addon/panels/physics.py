@@ -9,7 +9,7 @@ import bpy
 from ...drgs_blender.core.errors import DrgsError
 from ...drgs_blender.core.sim_materials import MATERIALS
 from .. import assets
-from ..physics import bake_job, bake_time, cache_state, coupling, particle_display
+from ..physics import bake_job, bake_time, cache_state, coupling, particle_display, settings_export
 from ..physics_materials import numbers_of
 from ..physics_settings import DrgsPhysicsRegion, DrgsPhysicsSettings
 from .text_layout import bar_text, wrapped
@@ -142,11 +142,16 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         wrapped(layout, context, problem, "ERROR")
     for name in found.missing:
         layout.label(text=f'"{name}" has no frames', icon="ERROR")
+    elsewhere = settings_export.played_elsewhere(obj)
+    if elsewhere is not None:
+        wrapped(layout, context, f"Plays the frames of {elsewhere} until it is baked", "INFO")
     row = layout.row(align=True)
     count = sum(coupling.count_of(other) for other in bake_job.chosen(context))
     more = f" {count} Objects" if count > 1 else ""
     if not found.frames and not found.missing:
         row.operator("drgs.bake_physics", text=f"Bake{more}", icon="REC")
+        if elsewhere is not None:
+            row.operator("drgs.free_physics", text="", icon="TRASH")
         return
     if found.changed:
         layout.label(text="Settings have changed since", icon="INFO")

@@ -23,7 +23,7 @@ from ...drgs_blender.core.particle_cache import ParticleCache
 from .. import assets, cache_playback, messages, output_check
 from ..export.export_cache import uid
 from . import bake_time, coupling, particle_display, scene_export
-from .settings_export import INPUT, Removed, exclusive_folder, subject_of
+from .settings_export import INPUT, Removed, adopt, claim, exclusive_folder, subject_of
 from .simulate_process import SimulateProcess, ending
 
 #: What is being done, by the `uid` of its object.
@@ -128,6 +128,8 @@ class Job:
                 obj, scene, member.inputs, still=still, coupled=coupled, bodies=bodies
             ):
                 yield (i + part) / count
+            if self._saves:
+                claim(member.folder, member.name)
         if count > 1:
             bodies_file = self._inputs / scene_export.BODIES
             named = [(member.name, member.inputs, member.folder) for member in self.members]
@@ -228,8 +230,9 @@ class Bake(Job):
         physics = obj.drgs.physics
         self.first, self.frames, self.count = physics.frame_start, physics.frame_end - physics.frame_start + 1, 0
         self._begun = 0, time.monotonic()
-        for other in objects:
+        for other, member in zip(objects, self.members):
             particle_display.hide(other)
+            adopt(other, member.folder)
 
     def progress(self) -> tuple[float, str]:
         """The part that is done, and words for it."""

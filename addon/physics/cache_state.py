@@ -12,7 +12,7 @@ import bpy
 from ...drgs_blender.core.particle_cache import ParticleCache
 from .. import cache_playback
 from . import coupling, scene_export
-from .settings_export import INPUT, describe, folder_of
+from .settings_export import INPUT, describe, folder_of, owner_of, played_elsewhere, subject_of
 from .simulate_process import ending
 
 
@@ -63,8 +63,13 @@ def _changed(obj: bpy.types.Object, scene: bpy.types.Scene) -> bool:
     return before != contacts or any(known.get(key) != now.get(key) for key in keys)
 
 
-def free(obj: bpy.types.Object) -> None:
+def free(obj: bpy.types.Object) -> list[str]:
     """Remove all files of the caches of an object and those that it is baked with, and what plays them.
+
+    Returns
+    -------
+    list of str
+        What stays, since it is not theirs, in words.
 
     Raises
     ------
@@ -74,11 +79,19 @@ def free(obj: bpy.types.Object) -> None:
     together = coupling.members(obj)
     while ending():
         time.sleep(0.02)
+    told = []
     for other in together:
         folder = folder_of(other)
+        kept, owner = played_elsewhere(other), owner_of(folder)
+        cache_playback.detach(other)
+        if kept is not None and kept.is_dir():
+            told.append(f"{subject_of(other)}: the frames in {kept} stay; they may be another file's")
+        if owner:
+            told.append(f"{subject_of(other)}: the frames in {folder} stay; they are those of {owner}")
+            continue
         ParticleCache(folder).clear()
         scene_export.clear(folder / INPUT)
-        cache_playback.detach(other)
         with suppress(OSError):
             (folder / cache_playback.FILE).unlink(missing_ok=True)
-            os.rmdir(folder)
+            (os.rmdir if other.drgs.physics.folder else os.removedirs)(folder)
+    return told

@@ -25,7 +25,7 @@ from .. import assets, cache_playback, mesh_arrays, messages, proxies
 from ..export.topology_check import check_modifiers, check_topology
 from ..physics_settings import DrgsPhysicsCollider
 from .forces import describe_field, fields_on, row_of
-from .settings_export import PANEL, describe, subject_of
+from .settings_export import OWNER, PANEL, describe, subject_of
 
 Array = np.ndarray
 
@@ -125,7 +125,7 @@ def clear(folder: Path) -> None:
     """Remove what `export_scene` wrote and the folder, as far as nothing else is in it."""
     with suppress(OSError):
         for path in folder.iterdir():
-            written = path.name in (BODY, SETTINGS, BODIES, MATRICES, MOTION, STDOUT, _OLD_STDOUT, LOG)
+            written = path.name in (BODY, SETTINGS, BODIES, MATRICES, MOTION, STDOUT, _OLD_STDOUT, LOG, OWNER)
             if written or path.name.startswith(_COLLIDER):
                 path.unlink(missing_ok=True)
         os.rmdir(folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from contextlib import suppress
@@ -11,7 +12,9 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ...drgs_blender.core.asset.archive import replace_file
 from ...drgs_blender.core.errors import UsageError
+from ...drgs_blender.core.particle_cache import ParticleCache
 from ...drgs_blender.core.sim_materials import MATERIALS
 from .. import cache_playback
 from ..physics_materials import ANGLES, numbers_of
@@ -21,8 +24,10 @@ from ..physics_settings import DrgsPhysicsSettings
 PANEL = "Physics > DR-GS Physics"
 #: Where a capture lies inside the cache.
 INPUT = "drgs_input"
-#: Where caches lie that the artist has chosen no folder for.
+#: Where caches lie that the artist has chosen no folder for, in a folder of each .blend.
 _CACHES = "//drgs_cache"
+#: Whose frames a cache has, beside the capture.
+OWNER = "owner.json"
 
 
 class Removed(UsageError):
@@ -55,7 +60,12 @@ def folder_of(obj: bpy.types.Object) -> Path:
 def _path_of(obj: bpy.types.Object) -> str:
     """The cache of an object as the artist wrote it, or the one that it has by itself, also after it was renamed."""
     written = obj.drgs.physics.folder.rstrip("/\\")
-    return written or _played_alone(obj) or f"{_CACHES}/{bpy.path.clean_name(obj.name)}"
+    return written or _played_alone(obj) or f"{_own_caches(obj)}/{bpy.path.clean_name(obj.name)}"
+
+
+def _own_caches(obj: bpy.types.Object) -> str:
+    """The folder in `_CACHES` that is the .blend's alone: another in its folder, also a copy of it, has another."""
+    return f"{_CACHES}/{Path(obj.library.filepath if obj.library else bpy.data.filepath).name.removesuffix('.blend')}"
 
 
 def _played_alone(obj: bpy.types.Object) -> str:
@@ -66,10 +76,66 @@ def _played_alone(obj: bpy.types.Object) -> str:
 
 
 def _played(obj: bpy.types.Object) -> str:
-    """The cache in `_CACHES` that an object plays, "" for none."""
+    """The cache in `_own_caches` that an object plays, "" for none."""
     modifier = cache_playback.modifier_of(obj) if obj.type == "MESH" and obj.users_scene else None
     folder, _, file = modifier.filepath.replace("\\", "/").rpartition("/") if modifier is not None else ("", "", "")
-    return folder if file == cache_playback.FILE and folder.startswith(f"{_CACHES}/") else ""
+    return folder if file == cache_playback.FILE and folder.startswith(f"{_own_caches(obj)}/") else ""
+
+
+def played_elsewhere(obj: bpy.types.Object) -> Path | None:
+    """The folder whose frames an object plays where that is not its cache, as in a copy of a .blend."""
+    modifier = cache_playback.modifier_of(obj)
+    played = cache_playback.path_of(obj, modifier).parent if modifier is not None else None
+    return None if played is None or _same_folder(obj, played) else played
+
+
+def owner_of(folder: Path) -> str:
+    """Another .blend that is still there, and its object, whose frames a cache has, in words; "" for none.
+
+    Parameters
+    ----------
+    folder : of the cache
+    """
+    try:
+        owner = json.loads((folder / INPUT / OWNER).read_text(encoding="utf-8"))
+        name, blend = owner["object"], Path(os.path.normpath(folder / owner["blend"]))
+    except (OSError, ValueError, TypeError, KeyError):
+        return ""
+    own = bpy.data.filepath
+    if not blend.is_file() or (own and os.path.exists(own) and os.path.samefile(own, blend)):
+        return ""
+    return f'"{name}" of {blend}' if ParticleCache(folder).frames() else ""
+
+
+def claim(folder: Path, name: str) -> None:
+    """Record that a cache has the frames of an object of this .blend.
+
+    Raises
+    ------
+    WriteError
+        Naming file and reason.
+    """
+    if bpy.data.filepath:
+        blend = bpy.data.filepath
+        with suppress(ValueError):  # on another drive of Windows
+            blend = os.path.relpath(blend, folder)
+        replace_file(folder / INPUT / OWNER, [json.dumps({"object": name, "blend": blend}).encode()])
+
+
+def adopt(obj: bpy.types.Object, own: Path) -> None:
+    """Have an empty cache begin with the frames that its object plays elsewhere, so that a bake may go on from them.
+
+    They are linked, which takes neither time nor space; a bake that starts over removes the links. Where the drive has
+    no links, it starts over.
+    """
+    played = played_elsewhere(obj)
+    if played is None or ParticleCache(own).header() is not None or ParticleCache(played).header() is None:
+        return
+    with suppress(OSError):
+        own.mkdir(parents=True, exist_ok=True)
+        for path in ParticleCache(played).files():
+            (own / path.name).unlink(missing_ok=True)
+            os.link(path, own / path.name)
 
 
 def check(obj: bpy.types.Object) -> None:
@@ -94,7 +160,7 @@ def check(obj: bpy.types.Object) -> None:
 
 
 def exclusive_folder(obj: bpy.types.Object) -> Path:
-    """The cache of an object, which no other object of any scene may have.
+    """The cache of an object, which no other object of any scene, or of another .blend, may have.
 
     Raises
     ------
@@ -109,6 +175,12 @@ def exclusive_folder(obj: bpy.types.Object) -> Path:
                 f'has the same cache as "{other.name}", {own}',
                 f"Choose another in {PANEL} > Domain and Cache",
             )
+    if owner := owner_of(own):
+        raise UsageError(
+            subject_of(obj),
+            f"would replace the frames of {owner}, in {own}",
+            f"Choose another folder in {PANEL} > Domain and Cache, or delete that bake there",
+        )
     return own
 
 

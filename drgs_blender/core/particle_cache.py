@@ -180,9 +180,13 @@ class ParticleCache:
         """Write the header alone."""
         replace_file(self.folder / HEADER, [json.dumps(asdict(header), indent=1).encode()])
 
+    def files(self) -> list[Path]:
+        """All that it may have, the header last: without it there is no cache."""
+        return [*map(self.path, self.frames()), *(self.folder / name for name in (_REST, _STATE, HEADER))]
+
     def clear(self) -> None:
         """Remove all files of a cache, the header first: what is left then is no cache."""
-        self._remove([self.folder / name for name in (HEADER, _STATE, _REST)] + [self.path(f) for f in self.frames()])
+        self._remove(reversed(self.files()))
         with suppress(OSError):
             for stray in self.folder.glob(".*.drgp.*.tmp"):
                 stray.unlink(missing_ok=True)

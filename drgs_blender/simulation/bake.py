@@ -108,11 +108,22 @@ def compute(
             if time.monotonic() - kept_at > _SAVE_EVERY:
                 bodies[0][0].write_state(frame, solver.arrays())
                 kept, kept_at = frame, time.monotonic()
+        if done:
+            _tell_lost([job for _, job in bodies])
     finally:
         now = settings.first + solver.frame
         if now > kept and all(cache.path(now).exists() and _owned(cache, job) for cache, job in bodies):
             bodies[0][0].write_state(now, solver.arrays())
     return done
+
+
+def _tell_lost(jobs: Sequence[Job]) -> None:
+    for solver in (job.solver for job in jobs if job.solver.lost):
+        log.warning(
+            "%s: %d of %d particles left the domain, and stay where they left it. Give a larger domain, or let it have "
+            "walls, to keep them",
+            solver.subject, solver.lost, len(solver.points),
+        )  # fmt: skip
 
 
 def header_of(job: Job, rest: ParticleFrame, settings: dict[str, Any]) -> Header:

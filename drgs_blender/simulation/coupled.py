@@ -137,8 +137,7 @@ class Coupled:
 
     def _sort(self) -> None:
         for body, grid in zip(self.bodies, self._grids, strict=True):
-            if not grid.sort():
-                body.check_inside(grid.state().x)
+            body.sort(grid)
         places = [grid.places for grid in self._grids]
         self._slots = {(i, j): shared_slots(places[i].active, places[i].slot, places[j].slot) for i, j in self._rules}
 

@@ -114,8 +114,9 @@ class Grid(ABC):
         """
 
     @abstractmethod
-    def sort(self) -> bool:
-        """Sort particles; False, and they must not be moved, if one is outside of the domain or not finite."""
+    def sort(self) -> int:
+        """Sort particles; how many are outside of the domain or not finite: these stay where they are, and no pin may
+        be one of them."""
 
     @abstractmethod
     def step(self, times: Sequence[tuple[float, float]], limits: Limits) -> list[float]:
@@ -148,11 +149,9 @@ class HostGrid(Grid):
         self._state, self._kept = state, len(state.total) > 0
         self._frame, self._seconds, self._pin_velocity = frame, seconds, pin_velocity
 
-    def sort(self) -> bool:
+    def sort(self) -> int:
         scene = self._scene
         self._a, lost = arrange(self._rows.x if self._state is None else self._state.x, scene.domain)
-        if len(lost):
-            return False
         order = self._a.order
         if self._state is None:
             move(self._rows, order, self._spare)
@@ -168,7 +167,7 @@ class HostGrid(Grid):
         self._scratch = np.empty((len(self._a.block), SCRATCH), np.float32)
         self._held = np.zeros_like(values) if len(self._pins) else values[:0]
         self._fastest = np.empty(len(self._a.block), np.float32)
-        return True
+        return len(lost)
 
     def step(self, times: Sequence[tuple[float, float]], limits: Limits) -> list[float]:
         (done, dt), *_ = times

@@ -71,7 +71,7 @@ class Arrangement(NamedTuple):
     Attributes
     ----------
     order : (n,) int64 array
-        The particles block by block.
+        The particles block by block, and then those that are in none.
     block : (b, 3) int32 array
         Blocks with particles, those of one parity together.
     shares : (k + 1,) int64 array
@@ -228,7 +228,7 @@ def _numbers(x: Array, domain: Domain) -> Array:
     return number
 
 
-def outside(x: Array, domain: Domain) -> Array:
+def outside_of(x: Array, domain: Domain) -> Array:
     """(k,) indices of the particles (n, 3) outside the domain or not finite."""
     return np.flatnonzero(_numbers(x, domain) < 0)
 
@@ -246,15 +246,13 @@ def arrange(x: Array, domain: Domain) -> tuple[Arrangement, Array]:
     -------
     arrangement : Arrangement
     lost : (k,) array
-        Indices of particles outside the domain or not finite; where there are any, the arrangement is void.
+        Indices of particles outside the domain or not finite, which are in no block.
     """
     bx, by, bz = domain.blocks
     number = _numbers(x, domain)
-    lost = np.flatnonzero(number < 0)
-    empty = np.empty((0, 3), np.int32)
-    if len(lost):
-        return Arrangement(lost, empty, lost, lost, empty, lost, lost, empty, empty), lost
-    order, counts = _counting_sort(number, bx * by * bz)
+    lost, inside = np.flatnonzero(number < 0), np.flatnonzero(number >= 0)
+    order, counts = _counting_sort(number[inside] if len(lost) else number, bx * by * bz)
+    order = inside[order] if len(lost) else order
     used = np.flatnonzero(counts)
     first = (np.cumsum(counts) - counts)[used]
     block = np.stack(np.unravel_index(used, domain.blocks), -1).astype(np.int32)
@@ -272,4 +270,5 @@ def arrange(x: Array, domain: Domain) -> tuple[Arrangement, Array]:
     work = start + _BLOCK * np.arange(len(start))
     parts = min(get_num_threads(), 1 + int(work[-1]) // _SHARE)
     shares = np.searchsorted(work, np.linspace(0, 1, parts + 1) * work[-1])
+    order = np.concatenate([order, lost]) if len(lost) else order
     return Arrangement(order, block, shares, start, neighbour, source, source_start, active, slot), lost

@@ -22,7 +22,7 @@ from .colliders import Collider, MovingCollider, check_apart
 from .contact import Plane, plane_rows
 from .fields import FieldRows
 from .grid import Forces, Grid, HostGrid, Limits, Scene
-from .grid_blocks import Domain, outside
+from .grid_blocks import Domain, outside_of
 from .particles import Particles, Properties
 from .stepper import Stepper
 
@@ -33,6 +33,8 @@ log = logging.getLogger(__name__)
 DRIFT = 0.85
 #: Cells that matter or a collider moves at most in a step.
 FASTEST = 0.5
+#: Share of the particles outside of the domain from which on nothing is left to simulate.
+_MOST_LOST = 0.5
 #: A step this many times shorter than the stiffness asks for means that the motion has run away.
 RUNAWAY = 200.0
 
@@ -75,7 +77,7 @@ class Solver(Stepper):
     ----------
     body : Body
     domain : Domain
-        Where particles may be; leaving it is an error.
+        Where particles may be; those that leave it stay where they are, in nobody's way.
     forces : Forces, optional
         Forces on all matter.
     colliders : sequence of Collider
@@ -177,7 +179,7 @@ class Solver(Stepper):
         """Refuse what cannot go well, with what to do about it."""
         if not len(self.body.points):
             raise UsageError("simulation", "has no particles", "Fill the mesh first")
-        self.check_inside(self.state.x)
+        self._check_inside(self.state.x)
         check_apart(self.body.points, self.domain.spacing, self.colliders, self.planes)
 
     @property
@@ -235,8 +237,7 @@ class Solver(Stepper):
             if cancelled is not None and cancelled():
                 raise Cancelled
             if drift > DRIFT:
-                if not grid.sort():
-                    self.check_inside(grid.state().x)
+                self.sort(grid)
                 drift = 0.0
             longest = min(usual, FASTEST * h / max(speed + push * usual, 1e-12))
             if longest < usual / RUNAWAY and speed > outside:
@@ -270,7 +271,8 @@ class Solver(Stepper):
         pin_velocity = np.zeros((len(self._pins), 3), np.float32)
         if pin_targets is not None:
             pin_velocity = ((pin_targets - self.state.x[self._pins]) / seconds).astype(np.float32)
-        low, high = self.state.x[:n].min(axis=0), self.state.x[:n].max(axis=0)
+        there = np.delete(self.state.x[:n], outside_of(self.state.x[:n], self.domain), axis=0)
+        low, high = there.min(axis=0), there.max(axis=0)
         outside = 0.0
         for moving in self.colliders:
             moving.enter(self.frame, seconds, low, high)
@@ -284,11 +286,22 @@ class Solver(Stepper):
         grid.enter(self.state, self.frame, seconds, pin_velocity)
         return max(speed, outside), outside, push
 
+    def sort(self, grid: Grid) -> None:
+        """Sort the particles of a grid, and see how many are left."""
+        lost = grid.sort()
+        if lost and (len(self._pins) or lost > _MOST_LOST * len(self.body.points)):
+            self._check_left(grid.state().x)
+
     def leave(self, grid: Grid) -> None:
         """End the frame: what is on the grid is the state."""
         self.state = grid.state()
         self._rejoin()
-        self.check_inside(self.state.x)
+        self._check_left(self.state.x)
+        self.state.v[outside_of(self.state.x, self.domain)] = 0
+
+    @property
+    def lost(self) -> int:
+        return len(outside_of(self.points, self.domain))
 
     def ran_away(self, speed: float) -> UsageError:
         """The error of matter that is too fast, m/s."""
@@ -327,9 +340,17 @@ class Solver(Stepper):
             state.x[n + lost] = at + (state.x[n + lost] - at) * (self._reach[lost] / distance[lost])[:, None]
             state.v[n + lost] = state.v[nearest[lost]]
 
-    def check_inside(self, x: Array) -> None:
+    def _check_left(self, x: Array) -> None:
+        """Refuse what cannot be gone on with: pins outside of the domain, most particles there, or no finite place."""
+        lost = outside_of(x, self.domain)
+        if len(lost):
+            most = np.count_nonzero(lost < len(self.body.points)) > _MOST_LOST * len(self.body.points)
+            if most or np.isin(lost, self._pins).any() or not np.isfinite(x[lost]).all():
+                self._check_inside(x)
+
+    def _check_inside(self, x: Array) -> None:
         """Refuse particles outside of the domain."""
-        lost = outside(x, self.domain)
+        lost = outside_of(x, self.domain)
         if len(lost):
             where = x[lost[0]]
             finite = bool(np.isfinite(where).all())

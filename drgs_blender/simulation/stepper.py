@@ -50,6 +50,11 @@ class Stepper(ABC):
         return None
 
     @property
+    def lost(self) -> int:
+        """Particles that have left the domain, and stay where they left it."""
+        return 0
+
+    @property
     @abstractmethod
     def points(self) -> Array:
         """(n, 3) float64 points of the body now, world."""
@@ -122,7 +127,7 @@ class Stepper(ABC):
         Cancelled
             The state is then that at the beginning of the frame.
         UsageError
-            Matter left the domain or its motion ran away: with frame, cause and remedy.
+            Most of the matter left the domain, or its motion ran away: with frame, cause and remedy.
         """
         before = self.arrays()
         try:

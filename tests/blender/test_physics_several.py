@@ -6,8 +6,9 @@ import time
 from types import SimpleNamespace
 
 import bpy
+import numpy as np
 import pytest
-from physics_scenes import FRAMES, PATIENCE, bake_job, begin_of, cache_of, settings_export, world
+from physics_scenes import FRAMES, PATIENCE, bake_job, begin_of, cache_of, computed_last, settings_export, world
 from scenes import part, select
 
 
@@ -132,6 +133,72 @@ def test_a_renamed_object_keeps_its_cache(ball, scene):
     assert folders == ["Fireball", "Fireball_001"]
     bpy.data.objects.remove(other)
     assert settings_export.folder_of(ball) == before
+
+
+@pytest.mark.slow
+def test_another_blend_never_replaces_frames_and_goes_on_from_those_it_plays(body, scene, tmp_path):
+    """Two files of one folder, with an object of one name, as a copy and *Save As* make."""
+    bpy.ops.drgs.bake_physics()
+    bpy.ops.wm.save_mainfile()
+    first = cache_of(body)
+    before = {path: path.read_bytes() for path in first.folder.iterdir() if path.is_file()}
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene v2.blend"))
+    shown = world(body, FRAMES)
+    body.drgs.physics.frame_end = FRAMES + 1
+    bpy.ops.drgs.bake_physics()
+    second = cache_of(body)
+    assert second.folder == tmp_path / "drgs_cache" / "scene v2" / "ball"
+    assert computed_last(body) == 1, "the frames that it played are its own now"
+    np.testing.assert_array_equal(world(body, FRAMES), shown)
+    assert settings_export.played_elsewhere(body) is None
+    body.drgs.physics.density = 300
+    bpy.ops.drgs.bake_physics()
+    assert computed_last(body) == FRAMES
+    assert {path: path.read_bytes() for path in before} == before
+    # A copy that has not been baked plays the frames, which go with none but the file that baked them.
+    body.drgs.physics.frame_end = FRAMES
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "third.blend"))
+    (kept,) = second.folder.glob(f"frame_{FRAMES:06d}.drgp")
+    bpy.ops.drgs.free_physics()
+    assert kept.exists() and not body.modifiers
+    assert f"the frames in {second.folder} stay" in part("addon.messages").history[-1].text
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
+    again = bpy.data.objects["ball"]
+    select(again)
+    np.testing.assert_array_equal(world(again, FRAMES), shown)
+    bpy.ops.drgs.free_physics()
+    assert not first.folder.exists() and kept.exists()
+
+
+def test_a_chosen_folder_is_refused_to_another_blend_while_the_first_is_there(body, scene, tmp_path):
+    body.drgs.physics.folder, body.drgs.physics.frame_end = "//shared", 2
+    bpy.ops.drgs.bake_physics()
+    bpy.ops.wm.save_mainfile()
+    old = tmp_path / "scene.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"))
+    kept = cache_of(body)
+    with pytest.raises(RuntimeError, match=rf'"ball": would replace the frames of "ball" of {old}.*Choose another'):
+        bpy.ops.drgs.bake_physics()
+    bpy.ops.drgs.free_physics()
+    assert kept.frames() == [1, 2] and f'they are those of "ball" of {old}' in part("addon.messages").history[-1].text
+    old.unlink()  # renamed, or given up
+    assert bpy.ops.drgs.bake_physics() == {"FINISHED"}
+    bpy.ops.drgs.free_physics()
+    assert not kept.folder.exists()
+
+
+def test_every_blend_has_a_folder_of_caches_of_its_own(ball, tmp_path):
+    """Also one that is named as the backups that Blender makes, and the objects of a library."""
+    folders = []
+    for name in ("scene.blend", "scene.v2.blend", "scene.blend1"):
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / name))
+        folders.append(settings_export.folder_of(ball).relative_to(tmp_path).as_posix())
+    assert folders == [f"drgs_cache/{name}/ball" for name in ("scene", "scene.v2", "scene.blend1")]
+    bpy.ops.wm.read_homefile(use_empty=True)
+    (tmp_path / "shots").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shots" / "shot.blend"))
+    bpy.ops.wm.link(directory=f"{tmp_path}/scene.blend/Object/", filename="ball")
+    assert settings_export.folder_of(bpy.data.objects["ball"]) == tmp_path / folders[0]
 
 
 def test_frames_are_the_scenes_until_the_artist_chooses(ball, scene):

@@ -50,7 +50,7 @@ def number_particles(thread, stride, scratch, x, origin, scale, bx, by, bz, out)
     bx, by, bz : int
         `Domain.blocks`.
     out : tuple of array
-        Keys, numbers of the particles, and `found` (LOST is added to); written.
+        Keys, numbers of the particles, and `found` (LOST is added to); written. Those that are lost come last.
     """
     keys, order, found = out
     for p in range(thread, len(x), stride):
@@ -59,12 +59,13 @@ def number_particles(thread, stride, scratch, x, origin, scale, bx, by, bz, out)
         if block >= 0:
             cell = ((int(gx - 0.5) & 3) * 4 + (int(gy - 0.5) & 3)) * 4 + (int(gz - 0.5) & 3)
         else:
+            block = bx * by * bz  # after all others
             add_to(found, LOST, 1)
         keys[p] = block * 64 + cell
         order[p] = np.int32(p)
 
 
-def list_blocks(thread, stride, scratch, n, keys, out):  # type: ignore[no-untyped-def]
+def list_blocks(thread, stride, scratch, n, keys, count, out):  # type: ignore[no-untyped-def]
     """Blocks with particles, once each, in any order.
 
     Parameters
@@ -74,6 +75,8 @@ def list_blocks(thread, stride, scratch, n, keys, out):  # type: ignore[no-untyp
         Particles.
     keys : array
         Of `number_particles`, sorted.
+    count : int
+        Blocks of the domain.
     out : tuple of array
         `found`: OCCUPIED is added to, and BLOCKS on written.
     """
@@ -82,7 +85,7 @@ def list_blocks(thread, stride, scratch, n, keys, out):  # type: ignore[no-untyp
         first = True
         if p > 0:
             first = keys[p] >> 6 != keys[p - 1] >> 6
-        if first:
+        if first and keys[p] >> 6 < count:
             found[BLOCKS + add_to(found, OCCUPIED, 1)] = keys[p] >> 6
 
 
@@ -130,11 +133,12 @@ def find_home_blocks(thread, stride, scratch, n, keys, numbers, sizes, out):  # 
     n, keys, numbers, sizes : int or array
         As of `index_blocks`.
     out : tuple of array
-        Slot of each sorted particle, (n,) int32; written.
+        Slot of each sorted particle, (n,) int32; written. -1 of those that are lost.
     """
     (home,) = out
     for p in range(thread, n, stride):
-        home[p] = np.int32(first_of(numbers, sizes[0], keys[p] >> 6))
+        slot = first_of(numbers, sizes[0], keys[p] >> 6)
+        home[p] = np.int32(slot) if slot < sizes[0] else np.int32(-1)
 
 
 NUMBER = WarpKernel(number_particles, (), _NATIVES)

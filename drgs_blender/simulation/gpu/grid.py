@@ -113,9 +113,9 @@ class DeviceGrid(Grid):
         domain = scene.domain
         place = self._state["x"], tuple(domain.origin.tolist()), 1.0 / domain.spacing, *domain.blocks
         self._number = self.launcher.recorded(NUMBER, n, place, (self._keys, self._order, self._found))
-        self._list = self.launcher.recorded(LIST, n, (n, self._keys), (self._found,))
+        self._list = self.launcher.recorded(LIST, n, (n, self._keys, int(np.prod(domain.blocks))), (self._found,))
 
-    def sort(self) -> bool:
+    def sort(self) -> int:
         domain, found, n = self._scene.domain, self._found, len(self._order) // 2
         with self.launcher.failures("sorting particles"):
             found[:BLOCKS].zero_()
@@ -124,8 +124,6 @@ class DeviceGrid(Grid):
             warp().utils.radix_sort_pairs(self._keys, self._order, n, end_bit=bits.bit_length())
             self._list()
             head = found[: BLOCKS + min(n, _FEW)].numpy()
-            if head[LOST]:
-                return False
             count = int(head[OCCUPIED])
             head = head if count <= _FEW else found[: BLOCKS + count].numpy()
             active = around(head[BLOCKS : BLOCKS + count], domain.blocks)
@@ -135,7 +133,7 @@ class DeviceGrid(Grid):
             self._sizes.assign(np.array([len(active), *domain.blocks[1:]], np.int64))
             self._index()
             self._house()
-        return True
+        return int(head[LOST])
 
     def _take_blocks(self, count: int) -> None:
         """Memory for a number of active blocks, and the launches that work on it."""

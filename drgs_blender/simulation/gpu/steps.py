@@ -356,7 +356,7 @@ def move_particles(thread, stride, scratch, blocks, nodes, properties, pins, gri
     ----------
     thread, stride, scratch : int64 or tuple
     blocks : tuple of array
-        Order of the particles, slot of each in that order, places of the slots and slots around them.
+        Order of the particles, slot of each in that order (-1: it stays), places of the slots and slots around them.
     nodes : (slots * 64, 4) float32 array
         Velocity (m/s) and mass (kg).
     properties : tuple
@@ -382,6 +382,8 @@ def move_particles(thread, stride, scratch, blocks, nodes, properties, pins, gri
     top = ZERO
     for at in range(thread, len(mass), stride):
         p, b = np.int64(order[at]), np.int64(home[at])
+        if b < 0:
+            continue
         i, j, k, fx, fy, fz = cell_of(x, p, origin, scale)
         i, j, k = i - 4 * active[b, 0] + 1, j - 4 * active[b, 1] + 1, k - 4 * active[b, 2] + 1
         wx, wy, wz = weights_of(fx), weights_of(fy), weights_of(fz)
