@@ -115,8 +115,10 @@ class Grid(ABC):
 
     @abstractmethod
     def sort(self) -> int:
-        """Sort particles; how many are outside of the domain or not finite: these stay where they are, and no pin may
-        be one of them."""
+        """Sort particles; how many are outside of the domain or not finite.
+
+        These stay where they are, and no pin may be one of them.
+        """
 
     @abstractmethod
     def step(self, times: Sequence[tuple[float, float]], limits: Limits) -> list[float]:

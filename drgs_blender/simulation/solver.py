@@ -271,6 +271,7 @@ class Solver(Stepper):
         pin_velocity = np.zeros((len(self._pins), 3), np.float32)
         if pin_targets is not None:
             pin_velocity = ((pin_targets - self.state.x[self._pins]) / seconds).astype(np.float32)
+        self._check_left(self.state.x)
         there = np.delete(self.state.x[:n], outside_of(self.state.x[:n], self.domain), axis=0)
         low, high = there.min(axis=0), there.max(axis=0)
         outside = 0.0

@@ -266,6 +266,26 @@ def test_what_goes_wrong_is_said_as_the_processor_says_it(launcher: Launcher) ->
         assert words in said[1]
 
 
+def test_drops_that_leave_the_domain_stay_as_on_the_processor(launcher: Launcher) -> None:
+    drop = np.add(lattice((0.05, 0.05, 0.05), H / 2), [1.2, 0.1, 0.1])
+    points = np.concatenate([lattice((0.3, 0.25, 0.25), H / 2), drop])
+    velocity = np.where(points[:, :1] > 1, [15.0, 0, 0], np.sin(9 * points[:, [1, 2, 0]]))
+    here, there = (
+        solver_of(points, H, "water", velocity=velocity, markers=points[::5], low=(-1,) * 3, high=(1.5,) * 3)
+        for _ in range(2)
+    )
+    on(there, launcher)
+    for solver in (here, there):
+        for _ in range(2):
+            solver.advance(FRAME)
+    assert here.lost == there.lost == len(drop)
+    assert np.abs(here.points - there.points).max() < 1e-2 * H
+    gone = there.points[:, 0] >= there.domain.high[0]
+    before = there.points[gone].copy()
+    there.advance(FRAME)
+    np.testing.assert_array_equal(there.points[gone], before)
+
+
 def test_a_caller_may_stop_within_a_frame(launcher: Launcher) -> None:
     solver = on(body(youngs_modulus=1e6), launcher)
     before, asked = solver.state.x.copy(), []

@@ -385,6 +385,30 @@ def test_errors_of_a_frame_name_the_body():
         job.solver.advance(FRAME)
 
 
+def test_drops_of_one_body_that_leave_the_domain_stop_none_and_are_told_once(tmp_path, caplog):
+    """And it goes on with the same bits."""
+    domain = {"domain": [[-0.5, -0.5, -0.1], [0.5, 0.5, 0.75]]}
+
+    def wet(folder, last):
+        scene = bodies(
+            domain | {"material": "water", "velocity": [3, 0, 0], "spin": [0, 9, 0]}, domain | {"velocity": [0, 0, 0]}
+        )
+        job = prepare_coupled(MESHES, parse_coupled(scene | {"last": last}, out=folder))
+        bake_coupled(job, caches_of(job))
+        return job
+
+    job = wet(tmp_path / "one", 7)
+    lost = [solver.lost for solver in job.solver.bodies]
+    assert 0 < lost[0] < len(job.jobs[0].filling.points) / 2 and not lost[1]
+    told = [record.getMessage() for record in caplog.records if "left the domain" in record.getMessage()]
+    assert len(told) == 1 and told[0].startswith(
+        f'body "top": {lost[0]} of {len(job.jobs[0].filling.points)} particles'
+    )
+    for last in (3, 5, 7):
+        wet(tmp_path / "parts", last)
+    assert content(tmp_path / "parts") == content(tmp_path / "one")
+
+
 def test_three_bodies_of_other_matter_keep_their_momentum():
     h = 0.1
     domain = aligned((-0.6, -0.6, -0.6), (2.2, 1, 1), h)
