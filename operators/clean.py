@@ -11,7 +11,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty
 
 from ..addon import assets, mesh_arrays, proxies, surfel_points
 from ..addon.export.face_match import match_faces
-from ..addon.viewport.surfels import posed_centres
+from ..addon.viewport.surfels import evaluated_vertices, places_of
 from ..drgs_blender.core.asset import Asset
 from ..drgs_blender.core.asset.part import taken
 from ..drgs_blender.core.bare_faces import bare_faces
@@ -143,7 +143,19 @@ class DRGS_OT_select_surfels(DrgsOperator, bpy.types.Operator):
         return found[rows]
 
 
-class DRGS_OT_finish_surfels(DrgsOperator, bpy.types.Operator):
+class _Removing(DrgsOperator):
+    """Removes surfels."""
+
+    def tell_proxy(self, obj: bpy.types.Object, asset: Asset) -> None:
+        """A proxy, which may be rigged, is not cut."""
+        if proxies.is_proxy(obj.data, asset):
+            self.warn(
+                f'"{obj.name}": its proxy still encloses the surfels that are removed, and physics fills all of it. To '
+                "have another, delete its vertices in Edit Mode, then choose Add Proxy Mesh"
+            )
+
+
+class DRGS_OT_finish_surfels(_Removing, bpy.types.Operator):
     """End the editing of surfels: those that were deleted are not rendered any more, and faces that only they covered
     go, too"""
 
@@ -205,8 +217,10 @@ class DRGS_OT_finish_surfels(DrgsOperator, bpy.types.Operator):
             self.warn(f'"{obj.name}": {foreign:,} of the points are none of its surfels; they are left out')
         if removed is None:
             obj.drgs.surfel_points = None
-        elif self.use_faces and len(new := np.setdiff1d(removed, before)) and len(obj.data.polygons):
-            delete_vertices_or_faces(obj, faces=faces_of(obj, asset, new))
+        elif len(new := np.setdiff1d(removed, before)):
+            self.tell_proxy(obj, asset)
+            if self.use_faces and len(obj.data.polygons):
+                delete_vertices_or_faces(obj, faces=faces_of(obj, asset, new))
         obj.update_tag()
         gone = 0 if removed is None else len(removed)
         self.report({"INFO"}, f"{gone:,} of {len(asset.surfels):,} surfels are removed")
@@ -229,7 +243,7 @@ class DRGS_OT_restore_surfels(DrgsOperator, selection.ObjectMode, bpy.types.Oper
         return {"FINISHED"}
 
 
-class DRGS_OT_crop(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
+class DRGS_OT_crop(_Removing, selection.ObjectMode, bpy.types.Operator):
     """Delete what of the selected DR-GS objects lies outside the box around another selected object"""
 
     bl_idname = "drgs.crop"
@@ -264,6 +278,8 @@ class DRGS_OT_crop(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
             bpy.data.meshes.remove(mesh)
             if not (left.all() and len(rows) == len(asset.surfels)):
                 obj.drgs.surfel_points = surfel_points.new_points(f"{obj.name} surfels", rows[left], places[left])
+            if not left.all():
+                self.tell_proxy(obj, asset)
             if gone.any() and len(gone) == len(obj.data.vertices) and len(asset.mesh.vertices):
                 delete_vertices_or_faces(obj, vertices=gone)
             obj.update_tag()
@@ -300,29 +316,15 @@ def points_of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.type
     It keeps which surfels were removed before, until the editing is finished.
     """
     asset, known = assets.load(assets.file_of(obj)), obj.drgs.surfel_points
-    count, left = len(asset.surfels), surfel_points.left_of(obj, asset)
-    rows = np.arange(count, dtype=np.int32) if left is None else left
     unfinished = surfel_points.is_unfinished(obj)
-    vertices, shown = evaluated_vertices(obj, depsgraph), obj.evaluated_get(depsgraph).data
-    proxy = proxies.read(shown) if proxies.is_proxy(shown, asset) else None
-    own = mesh_arrays.source_rows(obj.data, asset.mesh)
-    if own is not None and len(own) == len(vertices):  # what was deleted stays where it was
-        posed = asset.mesh.vertices.copy()
-        posed[own[own >= 0]] = vertices[own >= 0]
-        vertices = posed
-    places = (posed_centres(asset, vertices) if proxy is None else proxies.carried(asset.surfels.centre, proxy))[rows]
+    rows, places = places_of(obj, depsgraph)
     obj.drgs.surfel_points = mesh = surfel_points.new_points(f"{obj.name} surfels", rows, places)
-    before = known[surfel_points.SURFEL] if known is not None and unfinished else surfel_points.lacking(rows, count)
+    removed = surfel_points.lacking(rows, len(asset.surfels))
+    before = known[surfel_points.SURFEL] if known is not None and unfinished else removed
     mesh[surfel_points.SURFEL] = before.tolist() if isinstance(before, np.ndarray) else list(before)
     if known is not None and not known.users:
         bpy.data.meshes.remove(known)
     return mesh
-
-
-def evaluated_vertices(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Array:
-    """(n, 3) float32 object space, as modifiers move them; where these change their number, of the mesh itself."""
-    moved = mesh_arrays.read_vertices(obj.evaluated_get(depsgraph).data)
-    return moved if len(moved) == len(obj.data.vertices) else mesh_arrays.read_vertices(obj.data)
 
 
 def in_box(box: bpy.types.Object, obj: bpy.types.Object, places: Array) -> Array:

@@ -8,8 +8,9 @@ import bpy
 import numpy as np
 from bpy.props import IntProperty
 
-from ..addon import assets, mesh_arrays, proxies
+from ..addon import assets, mesh_arrays, proxies, surfel_points
 from ..drgs_blender.core.asset import Surfels
+from ..drgs_blender.core.asset.part import taken
 from ..drgs_blender.core.errors import UsageError
 from . import selection
 from .base import DrgsOperator
@@ -61,7 +62,8 @@ def _without_mesh(objects: list[bpy.types.Object]) -> list[bpy.types.Object]:
         if len(obj.data.vertices):
             own = len(assets.load(assets.file_of(obj)).mesh.vertices)
             problem = "has a mesh that can be bent itself" if own else "has a proxy already"
-            raise UsageError(f'Object "{obj.name}"', problem, "Choose a capture without a mesh")
+            remedy = "Choose a capture without a mesh" + ("" if own else ", or delete its vertices in Edit Mode before")
+            raise UsageError(f'Object "{obj.name}"', problem, remedy)
     return objects
 
 
@@ -81,7 +83,7 @@ def shape_of(proxy: bpy.types.Object, obj: bpy.types.Object, context: bpy.types.
     world = selection.in_world(proxy, mesh_arrays.read_vertices(shape))
     into = np.array(obj.matrix_world.inverted(), np.float64)
     vertices = world @ into[:3, :3].T + into[:3, 3]
-    centre = assets.load(assets.file_of(obj)).surfels.centre
+    centre = left_surfels(obj).centre
     size = float(np.ptp(centre, axis=0).max())
     if (vertices.min(axis=0) > centre.max(axis=0) + size).any() or (
         vertices.max(axis=0) < centre.min(axis=0) - size
@@ -90,9 +92,16 @@ def shape_of(proxy: bpy.types.Object, obj: bpy.types.Object, context: bpy.types.
     return vertices, triangles
 
 
+def left_surfels(obj: bpy.types.Object) -> Surfels:
+    """The surfels of its asset that an object has, as they were captured."""
+    asset = assets.load(assets.file_of(obj))
+    left = surfel_points.left_of(obj, asset)
+    return asset.surfels if left is None else taken(asset.surfels, left)
+
+
 def hull_of(context: bpy.types.Context, obj: bpy.types.Object, faces: int) -> tuple[Array, Array]:
-    """A closed mesh of about `faces` triangles around all surfels of an object, in its space, as `shape_of`."""
-    surfels = assets.load(assets.file_of(obj)).surfels
+    """A closed mesh of about `faces` triangles around all surfels that an object has, in its space, as `shape_of`."""
+    surfels = left_surfels(obj)
     if not len(surfels):
         raise UsageError(f'Object "{obj.name}"', "has no surfels", "Choose another")
     side = max(float(np.linalg.norm(np.ptp(surfels.centre, axis=0))) / _CELLS, 1e-6)

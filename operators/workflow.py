@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import product
+
 import bpy
 from mathutils import Matrix, Vector
 
 from ..addon import assets
+from ..addon.viewport.surfels import places_of
 from ..addon.workflow import poser_of, target
-from ..drgs_blender.core.errors import UsageError
+from ..drgs_blender.core.errors import AssetError, UsageError
 from . import selection
 from .base import DrgsOperator
 
@@ -100,14 +104,25 @@ def frame(context: bpy.types.Context, camera: bpy.types.Object, objects: list[bp
     """Put `camera` in front (-Y) of `objects` so that they fill its picture."""
     camera.rotation_euler = (1.5707963, 0, 0)
     context.view_layer.update()
-    corners = [o.matrix_world @ Vector(c) for o in objects for c in o.bound_box]
+    depsgraph = context.evaluated_depsgraph_get()
+    corners = [o.matrix_world @ Vector(c) for o in objects for c in _box_of(o, depsgraph)]
     if not corners:
         camera.location = (0, -5, 0)
         return
-    depsgraph = context.evaluated_depsgraph_get()
     camera.location, _ = camera.camera_fit_coords(depsgraph, [x for c in corners for x in c])
     middle = sum(corners, Vector()) / len(corners)
     camera.location = middle + (camera.location - middle) * 1.1
+
+
+def _box_of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Iterable[Iterable[float]]:
+    """Corners of the box around an object, its space; of one without a mesh around its surfels, as they are posed."""
+    try:
+        if len(assets.load(assets.file_of(obj)).mesh.vertices):
+            return obj.bound_box
+        places = places_of(obj, depsgraph)[1]
+    except AssetError:  # reported when it is rendered
+        return obj.bound_box
+    return product(*zip(places.min(axis=0), places.max(axis=0))) if len(places) else ()
 
 
 class DRGS_OT_show_sidebar(DrgsOperator, bpy.types.Operator):

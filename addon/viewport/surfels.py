@@ -68,6 +68,34 @@ def posed_centres(asset: Asset, vertices: Array, rows: Array | slice = slice(Non
     return np.ascontiguousarray(found, np.float32)
 
 
+def places_of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[Array, Array]:
+    """(n,) int32 surfels of its asset that an object has, and (n, 3) float32 where they are as it is posed, its space.
+
+    Raises
+    ------
+    AssetError
+        As of `surfel_points.left_of`.
+    """
+    asset = assets.load(assets.file_of(obj))
+    left = surfel_points.left_of(obj, asset)
+    rows = np.arange(len(asset.surfels), dtype=np.int32) if left is None else left
+    vertices, shown = evaluated_vertices(obj, depsgraph), obj.evaluated_get(depsgraph).data
+    proxy = proxies.read(shown) if proxies.is_proxy(shown, asset) else None
+    own = mesh_arrays.source_rows(obj.data, asset.mesh)
+    if own is not None and len(own) == len(vertices):  # what was deleted stays where it was
+        posed = asset.mesh.vertices.copy()
+        posed[own[own >= 0]] = vertices[own >= 0]
+        vertices = posed
+    places = posed_centres(asset, vertices) if proxy is None else proxies.carried(asset.surfels.centre, proxy)
+    return rows, places[rows]
+
+
+def evaluated_vertices(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Array:
+    """(n, 3) float32 object space, as modifiers move them; where these change their number, of the mesh itself."""
+    moved = mesh_arrays.read_vertices(obj.evaluated_get(depsgraph).data)
+    return moved if len(moved) == len(obj.data.vertices) else mesh_arrays.read_vertices(obj.data)
+
+
 def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
     """Draw the surfels of all visible DR-GS objects, no more than the scene's limit."""
     region, rv3d = context.region, context.region_data

@@ -8,7 +8,7 @@ from math import radians
 import bpy
 import numpy as np
 import pytest
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 from scenes import armature_object, asset_of, mesh_object, new_world, part, read_exr, select, sphere
 
 pytestmark = pytest.mark.blender_api
@@ -133,7 +133,7 @@ def test_what_has_a_mesh_or_a_proxy_is_refused(ball, cloud):
         bpy.ops.drgs.add_proxy()
     select(cloud)
     add_proxy()
-    with pytest.raises(RuntimeError, match="has a proxy already"):
+    with pytest.raises(RuntimeError, match=r"has a proxy already.*delete its vertices in Edit Mode"):
         bpy.ops.drgs.add_proxy()
 
 
@@ -347,6 +347,70 @@ def test_surfels_are_edited_and_cropped_where_they_are_seen(cloud, scene):
     bpy.ops.object.mode_set(mode="OBJECT")
     shown = part("addon.mesh_arrays").read_vertices(bpy.context.object.data)
     np.testing.assert_allclose(shown, centres(cloud)[kept] + (0, 0, 2), atol=1e-4)
+
+
+def crop_to_upper_half(cloud, scene):
+    box = bpy.data.objects.new("Box", None)
+    scene.collection.objects.link(box)
+    box.empty_display_type, box.matrix_world = "CUBE", cloud.matrix_world @ Matrix.Translation((0, 0, 1))
+    bpy.context.view_layer.update()
+    select(box, cloud)
+    assert bpy.ops.drgs.crop() == {"FINISHED"}
+    select(cloud)
+
+
+def test_a_proxy_and_its_matter_are_of_the_surfels_that_are_left(cloud, scene):
+    select(cloud)
+    add_proxy()
+    whole = part("addon.mesh_arrays").read_vertices(cloud.data)
+    assert whole[:, 2].min() < -0.9
+    crop_to_upper_half(cloud, scene)
+    told = part("addon.messages").history[-1]
+    assert told.level == "WARNING" and '"cloud": its proxy still encloses the surfels that are removed' in told.text
+    # What it says to do.
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="SELECT")
+    bpy.ops.mesh.delete(type="VERT")
+    bpy.ops.object.mode_set(mode="OBJECT")
+    add_proxy()
+    found = part("addon.mesh_arrays").read_vertices(cloud.data)
+    asset = part("addon.assets").load(part("addon.assets").file_of(cloud))
+    reach = 1.5 * asset.surfels.scale.max() + 4 * 2 * 3**0.5 / 64
+    assert max(-reach, 0.7 * whole[:, 2].min()) < found[:, 2].min() < 0.05 and found[:, 2].max() > 0.95
+    cloud.drgs.physics.use, cloud.drgs.physics.resolution = True, 12
+    bpy.ops.drgs.show_particles()
+    points = part("addon.physics.particle_display").of(cloud).points
+    assert len(points) > 100 and points[:, 2].min() > found[:, 2].min()
+
+
+def test_a_mesh_of_the_artist_is_held_against_what_is_left(cloud, scene):
+    crop_to_upper_half(cloud, scene)
+    shape = mesh_object("Shape", np.multiply(sphere()[0], 0.3), sphere()[1])
+    shape.matrix_world = cloud.matrix_world @ Matrix.Translation((0, 0, -2.5))
+    select(shape, cloud)
+    with pytest.raises(RuntimeError, match='"Shape": is not at "cloud"'):
+        bpy.ops.drgs.add_proxy()
+
+
+@pytest.mark.parametrize("proxy", [False, True])
+def test_a_new_camera_sees_the_surfels_that_are_left_as_they_are_posed(cloud, scene, proxy):
+    from bpy_extras.object_utils import world_to_camera_view
+
+    select(cloud)
+    shift = 2.0 * proxy
+    if proxy:
+        add_proxy()
+        moved_up(cloud, shift)
+    else:
+        crop_to_upper_half(cloud, scene)
+    kept = part("addon.surfel_points").left_of(cloud, part("addon.assets").load(part("addon.assets").file_of(cloud)))
+    places = centres(cloud)[slice(None) if kept is None else kept] + (0, 0, shift)
+    bpy.data.objects.remove(scene.camera)
+    assert bpy.ops.drgs.add_camera() == {"FINISHED"}
+    bpy.context.view_layer.update()
+    seen = np.array([world_to_camera_view(scene, scene.camera, cloud.matrix_world @ Vector(at)) for at in places])
+    assert (seen[:, :2] > 0).all() and (seen[:, :2] < 1).all() and (seen[:, 2] > 0).all()
+    assert np.ptp(seen[:, :2], axis=0).max() > 0.6, "and nothing that is not there"
 
 
 def test_viewports_find_the_parts_of_what_is_left_once(cloud, export, monkeypatch):
