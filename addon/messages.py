@@ -13,6 +13,8 @@ from collections import deque
 from collections.abc import Callable, Collection, Container, Hashable
 from typing import NamedTuple
 
+from ..drgs_blender.core.errors import without_numbers
+
 log = logging.getLogger("drgs")
 
 MAX_MESSAGES = 50
@@ -33,12 +35,15 @@ history: deque[Message] = deque(maxlen=MAX_MESSAGES)
 def note(level: str, text: str, logged: bool = True) -> None:
     """Remember a message; a repetition of the latest one, as every redraw has it, only renews its time.
 
-    Not `logged` is one that Blender prints as well, by a report.
+    So does one of a warning of before, as a loop of renders has it. Not `logged` is one that Blender prints as well, by a report.
     """
     if history and history[-1][1:] == (level, text):
         history.pop()
     elif logged:
         log.log(getattr(logging, level), text)
+    for message in [m for m in list(history) if m[1:] == (level, text) and level == "WARNING"]:
+        with contextlib.suppress(ValueError):  # another thread was quicker
+            history.remove(message)
     history.append(Message(time.time(), level, text))
 
 
@@ -101,6 +106,8 @@ def end_picture() -> None:
 class Warnings:
     """Collects the warnings of one export; every text once, and none that is `known`, to which they are added.
 
+    Of an animation, what is said again of another number of things is known.
+
     Parameters
     ----------
     report : prints a warning, in place of the log
@@ -110,9 +117,10 @@ class Warnings:
         self.texts: list[str] = []
         self._report = report
         self._known = set() if known is None else known
+        self._earlier = set(map(without_numbers, self._known))
 
     def __call__(self, text: str) -> None:
-        if text not in self._known:
+        if text not in self._known and without_numbers(text) not in self._earlier:
             self._known.add(text)
             self.texts.append(text)
             note("WARNING", text, logged=self._report is None)

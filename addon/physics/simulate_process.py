@@ -29,6 +29,8 @@ _WAIT, _PATIENCE = 0.2, 5.0
 #: Prefix of the messages in the program's log.
 _PREFIX = "drgs: "
 _COUNTS = re.compile(r"(\d+) particles.*at least (\d+) time steps")
+#: Who is meant, of several that are simulated together.
+_BODY = re.compile(r'body "([^"]+)"')
 #: A line while kernels are compiled.
 _PREPARING = re.compile(r'DRGS_PROGRESS part=([\d.]+) phase="([^"]*)"')
 
@@ -47,6 +49,12 @@ def ending() -> bool:
         elif time.monotonic() > until:
             process.kill()
     return bool(_ending)
+
+
+def _subject_of(line: str, subject: str) -> str:
+    """Of several objects that are simulated, the one that a line is about."""
+    named = set(_BODY.findall(line))
+    return f'Object "{named.pop()}"' if len(named) == 1 else subject
 
 
 def _close_input(process: subprocess.Popen[bytes]) -> None:
@@ -159,10 +167,12 @@ class SimulateProcess:
         code = self._process.wait()
         _close_input(self._process)
         if code == 0:
-            return [f"{subject}: {self._in_words(line.removeprefix(_PREFIX))}" for line in lines]
+            told = (self._in_words(line.removeprefix(_PREFIX)) for line in lines)
+            return [f"{_subject_of(line, subject)}: {line}" for line in told]
         reported = next((line for line in reversed(lines) if line.startswith(_PREFIX)), "")
         if reported and code != EXIT_TERMINATED:
-            raise AssetError(subject, self._in_words(reported.removeprefix(_PREFIX)).rstrip("."), held)
+            line = self._in_words(reported.removeprefix(_PREFIX)).rstrip(".")
+            raise AssetError(_subject_of(line, subject), line, held)
         if code == EXIT_CANNOT_WRITE:  # nor could its log
             remedy = "Free some space or choose another folder, and bake again"
             raise WriteError(f"{subject}, {self._folder}", "cannot be written", f"{remedy}. {held}".rstrip(". "))

@@ -22,7 +22,7 @@ import numpy as np
 from ..core import cryptomatte
 from ..core.asset import Asset
 from ..core.asset.model import Mesh
-from ..core.errors import UsageError
+from ..core.errors import UsageError, without_numbers
 from ..core.frame import Camera, Frame, Inside, ObjectState, Particles, ProxyMesh, RenderSettings, World
 from ..core.frame_sequences import frame_path
 from ..core.loading import many_imports
@@ -163,7 +163,7 @@ def run(args: argparse.Namespace) -> int:
         args.asset.stem, key, tear=tear, grain=grain, captured_colours=args.captured, inside=args.inside
     )
     carrier = _carrier(args, asset)
-    warned = False
+    warned, told = False, set[str]()
     for number, give_pose in poses:
         vertices, particles = give_pose()
         if vertices is not None and args.vertices and carrier is None:
@@ -190,7 +190,9 @@ def run(args: argparse.Namespace) -> int:
         with FractionBar(args, "rendering") as progress, interruptible() as stopped:
             picture = session.render(frame, progress, stopped)
         for warning in picture.warnings:
-            logger.warning("%s", warning)
+            if without_numbers(warning) not in told:
+                logger.warning("%s", warning)
+        told.update(map(without_numbers, picture.warnings))
         logger.info("frame %d rendered in %.2f s", number, time.perf_counter() - started)
         path = frame_path(args.out, number)
         if path.suffix.lower() == ".png":

@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..core.errors import AssetError, EngineError, UsageError
+from ..core.errors import AssetError, EngineError, UsageError, without_numbers
 from ..core.frame_sequences import frame_path
 from ..core.phases import is_preparing
 from . import sampling, session_link
@@ -119,9 +119,9 @@ def render(args: argparse.Namespace, machine: Machine) -> int:
     ):
 
         def note(texts: list[str]) -> None:
-            for text in sorted(set(texts) - noted):
+            for text in sorted(text for text in set(texts) if without_numbers(text) not in noted):
                 lines.note(text)
-            noted.update(texts)
+            noted.update(map(without_numbers, texts))
 
         for shot in evaluated:
             note(shot.warnings)

@@ -5,6 +5,7 @@ The ``exit_code`` of a class is what ``drgs`` returns to the shell or the farm w
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from unicodedata import category
 
@@ -117,10 +118,17 @@ class Cancelled(Exception):
     """The user cancelled; not an error."""
 
 
+_NAMES_AND_NUMBERS = re.compile(r'"[^"]*"|(?<![\w./\\-])\d+(?:[.,]\d+)*(?![\w/\\-]|\.\w)')
 #: Name -> class, for errors that cross the process boundary.
 ERROR_CLASSES: dict[str, type[DrgsError]] = {
     c.__name__: c for c in (DrgsError, UsageError, AssetError, DeviceError, WriteError, EngineError, VersionError)
 }
+
+
+def without_numbers(text: str) -> str:
+    """A message but for its counts, so that it is told once of all frames; names, before a colon or quoted, stay."""
+    name, colon, rest = text.partition(": ") if ": " in text else ("", "", text)
+    return name + colon + _NAMES_AND_NUMBERS.sub(lambda found: found[0] if found[0][0] == '"' else "#", rest)
 
 
 def first_of(names: Sequence[str]) -> str:

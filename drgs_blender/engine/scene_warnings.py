@@ -17,15 +17,16 @@ def scene_warnings(cache: SceneCache, passes: Collection[str] = ()) -> list[str]
     found = []
     if not cache.objects and not cache.meshes:
         found.append("the frame has no DR-GS object; the picture shows the world alone")
-    hidden_counts = [item.hidden_count for item in cache.objects] + [0] * len(cache.meshes)
-    for hidden, fault in zip(hidden_counts, cache.scene.faults):  # behind these are those that glow, once more
+    # Of a skin, which is made anew in every frame, nothing can be mended. Behind these are those that glow, once more.
+    known = [(item.hidden_count, item.skin is not None) for item in cache.objects] + [(0, False)] * len(cache.meshes)
+    for (hidden, skin), fault in zip(known, cache.scene.faults):
         if fault.bad_vertices:
             surfels = f" and {hidden} surfels" if hidden else ""
             found.append(
                 f"{fault.name}: {fault.bad_vertices} vertices are not finite or too far away; "
                 f"{fault.bad_faces} faces{surfels} are left out"
             )
-        if fault.empty_faces:
+        if fault.empty_faces and not skin:
             found.append(f"{fault.name}: {fault.empty_faces} faces have no area; light passes through them")
         if fault.bad_instances:
             found.append(

@@ -238,6 +238,7 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh", domain: Domain |
         pinned,
         velocity,
         None if domain is None else _way_out(points, vertices, faces),
+        "the body" if domain is None else f'body "{name}"',
     )
     carried = None
     if not rides:

@@ -59,6 +59,8 @@ class Body:
         m/s, at the start.
     way_out : (n, 3) array, optional
         From points to the nearest place of the body's surface, metres, for its contact with others.
+    name : str
+        In messages.
     """
 
     points: Array
@@ -68,6 +70,7 @@ class Body:
     pinned: Array | None = None
     velocity: Array | Sequence[float] = (0.0, 0.0, 0.0)
     way_out: Array | None = None
+    name: str = "the body"
 
 
 class Solver(Stepper):
@@ -180,7 +183,7 @@ class Solver(Stepper):
         if not len(self.body.points):
             raise UsageError("simulation", "has no particles", "Fill the mesh first")
         self._check_inside(self.state.x)
-        check_apart(self.body.points, self.domain.spacing, self.colliders, self.planes)
+        check_apart(self.body.points, self.domain.spacing, self.colliders, self.planes, self.body.name)
 
     @property
     def launcher(self) -> Launcher | None:

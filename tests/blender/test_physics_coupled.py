@@ -109,6 +109,13 @@ def test_coupled_objects_push_each_other_into_a_cache_each(pair, scene):
     assert not any(cache_of(obj).frames() or obj.modifiers for obj in pair)
 
 
+def test_a_line_about_one_of_several_bodies_is_told_of_that_one():
+    subject_of = part("addon.physics.simulate_process")._subject_of
+    both = 'Objects "A", "B"'
+    assert subject_of('floor or wall: overlaps body "B" at the start', both) == 'Object "B"'
+    assert subject_of('body "A" touches body "B"', both) == subject_of("device cuda: no", both) == both
+
+
 @pytest.mark.slow
 def test_a_coupled_bake_is_cancelled_and_goes_on(pair, scene):
     lower, upper = pair

@@ -44,6 +44,30 @@ def test_a_warning_of_one_frame_of_an_animation_stays(scene, ball):
     assert warned("nothing lights the scene")
 
 
+def test_what_holds_of_a_whole_animation_is_told_once(scene, ball):
+    """Also where it is of another number of things in every frame; of other objects it is another message."""
+    messages = part("addon.messages")
+    messages.clear()
+    messages.begin_render()
+    printed = []
+    for frame in range(3):
+        warn = messages.Warnings(messages.warned, printed.append)
+        for text in (f"ball: {frame + 7} faces have no area", f"Cube.00{frame}: 2 faces", f'"A 1": image {frame}.png'):
+            warn(text)
+        messages.end_picture()
+    told = ["ball: 7 faces have no area", *(f"Cube.00{i}: 2 faces" for i in range(3))]
+    told += [f'"A 1": image {i}.png' for i in range(3)]
+    assert sorted(printed) == sorted(warned()) == sorted(told)
+    # A picture by itself says all that it has, and a loop of pictures leaves one line of each in the panel.
+    for _ in range(3):
+        messages.begin_render()
+        warn = messages.Warnings(messages.warned)
+        for text in ("ball: 3 images", "ball: 4 images", "ball: shown by its particles"):
+            warn(text)
+        messages.end_picture()
+        assert sorted(warned()) == ["ball: 3 images", "ball: 4 images", "ball: shown by its particles"]
+
+
 def test_a_viewport_takes_back_what_its_whole_picture_no_longer_says(monkeypatch):
     views, messages = part("addon.viewport.views"), part("addon.messages")
     monkeypatch.setattr(views.draw, "strip", lambda *_: None)

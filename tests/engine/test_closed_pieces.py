@@ -11,6 +11,7 @@ from pictures import assert_same_bits, fresh
 from drgs_blender.core.errors import AssetError
 from drgs_blender.core.frame import Inside, MotionStep, Particles, Pose
 from drgs_blender.deform.bonds import Bonds
+from drgs_blender.engine.scene_warnings import scene_warnings
 from drgs_blender.render.scene.ray_masks import CAMERA, ORDINARY, SHADOW, SURFELS
 from drgs_blender.render.scene.trace_mesh import mask_of
 from drgs_blender.simulation.fill import fill
@@ -169,6 +170,18 @@ def test_damaged_particles_are_refused_by_name(session, make_frame, filling):
         frame.objects[0].particles = given
         with pytest.raises(AssetError, match=frame.objects[0].name):
             session.render(frame)
+
+
+@pytest.mark.parametrize("skin", [False, True])
+def test_faces_without_area_are_told_of_what_can_be_mended(session, make_frame, filling, skin):
+    """A skin, which is made anew in every frame, has some of hundreds of thousands: counted here as if it had."""
+    frame = torn_frame(make_frame, filling, 0.0, None)
+    frame.objects[0].particles = replace(frame.objects[0].particles, skin=skin, surfels=False)
+    session.render(frame)
+    cache = session._scene_cache
+    cache.scene.faults[0].empty_faces = 4
+    told = [text for text in scene_warnings(cache) if "4 faces have no area" in text]
+    assert len(told) == (0 if skin else 1)
 
 
 @pytest.mark.parametrize("surface", ["mesh", "surfels"])

@@ -125,7 +125,8 @@ def test_torn_and_flowing_matter_is_shown_as_it_is_asked_for(relight, folder, tm
         header = Header("digest", len(rest), len(mesh.vertices), 1, 24.0, settings, tear=0.8, cells=given)
         cache.create(header, ParticleFrame(rest, still, mesh.vertices))
         lifted = [x + np.where(x[:, 2:] > 0, np.float32([[0, 0, 1.6]]), 0) for x in (rest, mesh.vertices)]
-        cache.write(1, ParticleFrame(lifted[0], still, lifted[1]))
+        for frame in (1, 2):
+            cache.write(frame, ParticleFrame(lifted[0], still, lifted[1]))
         return "--cache", str(cache.folder)
 
     def green(*options):
@@ -148,6 +149,8 @@ def test_torn_and_flowing_matter_is_shown_as_it_is_asked_for(relight, folder, tm
     assert np.ptp(flows[flows > 0]) < np.ptp(halves[halves > 0]), "boxes are as wide everywhere"
     np.testing.assert_array_equal(rows(*jelly, "--surface", "particles"), flows)
     capsys.readouterr()
+    relight("--frames", "1-2", "--samples", "1", *water, "--out", str(tmp_path / "##.exr"))
+    assert capsys.readouterr().err.count("surface of its particles") == 1, "once of all frames"
     rows(*water, "--surface", "mesh")
     assert "surface of its particles" not in capsys.readouterr().err
     rows(*bake("old", "elastic", None))

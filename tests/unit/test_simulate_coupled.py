@@ -378,6 +378,15 @@ def test_bodies_that_cannot_be_simulated_together_are_named(caplog):
     assert 'body "top": is 4.8 cells long' in caplog.text
 
 
+def test_the_body_that_overlaps_the_floor_is_named(caplog):
+    """Of a few particles, and of more than can be."""
+    prepare_coupled(MESHES, parse_coupled(bodies({}, {"floor": 0.01}), out=Path("x")))
+    (told,) = (text for text in caplog.messages if "floor or wall" in text)
+    assert 'overlaps body "pile" at the start' in told
+    with pytest.raises(UsageError, match=r'body "top", floor or wall: overlaps body "top" at the start'):
+        prepare_coupled(MESHES, parse_coupled(bodies({"floor": 0.5}, {}), out=Path("x")))
+
+
 def test_errors_of_a_frame_name_the_body():
     job = prepare_coupled(MESHES, parse_coupled(bodies({}, {"floor": None}), out=Path("x")))
     job.solver.bodies[1].state.x[:, 2] -= 50
