@@ -35,7 +35,8 @@ history: deque[Message] = deque(maxlen=MAX_MESSAGES)
 def note(level: str, text: str, logged: bool = True) -> None:
     """Remember a message; a repetition of the latest one, as every redraw has it, only renews its time.
 
-    So does one of a warning of before, as a loop of renders has it. Not `logged` is one that Blender prints as well, by a report.
+    So does one of an earlier warning, as a loop of renders has it. Not `logged` is one that Blender prints as well, by
+    a report.
     """
     if history and history[-1][1:] == (level, text):
         history.pop()
