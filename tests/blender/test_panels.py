@@ -5,6 +5,7 @@ In a window Blender only prints such errors, panel by panel, when somebody looks
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
@@ -203,6 +204,13 @@ def test_the_bake_button_says_of_how_many_objects_and_what_is_waited_for(scene, 
     texts.clear()
     draw(Panel([]), bpy.context)
     assert texts == [None, "Bake"]
+    # What a copy of a .blend plays of the first can be seen, and taken off.
+    elsewhere = Path(bpy.path.abspath("//drgs_cache/another/ball"))
+    part("addon.cache_playback").attach(bpy.context.active_object, elsewhere / "mesh.pc2", 1)
+    texts.clear()
+    draw(Panel([]), bpy.context)
+    said = " ".join(text for text in texts if text)
+    assert "Plays the frames of" in said and said.endswith("Bake") and texts[-2:] == ["Bake", ""]
 
 
 def test_the_newest_problem_is_in_the_header_of_viewports(scene, monkeypatch):
