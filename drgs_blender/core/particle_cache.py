@@ -187,9 +187,8 @@ class ParticleCache:
     def clear(self) -> None:
         """Remove all files of a cache, the header first: what is left then is no cache."""
         self._remove(reversed(self.files()))
-        with suppress(OSError):
-            for stray in self.folder.glob(".*.drgp.*.tmp"):
-                stray.unlink(missing_ok=True)
+        with suppress(OSError, WriteError):
+            self._remove(self.folder.glob(".*.drgp.*.tmp"))
 
     @staticmethod
     def _remove(paths: Iterable[Path]) -> None:
@@ -383,8 +382,7 @@ def _write(path: Path, arrays: dict[str, Array]) -> None:
     """Arrays and, as the first member, their shapes and types."""
     kept = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     index = {name: [array.dtype.str, list(array.shape)] for name, array in kept.items()}
-    text = json.dumps(index, separators=(",", ":")).encode()
-    members = [("index.json", [memoryview(text)])]
+    members = [("index.json", [memoryview(json.dumps(index, separators=(",", ":")).encode())])]
     members += [(name, [array.reshape(-1).view(np.uint8).data]) for name, array in kept.items()]
     write_archive(path, members)
 
