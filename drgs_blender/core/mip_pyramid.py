@@ -82,10 +82,10 @@ class Pyramid:
 
     def __init__(self, image: TextureImage) -> None:
         pixels = image.pixels[..., None] if image.pixels.ndim == 2 else image.pixels
-        pixels = to_unit(np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3])
         self.image = image
-        encoded = image.srgb and image.pixels.dtype.kind == "u"
-        levels = [srgb_to_linear(pixels) if encoded else pixels]
+        levels = [
+            _linear(np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3], image.srgb)
+        ]
         while max(levels[-1].shape[:2]) > 1:
             levels.append(_halve(levels[-1]))
         self._sizes = np.array([level.shape[1::-1] for level in levels])  # width and height
@@ -163,6 +163,15 @@ class Pyramid:
 def magnification(image: TextureImage) -> Array:
     """How much the texture transform magnifies u and v, (2,)."""
     return np.linalg.norm(np.asarray(image.uv_transform, np.float64)[:, :2], axis=1)
+
+
+def _linear(pixels: Array, srgb: bool) -> Array:
+    """Values of pixels, float32; integers in sRGB from a table, for large images have more pixels than values."""
+    if not srgb or pixels.dtype.kind != "u":
+        return to_unit(pixels)
+    values = np.arange(np.iinfo(pixels.dtype).max + 1, dtype=pixels.dtype)
+    found: Array = srgb_to_linear(to_unit(values)).take(pixels)
+    return found
 
 
 def _halve(pixels: Array) -> Array:
