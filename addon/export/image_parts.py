@@ -11,8 +11,11 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
+from typing import Any, TypeVar
 
 import bpy
+
+T = TypeVar("T")
 
 MOVING = ("SEQUENCE", "MOVIE")
 #: The last digits of a file's name, which are its frame.
@@ -50,8 +53,8 @@ def tile_file(image: bpy.types.Image, number: int) -> str:
     return path.replace("<UDIM>", str(number)).replace("<UVTILE>", f"u{column + 1}_v{row + 1}")
 
 
-def ask_file(image: bpy.types.Image, question: Callable[[str | bytes], bool]) -> bool | None:
-    """What a question of `file_integrity` says of the file that Blender reads an image from, of a tiled its first's.
+def ask_file(image: bpy.types.Image, question: Callable[[str | bytes], T]) -> T | None:
+    """What a question, as of `file_integrity`, says of the file that Blender reads an image from, of a tiled the first.
 
     None where there is none, packed or on disk, and of a movie. Of those on disk answers are remembered.
     """
@@ -71,7 +74,7 @@ def ask_file(image: bpy.types.Image, question: Callable[[str | bytes], bool]) ->
 
 
 @lru_cache(maxsize=4096)
-def _answer(question: Callable[[str | bytes], bool], path: str, changed: int, size: int) -> bool:
+def _answer(question: Callable[[str | bytes], Any], path: str, changed: int, size: int) -> Any:
     """Of a file on disk as it was when it was changed last."""
     return question(path)
 

@@ -24,7 +24,7 @@ from .holdouts import Holdouts
 from .instances import Key, Visible, terminator_offset
 from .materials import finite
 from .meshes import check_normals
-from .painted_images import painted_images
+from .painted_images import painted_images, read_picture
 from .particles import particles_of
 from .surface_nodes import SurfaceWalker
 from .topology_check import Fit, check_modifiers, check_topology
@@ -130,10 +130,20 @@ class DrgsObjects:
         found, told = self._cache.get(
             ("painted", uid(obj), str(path)),
             (uid(obj), uid(obj.data)),
-            lambda: (painted_images(obj, assets.load(path), said.append), said),
+            lambda: (painted_images(obj, assets.load(path), said.append, self._picture), said),
         )
         for text in told:
             self._warn(text)
+        return found
+
+    def _picture(self, image: bpy.types.Image, warn: Warn) -> Image | None:
+        """Pixels of an image, read once for all objects that show it, and so sent once."""
+        said: list[str] = []
+        found, told = self._cache.get(
+            ("painted", uid(image)), (uid(image),), lambda: (read_picture(image, said.append), said)
+        )
+        for text in told:
+            warn(text)
         return found
 
 

@@ -5,21 +5,24 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import bpy
 import numpy as np
 
 from ...drgs_blender.core.asset import Asset
-from ...drgs_blender.core.asset.textures import MeshTextures, image_suffix
+from ...drgs_blender.core.asset.textures import MeshTextures, has_alpha, image_suffix
 from ...drgs_blender.core.materials import Image
-from ...drgs_blender.core.repainted_textures import pictures_of, repainted
+from ...drgs_blender.core.repainted_textures import named_apart, pictures_of, repainted, uses_of
 from .. import lookups
 from ..viewport_material import IMAGE, KEY
 from . import image_parts, image_pixels, images
 
 Array = np.ndarray
 Warn = Callable[[str], None]
+#: Gives the pixels of an image, straight; None where it has none.
+Read = Callable[[bpy.types.Image, Warn], Image | None]
 
 #: Assets whose images are hashed at a time, and bytes at the end of a file that tell it from another of its size:
 #: a checksum of a PNG's is among them.
@@ -38,92 +41,145 @@ class Painted(NamedTuple):
     picture: Image
 
 
-def painted_images(obj: bpy.types.Object, asset: Asset, warn: Warn) -> list[Image]:
+def read_picture(image: bpy.types.Image, warn: Warn) -> Image | None:
+    """Pixels of an image as textures of assets are looked up, straight; None where it has none."""
+    return images.export_image(image, True, warn)
+
+
+def painted_images(obj: bpy.types.Object, asset: Asset, warn: Warn, read: Read = read_picture) -> list[Image]:
     """Images of the asset's that have other pixels on an object, with those and their names in the asset.
 
     Warns of those that cannot be rendered as painted.
     """
-    return [replace(found.picture, name=found.name) for found in _found(obj, asset, warn)]
+    return [replace(found.picture, name=found.name) for found in _found(obj, asset, warn, read)]
 
 
 def with_painted_images(obj: bpy.types.Object, asset: Asset, warn: Warn) -> Asset:
-    """The asset of an object, or what is left of it, with its images as painted; these are packed in the .blend."""
-    found = list(_found(obj, asset, warn))
+    """The asset of an object, or what is left of it, with its images as painted; packed ones are packed anew."""
+    found = list(_found(obj, asset, warn, read_picture))
     textures = asset.mesh.textures
     if not found or textures is None:
         return asset
-    now = pictures_of(textures, [replace(one.picture, name=one.name) for one in found])
-    before, files = {}, {}
+    before: dict[tuple[str, bool], Array] = {}
+    now: dict[tuple[str, bool], Array] = {}
+    files: dict[tuple[str, bool], Array] = {}
     for one in found:
-        own = pictures_of(textures, [replace(_as_captured(one, textures), name=one.name)])
-        data = np.frombuffer(_file_of(one.image), np.uint8)
-        for key in own.keys() & now.keys():
-            before[key], files[key] = own[key], data
+        data = np.frombuffer(_file_of(one, has_alpha(textures.images[one.name].tobytes())), np.uint8)
+        own = _as_captured(one, textures)
+        painted = pictures_of(textures, [replace(one.picture, name=one.name)])
+        now |= painted
+        files |= dict.fromkeys(painted, data)
+        before |= pictures_of(textures, [] if own is None else [replace(own, name=one.name)])
     return repainted(asset, before, now, files)
 
 
-def _found(obj: bpy.types.Object, asset: Asset, warn: Warn) -> Iterator[Painted]:
+def _found(obj: bpy.types.Object, asset: Asset, warn: Warn, read: Read) -> Iterator[Painted]:
     """Images of an asset that are painted over on an object."""
     textures = asset.mesh.textures
-    trees = [s.material.node_tree for s in obj.original.material_slots if s.material and s.material.node_tree]
-    shown = {node.image for tree in trees for node in tree.nodes if node.type == "TEX_IMAGE" and node.image}
     if textures is None:
         return
     made = lambda: (textures, _hashes_of(textures))  # noqa: E731
     _, hashes = lookups.recall(_hashes, lambda known: known[0] is textures, made, _ASSETS)
-    for image in sorted((image for image in shown if KEY in image), key=lambda image: image.name):
-        if not image.is_dirty and (image.packed_file is None or _hash(image.packed_file) in hashes.values()):
+    uses = uses_of(textures)
+    shown: dict[tuple[str, bool], str] = {}
+    for image in _shown(obj, warn):
+        if image_parts.ask_file(image, _hash) in hashes.values():
             continue
-        was = image[KEY].split()[0]
-        names = [name for name, digest in hashes.items() if digest == was]
-        names = names or [name for name in [image.get(IMAGE)] if name in textures.images]
-        picture = images.export_image(image, True, warn) if names else None
+        names = _names(image, hashes)
+        picture = read(image, warn) if names else None
         lack = "is of another asset" if not names else "has no pixels" if picture is None else ""
-        if picture is not None and picture.pixels.dtype != np.uint8:
-            lack = "has floats, where the asset has bytes"
+        if picture is not None:
+            coloured = picture.encoding == "srgb"
+            names = [name for name in names if (name, coloured) in uses]
+            if picture.pixels.dtype != np.uint8:
+                lack = "has floats, where the asset has bytes"
+            elif not names:
+                kind = "colours" if coloured else "data"
+                lack = f"has the colour space {image.colorspace_settings.name}, and its asset has no {kind} there"
+            elif other := next((shown[name, coloured] for name in names if (name, coloured) in shown), None):
+                lack = f'stands for the same image of its asset as "{other}" does'
         if lack:
             warn(f'"{obj.name}": its image "{image.name}" {lack}; as painted it is not rendered, but the asset\'s own')
             continue
         assert picture is not None
+        shown |= {(name, coloured): image.name for name in names}
         yield from (Painted(image, name, picture) for name in names)
+
+
+def _shown(obj: bpy.types.Object, warn: Warn) -> list[bpy.types.Image]:
+    """Images of assets that the materials of an object show; warns of what is in the place of such."""
+    found = set()
+    for material in dict.fromkeys(slot.material for slot in obj.original.material_slots):
+        if material is None or material.node_tree is None:
+            continue
+        for node in material.node_tree.nodes:
+            if node.type != "TEX_IMAGE":
+                continue
+            if node.image is not None and KEY in node.image:
+                found.add(node.image)
+            elif KEY in material and any(output.is_linked for output in node.outputs):
+                what = "no image" if node.image is None else f'an image, "{node.image.name}", that is none of its asset'
+                warn(f'"{obj.name}": its material "{material.name}" shows {what}; the asset\'s own is rendered')
+    return sorted(found, key=lambda image: image.name_full)
+
+
+def _names(image: bpy.types.Image, hashes: dict[str, str]) -> list[str]:
+    """Names in an asset of an image that was made of its files, by their `hashes`: the last it had, or the first."""
+    last = "" if image.packed_file is None else _hash(image.packed_file.data)
+    for digest in (last, str(image[KEY]).partition(" ")[0]):
+        if names := [name for name, known in hashes.items() if known == digest]:
+            return [*names, *(n for name in names for n in named_apart(name) if n in hashes)]
+    own = str(image.get(IMAGE, ""))
+    return [name for name in (own, *named_apart(own)) if name in hashes]
 
 
 def _hashes_of(textures: MeshTextures) -> dict[str, str]:
     return {name: hashlib.sha256(data.tobytes()).hexdigest() for name, data in textures.images.items()}
 
 
-def _hash(packed: bpy.types.PackedFile) -> str:
-    data = packed.data
-    key = len(data), data[-_END:]
+def _hash(file: str | bytes) -> str:
+    """Of a file at a path, or a packed one."""
+    if isinstance(file, str):
+        return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    key = len(file), file[-_END:]
     if key not in _packed:
-        _packed[key] = hashlib.sha256(data).hexdigest()
+        _packed[key] = hashlib.sha256(file).hexdigest()
     return _packed[key]
 
 
-def _as_captured(painted: Painted, textures: MeshTextures) -> Image:
-    """An image as its asset has it."""
+def _as_captured(painted: Painted, textures: MeshTextures) -> Image | None:
+    """An image as its asset has it; None where that is damaged."""
     data = textures.images[painted.name].tobytes()
     image = bpy.data.images.new(painted.name, 1, 1)
     try:
         image.pack(data=data, data_len=len(data))
         image.source, image.alpha_mode = "FILE", painted.image.alpha_mode
         image.colorspace_settings.name = painted.image.colorspace_settings.name
-        picture = image_pixels.straight(image)
+        return image_pixels.straight(image)
     finally:
         bpy.data.images.remove(image)
-    # One that is damaged was never looked up: nothing of it is known.
-    return Image(painted.name, np.zeros((1, 1, 3), np.uint8), painted.picture.encoding) if picture is None else picture
 
 
-def _file_of(image: bpy.types.Image) -> bytes:
-    """An image as a file, which it is packed as; one of a library is copied for it."""
-    if not image.is_dirty and image.packed_file is not None and image_suffix(image.packed_file.data):
-        return bytes(image.packed_file.data)
-    if image.library is None:
+def _file_of(painted: Painted, alpha: bool) -> bytes:
+    """A painted image as a file with `alpha` or without, as the asset's own has it, which says what of it counts.
+
+    One that is packed and not saved is packed as that.
+    """
+    image = painted.image
+    if image.is_dirty and image.packed_file is not None and image.library is None:
         image.file_format = "PNG"
         image.pack()
-        return bytes(image.packed_file.data)
-    with image_parts.copied(image) as copy:
-        copy.file_format = "PNG"
-        copy.pack()
-        return bytes(copy.packed_file.data)
+    if not image.is_dirty and image.source == "FILE" and image.packed_file is not None:
+        data = bytes(image.packed_file.data)
+        if image_suffix(data) and has_alpha(data) == alpha:
+            return data
+    # Not a copy of the datablock: what is painted and not saved is not in that.
+    pixels = painted.picture.rgba[::-1]
+    made = bpy.data.images.new(painted.name, pixels.shape[1], pixels.shape[0], alpha=alpha)
+    try:
+        made.pixels.foreach_set(np.ravel(pixels / np.float32(255)))
+        made.file_format = "PNG"
+        made.pack()
+        return bytes(made.packed_file.data)
+    finally:
+        bpy.data.images.remove(made)

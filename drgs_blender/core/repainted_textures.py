@@ -69,6 +69,17 @@ def pictures_of(textures: MeshTextures, images: Sequence[Image]) -> dict[tuple[s
     return found
 
 
+def uses_of(textures: MeshTextures) -> set[tuple[str, bool]]:
+    """Names of images that materials have, and whether as colours."""
+    names = list(textures.images)
+    return {(names[n], slot in COLOURED) for slot, uses in enumerate(textures.slots.T) for n in uses[uses >= 0]}
+
+
+def named_apart(name: str) -> tuple[str, str]:
+    """Names of an image where it was painted as a colour and not as data, and where as data."""
+    return f"{name} (colour)", f"{name} (data)"
+
+
 def repainted(asset: Asset, before: Pictures, now: Pictures, files: Mapping[tuple[str, bool], Array]) -> Asset:
     """The asset with painted images, and materials of vertices and surfels as these have them.
 
@@ -92,11 +103,15 @@ def repainted(asset: Asset, before: Pictures, now: Pictures, files: Mapping[tupl
     at_surfels = None if asset.binding is None else _at_surfels(asset, textures, on_face)
     of_mesh: dict[str, Any] = {}
     of_surfels: dict[str, Any] = {}
+    pyramids: list[Pyramid] = []
+    made_of: tuple[object, ...] = ()
     for slot, k, key in _painted(textures, now):
         name, factors = SLOTS[slot], textures.factors[k, FACTORS[slot]]
         if key not in before:
             continue
-        pyramids = [_pyramid(textures, k, slot, key, pictures[key]) for pictures in (before, now)]
+        if (place := _place(textures, k, slot)) != made_of:
+            pyramids.clear()  # of a large image two are much, and more are too much
+            pyramids, made_of = [_pyramid(textures, k, slot, key, found[key]) for found in (before, now)], place
         for part, points, found in ((mesh, at_vertices, of_mesh), (surfels, at_surfels, of_surfels)):
             own = found.get(name, getattr(part, name, None))
             if own is None or points is None or (part is surfels and name == "opacity"):
@@ -147,12 +162,18 @@ def _with_files(textures: MeshTextures, files: Mapping[tuple[str, bool], Array])
         others = (textures.slots == names.index(name)) & (coloured != colour)
         other = files.get((name, not colour))
         if others.any() and (other is None or not np.array_equal(other, data)):
-            own = f"{name} ({'colour' if colour else 'data'})"
+            own = named_apart(name)[0 if colour else 1]
             slots[uses] = len(images) if own not in images else list(images).index(own)
             images[own] = data
         else:
             images[name] = data
     return replace(textures, images=images, slots=slots)
+
+
+def _place(textures: MeshTextures, k: int, slot: int) -> tuple[object, ...]:
+    """What the pyramids of a slot depend on."""
+    number, transform = int(textures.slots[k, slot]), textures.transforms[k, slot].tobytes()
+    return number, slot in COLOURED, textures.channel(slot, number), transform, int(textures.extensions[k, slot])
 
 
 def _pyramid(textures: MeshTextures, k: int, slot: int, key: tuple[str, bool], pixels: Array) -> Pyramid:

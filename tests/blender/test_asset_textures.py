@@ -97,6 +97,7 @@ def test_images_that_are_not_the_assets_are_told(ball, export):
     image["drgs_image"], image["drgs_textures"] = "another", "0 sRGB"
     assert not [w for w in export()[1] if "of another asset" in w] and not export()[0].objects[0].images
     paint(image, (1, 0, 0))
+    image.pack()
     assert [w for w in export()[1] if image.name in w and "of another asset" in w]
 
 

@@ -13,11 +13,13 @@ from test_mesh_textures import png, seen, textured, uniform  # noqa: F401 - a fi
 from drgs_blender.build.make import make_asset
 from drgs_blender.core.asset import Asset
 from drgs_blender.core.asset.container import write_asset
-from drgs_blender.core.asset.textures import ALBEDO, OPACITY, ROUGHNESS
+from drgs_blender.core.asset.textures import ALBEDO, EXTENSIONS, OPACITY, ROUGHNESS
 from drgs_blender.core.color import srgb_to_linear
 from drgs_blender.core.frame import Adjustment, Frame, ObjectState, RenderSettings, World
 from drgs_blender.core.materials import Image
 from drgs_blender.core.repainted_textures import carried_paint, pictures_of, repainted
+from drgs_blender.engine.loaded_assets import LoadedAsset
+from drgs_blender.engine.repainted_assets import RepaintedAssets
 from drgs_blender.engine.session import Session
 from drgs_blender.formats.files import Image as FileImage
 from drgs_blender.formats.files import MaterialFile, MeshFile
@@ -120,8 +122,29 @@ def test_pictures_do_not_know_what_was_painted_before(tmp_path: Path, sees: str)
     assert middle[1][0] > 3 * middle[1][1] and middle[2][1] > 3 * middle[2][0]
 
 
-def test_two_objects_of_one_asset_are_painted_apart(seen) -> None:  # noqa: F811
-    """And one after another: nothing of a painting stays with the asset."""
+def test_two_objects_of_one_asset_are_painted_apart(tmp_path: Path) -> None:
+    """In one picture, side by side."""
+    asset, _ = with_surfels()
+    write_asset(tmp_path / "square.drgs", asset)
+    assert asset.mesh.textures is not None
+    (name,) = asset.mesh.textures.images
+    session, states = Session(), []
+    key = session.load_asset(tmp_path / "square.drgs")
+    for x, colour in ((-1, (250, 10, 10)), (1, (10, 250, 10))):
+        image = Image(name, np.full((8, 8, 3), colour, np.uint8), "srgb")
+        matrix = np.eye(4)
+        matrix[0, 3] = x
+        states.append(ObjectState(f"at {x}", key, images=[image], matrix_world=matrix))
+    settings = RenderSettings(samples=4, camera_sees="mesh", rays_see="mesh", subpixel_samples=1)
+    camera = replace(look_along_y(32, focal=32 / 3.6), orthographic=True)
+    left, right = session.render(Frame(0, camera, states, world=World(), settings=settings))["Combined"][
+        16, [8, 24], :3
+    ]
+    assert left[0] > 3 * left[1] and right[1] > 3 * right[0]
+
+
+def test_objects_are_painted_one_after_another(seen) -> None:  # noqa: F811
+    """Nothing of a painting stays with the asset."""
     asset = textured(uniform((200, 200, 200)))
     for colour in ((250, 10, 10), (10, 250, 10)):
         values, _ = seen(asset, images=[Image("albedo", np.full((2, 2, 3), colour, np.uint8), "srgb")])
@@ -194,3 +217,91 @@ def test_paint_on_vertices_is_told_from_what_an_image_made_of_them() -> None:
     np.testing.assert_array_equal(found["albedo"][3], (1, 0, 0))
     np.testing.assert_array_equal(np.delete(found["albedo"], 3, 0), np.delete(now.albedo, 3, 0))
     assert found["roughness"] is None
+
+
+def test_what_lets_light_pass_is_painted_at_vertices_and_not_how_surfels_blend() -> None:
+    """Surfels have an opacity of their own, which is that of their disk; that of the material is the vertices'."""
+    asset, noise = with_surfels()
+    textures = asset.mesh.textures
+    assert textures is not None
+    slots = textures.slots.copy()
+    slots[:, OPACITY] = slots[:, ALBEDO]
+    opacity = np.ones(len(asset.mesh.vertices), np.float32)
+    mesh = replace(asset.mesh, opacity=opacity, textures=replace(textures, slots=slots))
+    now = np.dstack([noise, np.full(noise.shape[:2], 128, np.uint8)])
+    opaque = np.dstack([noise, np.full(noise.shape[:2], 255, np.uint8)])
+    (name,) = textures.images
+    mesh.textures = replace(mesh.textures, images={name: png(opaque)})
+    made = painted(replace(asset, mesh=mesh), opaque, now)
+    np.testing.assert_array_equal(made.surfels.opacity, asset.surfels.opacity)
+    np.testing.assert_allclose(made.mesh.opacity, 128 / 255, atol=2e-3)
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_materials_that_have_one_image_are_painted_each_as_it_has_it(same: bool) -> None:
+    """Two materials of an image, the second maybe with its picture moved by half of its width."""
+    asset, noise = with_surfels()
+    textures = asset.mesh.textures
+    assert textures is not None
+    names = [*textures.names, "other"]
+    both = {name: np.repeat(getattr(textures, name), 2, axis=0) for name in ("slots", "factors", "transforms")}
+    both["transforms"][1, :, 0, 2] += 0 if same else 0.5
+    upper = (asset.mesh.vertices[asset.mesh.faces].mean(axis=1)[:, 2] > 0).astype(np.int32)
+    extensions = np.repeat(textures.extensions, 2, axis=0)
+    asset.mesh.textures = replace(textures, names=names, material=upper, extensions=extensions, **both)
+    now = noise.copy()
+    now[:, 32:] = 255, 0, 0
+    made = painted(asset, noise, now)
+    x, _, z = asset.surfels.centre.T
+    red = (np.abs(made.surfels.albedo - RED) < 5e-3).all(axis=1)
+    assert red[(x > 0.2) & (x < 0.8) & (z < -0.2)].all()
+    assert red[((x > 0.2) if same else (x < -0.2)) & (np.abs(x) < 0.8) & (z > 0.2)].all()
+
+
+def test_what_is_painted_is_times_the_factor_of_its_material() -> None:
+    """And no more than a surface can reflect."""
+    asset, noise = with_surfels()
+    assert asset.mesh.textures is not None
+    asset.mesh.textures.factors[:, :3] = 0.5, 3.0, 0.25
+    made = painted(asset, noise, np.full_like(noise, 255))
+    for albedo in (made.surfels.albedo, made.mesh.albedo):
+        np.testing.assert_allclose(albedo, np.broadcast_to((0.5, 1.0, 0.25), albedo.shape), atol=2e-3)
+
+
+def test_surfels_take_the_mean_of_what_they_cover() -> None:
+    """Black and white lines of one pixel each are grey on surfels, which are wider."""
+    asset, noise = with_surfels()
+    now = np.zeros((1024, 1024, 3), np.uint8)
+    now[::2] = 255
+    albedo = painted(asset, noise, now).surfels.albedo
+    assert np.abs(albedo - 0.5).max() < 0.1
+
+
+def test_images_go_on_past_their_edge_as_those_of_the_asset_do() -> None:
+    """The right half is red; moved to the left by all of its width, nothing but its last column is seen."""
+    asset, noise = with_surfels()
+    assert asset.mesh.textures is not None
+    asset.mesh.textures.transforms[:, :, 0, 2] = 1
+    asset.mesh.textures.extensions[:] = EXTENSIONS.index("extend")
+    now = noise.copy()
+    now[:, 32:] = 255, 0, 0
+    albedo = painted(asset, noise, now).surfels.albedo
+    np.testing.assert_allclose(albedo, np.broadcast_to(RED, albedo.shape), atol=0.02)
+
+
+@pytest.mark.parametrize("alpha", [True, False])
+def test_rays_meet_painted_alpha_where_the_asset_has_any(alpha: bool) -> None:
+    """Else the red is the opacity, whatever Blender gives besides."""
+    pixels = np.full((4, 4, 4 if alpha else 3), 255, np.uint8)
+    asset = textured({"leaf": pixels}, slots=(-1, -1, -1, -1))
+    assert asset.mesh.textures is not None
+    slots = asset.mesh.textures.slots.copy()
+    slots[0, OPACITY] = 0
+    asset.mesh.textures = replace(asset.mesh.textures, slots=slots)
+    now = np.full((4, 4, 4), (50, 0, 0, 100), np.uint8)
+    state = ObjectState("thing", "leaf.drgs", images=[Image("leaf", now, "linear")])
+    made, _ = RepaintedAssets().loaded(LoadedAsset(asset, (0, 0, 0)), state)
+    textured_now = made.textured_of("leaf.drgs")
+    channel = textured_now.textures.channel(OPACITY, 0)
+    assert channel == ("a" if alpha else "r")
+    assert (textured_now.image(0, OPACITY).pixels[..., "rgba".index(channel)] == (100 if alpha else 50)).all()
