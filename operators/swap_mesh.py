@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import bpy
@@ -9,6 +10,7 @@ import numpy as np
 from bpy.props import BoolProperty
 
 from ..addon import assets, mesh_arrays, surfel_points
+from ..addon.export.painted_images import painted_images
 from ..addon.export.topology_check import REMODELLING
 from ..addon.viewport_material import viewport_material
 from ..drgs_blender.core.asset import MATERIAL_CHANNELS, Asset, Mesh
@@ -47,6 +49,7 @@ class DRGS_OT_swap_mesh(ReshapeOperator, bpy.types.Operator):
         check_new(other)
         self._object, self._other = obj.name, other.name
         source = assets.file_of(obj)
+        check_images(obj, assets.load(source), self.warn)
         said = f"Binding to {other.name}", "could not be bound to it"
         return self.reshape(context, source, swap_of(obj, assets.load(source), other), f'Object "{other.name}"', said)
 
@@ -87,6 +90,16 @@ def chosen(context: bpy.types.Context) -> tuple[bpy.types.Object, bpy.types.Obje
         )  # fmt: skip
     selection.editable(others, vertices=False, data=True)
     return obj, others[0]
+
+
+def check_images(obj: bpy.types.Object, asset: Asset, warn: Callable[[str], None]) -> None:
+    """UsageError where images of an object are painted, which are not in its file; names both."""
+    names = ", ".join(image.name for image in painted_images(obj, asset, warn))
+    if names and not obj.drgs.show_captured:
+        raise UsageError(
+            f'Object "{obj.name}"', f"has images that are painted and not in its file ({names})",
+            "Choose Save Edited Asset, with Link Objects to New File, or Show as Captured",
+        )  # fmt: skip
 
 
 def check_new(other: bpy.types.Object) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import bmesh
 import bpy
 import numpy as np
+import parity
 import pytest
 from scenes import part
 from test_asset_textures import ball, image_of, paint, png, read, textured_ball  # noqa: F401 - a fixture
@@ -218,3 +220,42 @@ def test_a_damaged_image_of_an_asset_is_painted_over(scene, tmp_path):
     kept = part("drgs_blender.core.asset.container").read_asset(tmp_path / "kept.drgs")
     np.testing.assert_array_equal(decoded(kept.mesh.textures, "albedo", tmp_path)[3, 3, :3], GREEN)
     np.testing.assert_array_equal(kept.mesh.albedo, damaged.mesh.albedo)
+
+
+def test_meshes_are_swapped_once_what_is_painted_on_images_is_saved(ball, tmp_path):  # noqa: F811
+    """The new mesh has other UVs: its vertices have the colours of the file."""
+    bpy.ops.mesh.primitive_uv_sphere_add(radius=1.0)
+    other = bpy.context.active_object
+    paint(image_of("albedo"), PAINT)
+    ball.select_set(True)
+    bpy.context.view_layer.objects.active = ball
+    with pytest.raises(RuntimeError, match="painted and not in its file .albedo."):
+        bpy.ops.drgs.swap_mesh(filepath=str(tmp_path / "swapped.drgs"))
+    other.select_set(False)
+    bpy.ops.drgs.save_asset(filepath=str(tmp_path / "kept.drgs"), use_saved=True)
+    other.select_set(True)
+    assert bpy.ops.drgs.swap_mesh(filepath=str(tmp_path / "swapped.drgs")) == {"FINISHED"}
+    mesh = part("drgs_blender.core.asset.container").read_asset(tmp_path / "swapped.drgs").mesh
+    linear = ((np.array(PAINT) + 0.055) / 1.055) ** 2.4
+    np.testing.assert_allclose(mesh.albedo[mesh.vertices[:, 2].argmax()], linear, atol=0.02)
+
+
+def test_a_saved_asset_looks_as_the_painted_object_did(scene, ball, tmp_path):  # noqa: F811
+    """To the last bit; adjusted, and a part of it deleted."""
+    parity.light(scene)
+    parity.set_up(scene, 48, samples=8, bounces=1)
+    edit = bmesh.new()
+    edit.from_mesh(ball.data)
+    bmesh.ops.delete(edit, geom=[f for f in edit.faces if f.calc_center_median().x > 0.4], context="FACES")
+    edit.to_mesh(ball.data)
+    edit.free()
+    ball.drgs.adjustment.tint = (0.5, 0.75, 1.0)
+    for name in ("albedo", "surface", "bumps"):
+        image = image_of(name)
+        pixels = np.array(image.pixels[:], np.float32).reshape(image.size[1], -1, 4)
+        pixels[2:5, 1:6, :3] = 0.2, 0.6, 0.9
+        image.pixels.foreach_set(pixels.ravel())
+        image.update()
+    before = parity.pictures(scene, "DRGS")
+    bpy.ops.drgs.save_asset(filepath=str(tmp_path / "kept.drgs"), use_saved=True)
+    np.testing.assert_array_equal(parity.pictures(scene, "DRGS"), before)
