@@ -18,7 +18,9 @@ T = TypeVar("T")
 #: Types of datablocks on which the shading of surfaces and of the world depends.
 SHADING_MODELS = (bpy.types.Material, bpy.types.NodeTree, bpy.types.Image, bpy.types.Texture, bpy.types.World)
 #: First items of the keys of entries that depend on such datablocks.
-SHADED = ("mesh", "world", "painted")
+SHADED = ("mesh", "world")
+#: On what painted images depend, and the first item of their keys: they are slow to read, so not of a World's slider.
+_SHOWING, PAINTED = (bpy.types.Material, bpy.types.Image), "painted"
 
 
 def uid(datablock: bpy.types.ID | None) -> int:
@@ -58,17 +60,15 @@ class ExportCache:
 
     def note(self, depsgraph: bpy.types.Depsgraph) -> None:
         """Drop entries that the depsgraph's updates invalidate."""
-        looks, shapes = False, set()
+        stale, shapes = set(), set()
         for update in depsgraph.updates:
             if isinstance(update.id, SHADING_MODELS):
-                looks = True
+                stale |= {*SHADED, PAINTED} if isinstance(update.id, _SHOWING) else set(SHADED)
             elif update.is_updated_geometry:
                 shapes.add(uid(update.id))
-        if looks or shapes:
+        if stale or shapes:
             self._known = {
-                key: entry
-                for key, entry in self._known.items()
-                if not (looks and key[0] in SHADED) and shapes.isdisjoint(entry[0])
+                key: entry for key, entry in self._known.items() if key[0] not in stale and shapes.isdisjoint(entry[0])
             }
 
     def forget_shading(self) -> None:

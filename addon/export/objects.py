@@ -19,7 +19,7 @@ from ...drgs_blender.core.passes import Pass
 from .. import assets, cache_playback, cage_nodes, mesh_arrays, point_caches, proxies, surfel_points
 from ..viewport_material import is_viewport_material
 from .aov_nodes import aov_values
-from .export_cache import ExportCache, uid
+from .export_cache import PAINTED, ExportCache, uid
 from .holdouts import Holdouts
 from .instances import Key, Visible, terminator_offset
 from .materials import finite
@@ -128,7 +128,7 @@ class DrgsObjects:
         path = assets.file_of(obj)
         said: list[str] = []
         found, told = self._cache.get(
-            ("painted", uid(obj), str(path)),
+            (PAINTED, uid(obj), str(path)),
             (uid(obj), uid(obj.data)),
             lambda: (painted_images(obj, assets.load(path), said.append, self._picture), said),
         )
@@ -140,7 +140,7 @@ class DrgsObjects:
         """Pixels of an image, read once for all objects that show it, and so sent once."""
         said: list[str] = []
         found, told = self._cache.get(
-            ("painted", uid(image)), (uid(image),), lambda: (read_picture(image, said.append), said)
+            (PAINTED, uid(image)), (uid(image),), lambda: (read_picture(image, said.append), said)
         )
         for text in told:
             warn(text)

@@ -229,7 +229,7 @@ def test_meshes_are_swapped_once_what_is_painted_on_images_is_saved(ball, tmp_pa
     paint(image_of("albedo"), PAINT)
     ball.select_set(True)
     bpy.context.view_layer.objects.active = ball
-    with pytest.raises(RuntimeError, match="painted and not in its file .albedo."):
+    with pytest.raises(RuntimeError, match=r"painted and not in its file \(albedo\)"):
         bpy.ops.drgs.swap_mesh(filepath=str(tmp_path / "swapped.drgs"))
     other.select_set(False)
     bpy.ops.drgs.save_asset(filepath=str(tmp_path / "kept.drgs"), use_saved=True)
@@ -259,3 +259,28 @@ def test_a_saved_asset_looks_as_the_painted_object_did(scene, ball, tmp_path):  
     before = parity.pictures(scene, "DRGS")
     bpy.ops.drgs.save_asset(filepath=str(tmp_path / "kept.drgs"), use_saved=True)
     np.testing.assert_array_equal(parity.pictures(scene, "DRGS"), before)
+
+
+def test_viewports_read_painted_images_again_for_images_and_materials_alone(ball, monkeypatch):  # noqa: F811
+    """Not for the World, of which a slider is dragged; for a node that shows another image."""
+    exported = lambda: part("addon.viewport.scenes").exported(bpy.context.evaluated_depsgraph_get())  # noqa: E731
+    pixels, reads = part("addon.export.image_pixels"), []
+    original = pixels.straight
+    monkeypatch.setattr(pixels, "straight", lambda image: (reads.append(image.name), original(image))[1])
+    world = bpy.context.scene.world = bpy.data.worlds.new("World")
+    if world.node_tree is None:  # before Blender 5.0
+        world.use_nodes = True
+    image = image_of("albedo")
+    paint(image, PAINT)
+    bpy.context.view_layer.update()
+    assert exported().frame.objects[0].images
+    reads.clear()
+    strength = next(n for n in world.node_tree.nodes if n.type == "BACKGROUND").inputs["Strength"]
+    for value in (0.5, 0.75):
+        strength.default_value = value
+        bpy.context.view_layer.update()
+        assert exported().frame.objects[0].images and not reads
+    for node in _nodes(ball, image):
+        node.image = image_of("bumps")
+    bpy.context.view_layer.update()
+    assert not exported().frame.objects[0].images
