@@ -14,7 +14,7 @@ import numpy as np
 from ...drgs_blender.core.asset import Asset
 from ...drgs_blender.core.asset.textures import MeshTextures, has_alpha, image_suffix
 from ...drgs_blender.core.materials import Image
-from ...drgs_blender.core.repainted_textures import named_apart, pictures_of, repainted, uses_of
+from ...drgs_blender.core.repainted_textures import pictures_of, repainted, uses_of
 from .. import lookups
 from ..viewport_material import IMAGE, KEY
 from . import image_parts, image_pixels, images
@@ -128,9 +128,8 @@ def _names(image: bpy.types.Image, hashes: dict[str, str]) -> list[str]:
     last = "" if image.packed_file is None else _hash(image.packed_file.data)
     for digest in (last, str(image[KEY]).partition(" ")[0]):
         if names := [name for name, known in hashes.items() if known == digest]:
-            return [*names, *(n for name in names for n in named_apart(name) if n in hashes)]
-    own = str(image.get(IMAGE, ""))
-    return [name for name in (own, *named_apart(own)) if name in hashes]
+            return names
+    return [name for name in [image.get(IMAGE)] if name in hashes]
 
 
 def _hashes_of(textures: MeshTextures) -> dict[str, str]:

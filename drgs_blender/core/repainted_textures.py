@@ -75,11 +75,6 @@ def uses_of(textures: MeshTextures) -> set[tuple[str, bool]]:
     return {(names[n], slot in COLOURED) for slot, uses in enumerate(textures.slots.T) for n in uses[uses >= 0]}
 
 
-def named_apart(name: str) -> tuple[str, str]:
-    """Names of an image where it was painted as a colour and not as data, and where as data."""
-    return f"{name} (colour)", f"{name} (data)"
-
-
 def repainted(asset: Asset, before: Pictures, now: Pictures, files: Mapping[tuple[str, bool], Array]) -> Asset:
     """The asset with painted images, and materials of vertices and surfels as these have them.
 
@@ -162,7 +157,7 @@ def _with_files(textures: MeshTextures, files: Mapping[tuple[str, bool], Array])
         others = (textures.slots == names.index(name)) & (coloured != colour)
         other = files.get((name, not colour))
         if others.any() and (other is None or not np.array_equal(other, data)):
-            own = named_apart(name)[0 if colour else 1]
+            own = f"{name} ({'colour' if colour else 'data'})"
             slots[uses] = len(images) if own not in images else list(images).index(own)
             images[own] = data
         else:

@@ -73,6 +73,15 @@ def test_what_is_painted_and_saved_is_rendered_and_saved_with_the_asset(ball, tm
     assert (image.packed_file is None) == (kept != "Save")
 
 
+def test_an_image_in_a_file_that_is_painted_and_not_saved_stays_so(ball, tmp_path):  # noqa: F811
+    image = image_of("albedo")
+    image.unpack(method="WRITE_LOCAL")
+    paint(image, PAINT)
+    bpy.ops.drgs.save_asset(filepath=str(tmp_path / "kept.drgs"))
+    np.testing.assert_array_equal(decoded(read(tmp_path / "kept.drgs"), "albedo", tmp_path)[3, 3, :3], GREEN)
+    assert image.is_dirty and image.packed_file is None
+
+
 def test_an_image_that_is_generated_in_place_is_sent(ball, export):  # noqa: F811
     image = image_of("albedo")
     image.source, image.generated_color = "GENERATED", (1, 0, 0, 1)
@@ -168,6 +177,7 @@ def test_what_is_painted_on_an_image_of_a_library_and_not_saved_is_saved_with_th
     assert [i.name for i in export()[0].objects[0].images] == ["albedo"]
     bpy.ops.drgs.save_asset(filepath=str(tmp_path / "kept.drgs"))
     np.testing.assert_array_equal(decoded(read(tmp_path / "kept.drgs"), "albedo", tmp_path)[3, 3, :3], GREEN)
+    assert image.is_dirty, "what is of a library stays as it is"
 
 
 def test_a_file_that_is_colour_and_data_is_painted_again_after_it_is_saved(scene, tmp_path, export):
