@@ -1,6 +1,6 @@
 """What light costs: time to equal quality against Cycles and Mitsuba, what makes the time, and what it buys.
 
-python bench/bench_light.py [--part equal-psnr mitsuba denoised relmse cost efficiency ablation] [--size 200] ...
+python bench/bench_light.py [--part equal-psnr mitsuba denoised relmse cost efficiency cases ablation] [--size 200] ...
 
 Each part writes its own section. Everything runs on two processors, as far as the system allows that to be set.
 """
@@ -14,7 +14,9 @@ import light_ablation
 import light_cost
 import light_efficiency
 import light_renderers
-from light_cases import CASES, FOLDER
+import light_variance
+from light_cases import FOLDER
+from light_scenes import EVERY
 from report import write_section
 
 PARTS = {
@@ -24,6 +26,7 @@ PARTS = {
     "relmse": ("Light: relative error at 32 samples", light_renderers.relative_error),
     "cost": ("Light: what makes the time", light_cost.cost),
     "efficiency": ("Light: what denoiser, MIS and mesh bring", light_efficiency.efficiency),
+    "cases": ("Light: noise of single cases", light_variance.variance),
     "ablation": ("Light: inter-reflection, shadows and reflections", light_ablation.ablation),
 }
 
@@ -31,7 +34,7 @@ PARTS = {
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--part", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
-    parser.add_argument("--cases", nargs="+", choices=[c.name for c in CASES], default=[c.name for c in CASES])
+    parser.add_argument("--cases", nargs="+", choices=[c.name for c in EVERY], default=[c.name for c in EVERY])
     parser.add_argument("--size", type=int, default=200, help="of the pictures that are compared")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument(
@@ -48,6 +51,10 @@ def main() -> None:
     parser.add_argument("--memory-size", type=int, nargs=2, default=(1920, 1080))
     parser.add_argument("--million", type=int, default=1_000_000, help="triangles and surfels of the memory test")
     parser.add_argument("--efficiency-rays", type=int, nargs="+", default=(4, 8, 16, 32, 64, 128, 256, 512))
+    parser.add_argument("--cases-size", type=int, default=128, help="of the pictures of part cases")
+    parser.add_argument("--cases-seeds", type=int, default=4)
+    parser.add_argument("--cases-samples", type=int, nargs="+", default=(8, 32, 128, 512), help="of ours, in part cases")
+    parser.add_argument("--cases-spp", type=int, nargs="*", default=(8, 32, 128), help="of Cycles; none: without it")
     parser.add_argument("--ablation-size", type=int, default=400, help="of the pictures of part ablation")
     parser.add_argument("--ablation-rays", type=int, default=512)
     options = parser.parse_args()

@@ -63,6 +63,23 @@ def add_world(scene: bpy.types.Scene, path: str, rotation_z: float, strength: fl
     nodes["Background"].inputs["Strength"].default_value = strength
 
 
+def add_lamps(scene: bpy.types.Scene, lamps: list[dict]) -> None:
+    """Lights, in the words of `core.frame.Light`."""
+    for lamp in lamps:
+        data = bpy.data.lights.new("lamp", lamp["kind"].upper())
+        data.energy, data.color = lamp["power"], lamp.get("colour", (1, 1, 1))
+        if lamp["kind"] == "point":
+            data.shadow_soft_size = lamp["radius"]
+        elif lamp["kind"] == "sun":
+            data.angle = lamp["angle"]
+        else:
+            data.size = lamp["size_x"]
+        item = bpy.data.objects.new("lamp", data)
+        item.matrix_world = Matrix(lamp["matrix_world"])
+        item.visible_camera = False
+        scene.collection.objects.link(item)
+
+
 def add_camera(scene: bpy.types.Scene, camera: dict) -> None:
     data = bpy.data.cameras.new("camera")
     data.sensor_fit = "HORIZONTAL"
@@ -136,14 +153,17 @@ def main(path: str) -> None:
             subject.shadow_terminator_geometry_offset = job["terminator_offset"]
         add_world(scene, job["environment"], job.get("rotation_z", 0.0), job.get("strength", 1.0))
         add_camera(scene, job["camera"])
+        add_lamps(scene, job.get("lamps", []))
         if job.get("deform"):
             deform(subject)
         if job.get("vertices_out"):
             np.save(job["vertices_out"], evaluated_vertices(subject))
+        used = time.process_time()
         pixels, seconds = render(scene, job) if job["samples"] else (None, 0.0)
+        used = time.process_time() - used
         if pixels is not None:
             np.save(job["out"], pixels)
-        results.append({"out": job["out"], "seconds": seconds})
+        results.append({"out": job["out"], "seconds": seconds, "processor_seconds": used})
         print(f"cycles: {job['out']} {seconds:.2f} s", flush=True)
     Path(path).with_suffix(".result.json").write_text(json.dumps(results))
 
