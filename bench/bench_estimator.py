@@ -59,8 +59,9 @@ def densities() -> list[list[object]]:
     rows = []
     for name in ("city", "studio", "sunset", "night"):
         light = EnvironmentLight(World(read_environment(environments() / f"{name}.exr").radiance))
-        solid = -np.diff(light.row_z.astype(float)) * 2 * np.pi / light.cells.density.shape[1]
-        rows.append([f"environment, {name}.exr", float((light.cells.density * solid[:, None]).sum())])
+        density = light.cells.density
+        solid = -np.diff(light.row_z.astype(float)) * 2 * np.pi / density.shape[1]
+        rows.append([f"environment, {name}.exr", float((density * solid[:, None]).sum())])
     return rows
 
 

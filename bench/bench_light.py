@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--efficiency-rays", type=int, nargs="+", default=(4, 8, 16, 32, 64, 128, 256, 512))
     parser.add_argument("--cases-size", type=int, default=128, help="of the pictures of part cases")
     parser.add_argument("--cases-seeds", type=int, default=4)
-    parser.add_argument("--cases-samples", type=int, nargs="+", default=(8, 32, 128, 512), help="of ours, in part cases")
+    parser.add_argument("--cases-samples", type=int, nargs="+", default=(8, 32, 128, 512), help="of ours")
     parser.add_argument("--cases-spp", type=int, nargs="*", default=(8, 32, 128), help="of Cycles; none: without it")
     parser.add_argument("--ablation-size", type=int, default=400, help="of the pictures of part ablation")
     parser.add_argument("--ablation-rays", type=int, default=512)

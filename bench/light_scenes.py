@@ -154,9 +154,8 @@ class Scene(Case):
 
 def lamp(kind: str, place: tuple[float, float, float], power: float, **more: Any) -> dict[str, Any]:
     """A light at `place` that shines towards the middle of the scene."""
-    return {
-        "kind": kind, "power": power, "matrix_world": look_at(np.array(place), np.array([0.0, 0, 0.5])).tolist(), **more,
-    }  # fmt: skip
+    matrix = look_at(np.array(place), np.array([0.0, 0.0, 0.5]))
+    return {"kind": kind, "power": power, "matrix_world": matrix.tolist(), **more}
 
 
 METAL = {"metallic": 1.0, "albedo": 0.8}

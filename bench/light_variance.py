@@ -129,9 +129,10 @@ def variance(options: argparse.Namespace) -> str:
     if spp:
         columns += ["Cycles: relMSE / trimmed", "dB by 4 x", "time Cycles / ours"]
     verdict = f" Median {np.median(ratios):.1f}, worst {min(ratios):.1f}." if ratios else ""
+    about = [f"{c.name}: {c.materials}, {c.environment.name}, {getattr(c, 'bounces', 1)} bounces" for c in cases]
     return (
-        f"{size}x{size}, {seeds} seeds, {', '.join(map(str, counts))} samples, noise by pairs of seeds; relative errors "
-        f"at {EQUAL} samples (trimmed: without the {TRIM:.1%} of the pixels that are worst); processor seconds of "
-        f"sampling alone, to the relative error of ours at {EQUAL}.{verdict}\n\n{table(columns, rows)}\n\n"
-        + "\n".join(f"- {c.name}: {c.materials}, {c.environment.name}, {getattr(c, 'bounces', 1)} bounces" for c in cases)
+        f"{size}x{size}, {seeds} seeds, {', '.join(map(str, counts))} samples, noise by pairs of seeds; relative "
+        f"errors at {EQUAL} samples (trimmed: without the {TRIM:.1%} of the pixels that are worst); processor seconds "
+        f"of sampling alone, to the relative error of ours at {EQUAL}.{verdict}\n\n{table(columns, rows)}\n\n"
+        + "\n".join(f"- {text}" for text in about)
     )

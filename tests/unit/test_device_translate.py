@@ -132,9 +132,9 @@ def test_the_renderers_arithmetic_is_the_same_to_the_last_bit(name: str) -> None
 def test_the_sky_is_looked_up_to_the_last_bit() -> None:
     image = np.random.default_rng(0).random((40, 80, 3)).astype(np.float32) ** 6
     sky = environment.EnvironmentLight(World(environment=image))
-    u, v = floats(3000, (0, 1), (0, 1))
+    u, v, z = floats(3000, (0, 1), (0, 1), (-1, 1))
     rows = np.random.default_rng(3).integers(0, 576, 3000)
-    for function, columns in ((environment.envmap_radiance, [u, v]), (environment.envmap_pdf, [u, v, rows])):
+    for function, columns in ((environment.envmap_radiance, [u, v]), (environment.envmap_pdf, [u, v, z, rows])):
         np.testing.assert_array_equal(
             on_device(function, columns, (sky.envmap,)), here(function, columns, (sky.envmap,))
         )

@@ -44,11 +44,11 @@ def sphere_grid(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
     return directions, np.repeat(angle, columns)
 
 
-def texel_means(luminance: np.ndarray) -> np.ndarray:
-    """Mean over each texel of the bilinear interpolant: wraps in columns, clamps in rows."""
+def cell_means(luminance: np.ndarray) -> np.ndarray:
+    """Mean of the bilinear interpolant over each cell between centres of texels: wraps in columns, clamps in rows."""
     rows = np.concatenate([luminance[:1], luminance, luminance[-1:]])
-    rows = 0.75 * luminance + 0.125 * (rows[:-2] + rows[2:])
-    return 0.75 * rows + 0.125 * (np.roll(rows, 1, axis=1) + np.roll(rows, -1, axis=1))
+    rows = 0.5 * (rows[:-1] + rows[1:])
+    return 0.5 * (np.roll(rows, 1, axis=1) + rows)
 
 
 def numbers(count: int, seed: int = 0) -> np.ndarray:
@@ -89,13 +89,13 @@ def test_rotation_colour_and_strength() -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_density_integrates_to_one(kind: str) -> None:
     light = EnvironmentLight(World(environment=picture(kind)))
-    columns = light.cells.density.shape[1]
+    density = light.cells.density
     # Rows of cells have unequal heights in z: integrate cell by cell.
-    solid = -np.diff(light.row_z.astype(float)) * 2 * np.pi / columns
-    assert (light.cells.density * solid[:, None]).sum() == pytest.approx(1.0, abs=1e-5)
-    directions, angle = sphere_grid(160, 320)
+    solid = -np.diff(light.row_z.astype(float)) * 2 * np.pi / density.shape[1]
+    assert (density * solid[:, None]).sum() == pytest.approx(1.0, abs=1e-5)
+    directions, angle = sphere_grid(960, 1920)
     assert light.pdf(directions).astype(float) @ angle == pytest.approx(1.0, abs=1e-4)
-    assert (light.cells.density > 0).sum() == len(light.cells.runs)
+    assert (density > 0).sum() == len(light.cells.runs)
     assert len(np.unique(light.cells.runs[:, 1])) == len(light.cells.runs)
     assert light.cells.runs[-1, 0] == 2**32 - 1
 
@@ -110,13 +110,14 @@ def test_every_lit_cell_of_a_large_map_has_its_density(size: tuple[int, int], sk
         image *= 1e-5
         image[size[0] // 3, 70:73] = 1e5
     light = EnvironmentLight(World(environment=image))
-    solid = -np.diff(light.row_z.astype(float)) * 2 * np.pi / light.cells.density.shape[1]
-    expected = texel_means(image @ LUMINANCE)
-    probability = light.cells.density * solid[:, None]
+    density = light.cells.density
+    solid = -np.diff(light.row_z.astype(float)) * 2 * np.pi / density.shape[1]
+    expected = cell_means(image @ LUMINANCE)
+    probability = density * solid[:, None]
     expected = expected * solid[:, None] / (expected * solid[:, None]).sum()
     # Half a random number of rounding at either edge, and what the darkest cells were raised to one.
     assert np.abs(probability - expected).max() < 2.0**-32 * 2 + 1e-3 * expected.max()
-    assert light.cells.density.min() > 0
+    assert density.min() > 0
     assert (np.diff(light.cells.runs[:, 0].astype(np.int64)) >= 1).all() and light.cells.runs[-1, 0] == 2**32 - 1
 
 
@@ -130,7 +131,7 @@ def test_any_number_of_threads_makes_the_same_cells() -> None:
     finally:
         use_threads(before)
     many = EnvironmentLight(world)
-    for name in ("runs", "guide", "density", "first", "parts"):
+    for name in ("grid", "runs", "guide", "first", "parts"):
         np.testing.assert_array_equal(getattr(one.cells, name), getattr(many.cells, name))
     np.testing.assert_array_equal(one.product.starts, many.product.starts)
 
@@ -150,8 +151,8 @@ def test_samples_follow_the_density(kind: str, turned: bool, normal: tuple[float
     count = 200_000
     directions, pdf = light.sample(numbers(count), normal)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-5)
-    # On a cell's very border the lookup may fall to the neighbour.
-    assert (np.abs(light.pdf(directions, normal) - pdf) <= 1e-4 * pdf).mean() > 0.999
+    # On a block's very border the lookup may fall to the neighbour.
+    assert (np.abs(light.pdf(directions, normal) - pdf) <= 1e-3 * pdf).mean() > 0.998
     # Histogram over octants and over bands, against the density's integral.
     grid, angle = sphere_grid(1920, 960)  # borders of bands run through bright rows
     weights = light.pdf(grid @ rotation, normal) * angle  # the grid keeps to the cells in the environment's own frame
@@ -175,6 +176,19 @@ def test_sampling_integrates_the_radiance(kind: str) -> None:
     assert abs(value.mean() - expected) < 5 * error + 3e-3 * expected
     if kind == "constant":
         np.testing.assert_allclose(pdf, 1 / (4 * np.pi), rtol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(64, 128), (2048, 4096)])
+def test_every_direction_towards_a_small_sun_brings_the_same(size: tuple[int, int]) -> None:
+    """Its few texels are slopes of the bilinear lookup; a density constant over a texel would spread by half of it."""
+    image = np.zeros((*size, 3), np.float32)
+    image[size[0] // 3, 70:72] = (9, 8, 5), (1, 1, 1)
+    light = EnvironmentLight(World(environment=image))
+    directions, pdf = light.sample(numbers(50_000))
+    brought = light.lookup(directions) @ LUMINANCE / pdf
+    if light.cells.step == 1:
+        np.testing.assert_allclose(brought, light.power, rtol=0.06)
+    assert brought.mean() == pytest.approx(light.power, rel=0.02)
 
 
 @pytest.mark.parametrize("turned", [False, True])

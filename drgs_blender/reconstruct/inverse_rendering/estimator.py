@@ -29,6 +29,7 @@ from ...render.lights.environment import (
     direction_in_cell,
     envmap_pdf,
     first_cell,
+    height_in_map,
     map_at,
 )
 from ...render.lights.product_sampling import block_of, in_cells_order, product_row
@@ -245,8 +246,8 @@ def _direction(strategy, numbers, normal, frame, view, alpha, bound, row, envmap
         place = first_cell(number, envmap)
         while number > cell_end(place, envmap):
             place += 1
-        _, column, upper, lower, _ = cell_at(place, envmap)
-        lx, ly, lz, _, _ = direction_in_cell(column, upper, lower, n1, n2, envmap)
+        column, upper, lower, a, b, c, d = cell_at(place, envmap)
+        lx, ly, lz, _, _, _ = direction_in_cell(column, upper, lower, (a, b, c, d), n1, n2, envmap)
         xx, xy, xz, yx, yy, yz, zx, zy, zz = to_light
         return xx * lx + yx * ly + zx * lz, xy * lx + yy * ly + zy * lz, xz * lx + yz * ly + zz * lz
     if strategy == 0:
@@ -341,7 +342,7 @@ def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples): 
                 u, v = map_at(lx, ly, lz, envmap)
                 total = F(counts[0]) * nl * INVERSE_PI + F(counts[1]) * density * norm
                 if counts[2] > 0:
-                    total += F(counts[2]) * envmap_pdf(u, v, row, envmap)
+                    total += F(counts[2]) * envmap_pdf(u, v, height_in_map(lx, ly, lz, envmap), row, envmap)
                 if not total > F(1e-12):
                     continue
                 w = ONE / total

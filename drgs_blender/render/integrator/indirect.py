@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...compute.jit import njit
-from ..lights.environment import envmap_pdf, envmap_radiance, map_at
+from ..lights.environment import envmap_pdf, envmap_radiance, height_in_map, map_at
 from ..lights.light_groups import group_of_environment, group_of_hit, group_of_sample
 from ..lights.light_links import emits_to, lights_of, set_of
 from ..lights.light_sampler import emission_along, lights_along
@@ -188,10 +188,11 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
         if through > ZERO:
             u, v = map_at(*direction, envmap)
             red, green, blue = envmap_radiance(u, v, envmap)
-            density, light = s[i + w.PG], envmap_pdf(u, v, ints[c + w.ROW], envmap)
+            z = height_in_map(direction[0], direction[1], direction[2], envmap)
+            density, light = s[i + w.PG], envmap_pdf(u, v, z, ints[c + w.ROW], envmap)
             weight = through / (density + light)
             if scene.geometry.terminators != 0 and w.grazing(s, i) > ZERO:
-                light = envmap_pdf(u, v, U(SIDE * SIDE), envmap)
+                light = envmap_pdf(u, v, z, U(SIDE * SIDE), envmap)
                 weight = through * mis.power_heuristic(density, light) / density
             group = group_of_environment(scene.lights)
             _find(scene.lights, found, owner, group, fr * red * weight, fg * green * weight, fb * blue * weight)

@@ -10,7 +10,7 @@ since their visibility is found there.
 from __future__ import annotations
 
 from ...compute.jit import inlined, njit
-from ..lights.environment import envmap_pdf
+from ..lights.environment import envmap_pdf, height_in_map
 from ..lights.product_sampling import SIDE
 from ..sampling import ONE, ZERO, F, U, luminance
 from . import brdf
@@ -124,7 +124,8 @@ def _light_weight(s, i, settings, envmap):  # type: ignore[no-untyped-def]
     fr, fg, fb = brdf.fresnel(mv, albedo, metal, s[i + w.FD], settings.shading_model)
     diffuse, glossy = s[i + w.KD] * luminance(albedo[0], albedo[1], albedo[2]), luminance(fr, fg, fb)
     density = (diffuse * s[i + w.PC] + glossy * s[i + w.PG]) / max(diffuse + glossy, _TINY)
-    light = envmap_pdf(s[i + w.MU], s[i + w.MV], U(SIDE * SIDE), envmap)
+    z = height_in_map(s[i + w.LX], s[i + w.LY], s[i + w.LZ], envmap)
+    light = envmap_pdf(s[i + w.MU], s[i + w.MV], z, U(SIDE * SIDE), envmap)
     return power_heuristic(light, density)
 
 

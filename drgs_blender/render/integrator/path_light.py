@@ -8,7 +8,16 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compute.jit import njit
-from ..lights.environment import cell_at, cell_end, direction_in_cell, envmap_pdf, envmap_radiance, first_cell, map_at
+from ..lights.environment import (
+    cell_at,
+    cell_end,
+    direction_in_cell,
+    envmap_pdf,
+    envmap_radiance,
+    first_cell,
+    height_in_map,
+    map_at,
+)
 from ..lights.light_groups import group_of_environment, group_of_hit, group_of_sample
 from ..lights.light_links import emits_to, lights_of
 from ..lights.light_sampler import emission_along, lights_along, sample_light
@@ -252,8 +261,8 @@ def towards_envmap(numbers, at, row, throughput, first, scratch, count, scene, s
     cell = first_cell(inside, envmap)
     while inside > cell_end(cell, envmap):
         cell += 1
-    _, column, upper, lower, density = cell_at(cell, envmap)
-    dx, dy, dz, u, v = direction_in_cell(column, upper, lower, n0, n1, envmap)
+    column, upper, lower, a, b, c, d = cell_at(cell, envmap)
+    dx, dy, dz, u, v, density = direction_in_cell(column, upper, lower, (a, b, c, d), n0, n1, envmap)
     pdf = weigh_lit(at, (dx, dy, dz), scratch, count, scene)
     own = density * ratio
     if not (own > ZERO and is_bright(scratch.value)):
@@ -265,7 +274,7 @@ def towards_envmap(numbers, at, row, throughput, first, scratch, count, scene, s
     if through > ZERO:
         k = through / (own + pdf)
         if w.grazing(s, 0) > ZERO:
-            k = through * power_heuristic(envmap_pdf(u, v, U(SIDE * SIDE), envmap), s[w.PG]) / own
+            k = through * power_heuristic(density, s[w.PG]) / own
         light = (r * k, g * k, b * k)
         gather(light, light, throughput, first, group_of_environment(scene.lights), scene.lights, scratch)
 
@@ -364,9 +373,10 @@ def light_along(ray, densities, receiver, row, diffuse, throughput, first, scrat
     if through > ZERO and scene.traits.environment:
         u, v = map_at(direction[0], direction[1], direction[2], scene.envmap)
         r, g, b = envmap_radiance(u, v, scene.envmap)
-        k = through / (pdf + share * envmap_pdf(u, v, row, scene.envmap))
+        z = height_in_map(direction[0], direction[1], direction[2], scene.envmap)
+        k = through / (pdf + share * envmap_pdf(u, v, z, row, scene.envmap))
         if share > ZERO and w.grazing(scratch.rays.floats, 0) > ZERO:
-            k = through * (ONE - power_heuristic(envmap_pdf(u, v, U(SIDE * SIDE), scene.envmap), pdf)) / pdf
+            k = through * (ONE - power_heuristic(envmap_pdf(u, v, z, U(SIDE * SIDE), scene.envmap), pdf)) / pdf
         light = k * r, k * g, k * b
         if light[0] + light[1] + light[2] > ZERO:
             gather(light, light, throughput, first, group_of_environment(lights), lights, scratch)

@@ -15,7 +15,16 @@ import numpy as np
 
 from ...compute.jit import inlined, njit
 from .. import sampling
-from ..lights.environment import cell_at, cell_end, direction_in_cell, envmap_pdf, envmap_touch, first_cell, map_at
+from ..lights.environment import (
+    cell_at,
+    cell_end,
+    direction_in_cell,
+    envmap_pdf,
+    envmap_touch,
+    first_cell,
+    height_in_map,
+    map_at,
+)
 from ..lights.light_links import lights_of
 from ..lights.light_sampler import sample_light
 from ..lights.product_sampling import block_of, in_cells_order
@@ -248,7 +257,7 @@ def environment_directions(rays, count, envmap):  # type: ignore[no-untyped-def]
     ----------
     rays : Batch
         N0 to N2 (random numbers) and ROW are read. Written: LX, LY, LZ (unit, world), MU, MV (lat-long coordinates in
-        [0, 1]), PE (pdf, sr^-1); N2, CELL and ER are overwritten.
+        [0, 1]), PE (pdf, sr^-1); N2, CELL, ER and the BRDF are overwritten.
     count : int64
         Slots.
     envmap : EnvMap
@@ -276,15 +285,17 @@ def environment_directions(rays, count, envmap):  # type: ignore[no-untyped-def]
         ints[c + CELL] = place
     for slot in range(count):
         i, c = at(slot)
-        _, column, s[i + MV], s[i + LZ], density = cell_at(ints[c + CELL], envmap)
-        s[i + MU], s[i + PE] = F(column), density * s[i + ER]
+        column, s[i + MV], s[i + LZ], s[i + QR], s[i + QG], s[i + QB], s[i + SR] = cell_at(ints[c + CELL], envmap)
+        s[i + MU] = F(column)
     for p in range(packets(count)):
         b, c = p * PACKET_FLOATS, p * PACKET_INTS
         for k in range(LANES):
             i = b + k
-            s[i + LX], s[i + LY], s[i + LZ], s[i + MU], s[i + MV] = direction_in_cell(
-                s[i + MU], s[i + MV], s[i + LZ], ints[c + k + N0], ints[c + k + N1], envmap
+            corners = s[i + QR], s[i + QG], s[i + QB], s[i + SR]
+            s[i + LX], s[i + LY], s[i + LZ], s[i + MU], s[i + MV], density = direction_in_cell(
+                s[i + MU], s[i + MV], s[i + LZ], corners, ints[c + k + N0], ints[c + k + N1], envmap
             )
+            s[i + PE] = density * s[i + ER]
 
 
 @njit
@@ -335,7 +346,8 @@ def look_up(rays, count, envmap):  # type: ignore[no-untyped-def]
     for slot in range(count):
         i, c = at(slot)
         if s[i + LIVE] > ZERO:
-            s[i + PE] = envmap_pdf(s[i + MU], s[i + MV], ints[c + ROW], envmap)
+            z = height_in_map(s[i + LX], s[i + LY], s[i + LZ], envmap)
+            s[i + PE] = envmap_pdf(s[i + MU], s[i + MV], z, ints[c + ROW], envmap)
 
 
 @njit

@@ -1,8 +1,8 @@
 """The environment light (environment map): radiance from a direction, and directions in proportion to radiance.
 
-A texel's directions are drawn uniformly over its solid angle (uniform in azimuth and in z), so its density is one
-constant, finite at the poles. Its probability is the luminance, averaged over the texel as the bilinear lookup sees it,
-times the solid angle: wherever a lookup can be positive, so is the density.
+The density is the luminance of the bilinear lookup over the power: small suns, which are slopes between few texels,
+bring the same whichever direction towards them is drawn. Only in the height above a texel's centre both differ by a
+trifle, as the lookup is linear in the angle and the density in z, which makes it finite at the poles.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit, plain
+from ...compute.jit import inlined, njit, plain
 from ...compute.threads import ROWS, over_range
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
@@ -71,8 +71,11 @@ class EnvMap(NamedTuple):
     guide: int
     guide_size: int
     row_z: int
-    step: int
+    grid: int
+    stride: int
+    rows: int
     columns: int
+    scale: np.float32
     starts: int
     slices: int
     ratio: int
@@ -102,8 +105,8 @@ class EnvironmentLight:
     Attributes
     ----------
     texels : (h, w, 4) float32 array
-        Lat-long radiance times colour and strength, linear Rec.709, and in the last place the density of the sampling
-        cell that the texel lies in: one cache line serves both.
+        Lat-long radiance times colour and strength, linear Rec.709, and in the last place its luminance, if that is the
+        grid of the cells: one cache line serves both.
     cells : Cells
         The cells in which it is sampled.
     row_z : (rows + 1,) float32 array
@@ -160,16 +163,20 @@ class EnvironmentLight:
         """`envmap` of arrays that lie elsewhere."""
         height, width = self.texels.shape[:2]
         cells, product = self.cells, self.product
+        texels = address_of(self.texels)
+        one = cells.step == 1
         return EnvMap(
-            address_of(self.texels),
+            texels,
             height,
             width,
             address_of(cells.runs),
             address_of(cells.guide),
             len(cells.guide),
             address_of(self.row_z),
-            cells.step,
-            width // cells.step,
+            texels + 3 * self.texels.itemsize if one else address_of(cells.grid),
+            4 if one else 1,
+            *cells.grid.shape,
+            np.float32(1.0 / cells.power if cells.power > 0.0 else 0.0),
             address_of(product.starts),
             address_of(product.slices),
             address_of(product.ratio),
@@ -230,13 +237,30 @@ def map_at(dx, dy, dz, envmap):  # type: ignore[no-untyped-def]
 
 
 @njit
-def envmap_pdf(u, v, product, envmap):  # type: ignore[no-untyped-def]
+def height_in_map(dx, dy, dz, envmap):  # type: ignore[no-untyped-def]
+    """z of a world direction in the environment's frame, for `envmap_pdf`.
+
+    Parameters
+    ----------
+    dx, dy, dz : float32
+        Unit, world.
+    envmap : EnvMap
+
+    Returns
+    -------
+    float32
+    """
+    return envmap.zx * dx + envmap.zy * dy + envmap.zz * dz
+
+
+@njit
+def envmap_pdf(u, v, z, product, envmap):  # type: ignore[no-untyped-def]
     """The pdf per solid angle of environment sampling (PBRT 12.5), at a surface.
 
     Parameters
     ----------
-    u, v : float32
-        Lat-long coordinates of the direction, in [0, 1].
+    u, v, z : float32
+        Lat-long coordinates of the direction, in [0, 1], and `height_in_map`.
     product : int32
         `product_row` of the surface's normal.
     envmap : EnvMap
@@ -246,12 +270,31 @@ def envmap_pdf(u, v, product, envmap):  # type: ignore[no-untyped-def]
     float32
         sr^-1.
     """
-    row = min(np.int64(envmap.height - 1), np.int64(v * np.float32(envmap.height)))
-    column = min(np.int64(envmap.width - 1), np.int64(u * np.float32(envmap.width)))
-    density = load_float(envmap.texels, 4 * (row * envmap.width + column) + 3)
-    if envmap.step > 1:
-        row, column = row // envmap.step, column // envmap.step
-    return density * product_ratio(product, row, column, envmap)
+    one, half = np.float32(1.0), np.float32(0.5)
+    x = u * np.float32(envmap.columns) + half
+    row = min(np.int64(v * np.float32(envmap.rows) + half), np.int64(envmap.rows))
+    column = np.int64(x)
+    upper, lower = load_float(envmap.row_z, row), load_float(envmap.row_z, row + 1)
+    t = min(max((upper - z) / (upper - lower), np.float32(0.0)), one)
+    s = min(x - np.float32(column), one)
+    column = column if column < envmap.columns else 0
+    a, b, c, d = _corners(row, column, envmap)
+    upper, lower = (one - s) * a + s * b, (one - s) * c + s * d
+    return ((one - t) * upper + t * lower) * envmap.scale * product_ratio(product, row, column, envmap)
+
+
+@njit
+def _corners(row, column, envmap):  # type: ignore[no-untyped-def]
+    """Luminance at the corners of a cell: upper left, upper right, lower left, lower right."""
+    upper, lower = max(row - 1, 0) * envmap.columns, min(row, envmap.rows - 1) * envmap.columns
+    left = column - 1 if column > 0 else envmap.columns - 1
+    grid, stride = envmap.grid, envmap.stride
+    return (
+        load_float(grid, stride * (upper + left)),
+        load_float(grid, stride * (upper + column)),
+        load_float(grid, stride * (lower + left)),
+        load_float(grid, stride * (lower + column)),
+    )
 
 
 @njit
@@ -348,7 +391,7 @@ def cell_end(cell_index, envmap):  # type: ignore[no-untyped-def]
 
 @njit
 def cell_at(cell_index, envmap):  # type: ignore[no-untyped-def]
-    """A sampling cell and its pdf without regard to a normal.
+    """A sampling cell, for `direction_in_cell`.
 
     Parameters
     ----------
@@ -358,22 +401,29 @@ def cell_at(cell_index, envmap):  # type: ignore[no-untyped-def]
 
     Returns
     -------
-    row, column : int64
+    column : int64
         Of the cell among cells.
     upper, lower : float32
         z of the upper and lower edge of its row, in the environment's frame.
-    density : float32
-        Pdf per solid angle, sr^-1.
+    a, b, c, d : float32
+        Luminance at its corners: upper left, upper right, lower left, lower right.
     """
     cell = np.int64(load_uint32(envmap.cells, 2 * np.int64(cell_index) + 1))
     row, column = cell // envmap.columns, cell % envmap.columns
-    density = load_float(envmap.texels, 4 * (row * envmap.step * envmap.width + column * envmap.step) + 3)
-    return row, column, load_float(envmap.row_z, row), load_float(envmap.row_z, row + 1), density
+    a, b, c, d = _corners(row, column, envmap)
+    return column, load_float(envmap.row_z, row), load_float(envmap.row_z, row + 1), a, b, c, d
+
+
+@inlined
+def _on_slope(number, start, end):  # type: ignore[no-untyped-def]
+    """Place in [0, 1] of a random number, in proportion to what goes from `start` to `end` there (PBRT A.5.1)."""
+    root = math.sqrt(start * start + number * (end * end - start * start))
+    return min(number * (start + end) / max(start + root, np.float32(1e-37)), np.float32(1.0))
 
 
 @njit
-def direction_in_cell(column, upper, lower, n0, n1, envmap):  # type: ignore[no-untyped-def]
-    """Direction uniform in the solid angle of a cell.
+def direction_in_cell(column, upper, lower, corners, n0, n1, envmap):  # type: ignore[no-untyped-def]
+    """Direction in the solid angle of a cell, in proportion to the blend of its corners' luminance.
 
     Parameters
     ----------
@@ -381,6 +431,8 @@ def direction_in_cell(column, upper, lower, n0, n1, envmap):  # type: ignore[no-
         Of the cell.
     upper, lower : float32
         z of its edges, see `cell_at`.
+    corners : tuple of float32
+        Luminance, see `cell_at`.
     n0, n1 : uint32
         Random numbers: azimuth, z.
     envmap : EnvMap
@@ -391,16 +443,25 @@ def direction_in_cell(column, upper, lower, n0, n1, envmap):  # type: ignore[no-
         Unit, world.
     u, v : float32
         Lat-long coordinates, in [0, 1].
+    density : float32
+        Pdf per solid angle without regard to a normal, sr^-1.
     """
-    u = (np.float32(column) + unit(n0)) / np.float32(envmap.columns)
-    z = upper + unit(n1) * (lower - upper)
-    s, c = sincos_turns(np.float32(0.5) - u)
-    ring = math.sqrt(max(np.float32(0.0), np.float32(1.0) - z * z))
-    x, y = ring * c, ring * s
+    a, b, c, d = corners
+    one = np.float32(1.0)
+    t = _on_slope(unit(n1), a + b, c + d)
+    left, right = (one - t) * a + t * c, (one - t) * b + t * d
+    s = _on_slope(unit(n0), left, right)
+    u = (np.float32(column) + s - np.float32(0.5)) / np.float32(envmap.columns)
+    u = u if u >= np.float32(0.0) else u + one
+    z = upper + t * (lower - upper)
+    sine, cosine = sincos_turns(np.float32(0.5) - u)
+    ring = math.sqrt(max(np.float32(0.0), one - z * z))
+    x, y = ring * cosine, ring * sine
     dx = envmap.xx * x + envmap.yx * y + envmap.zx * z
     dy = envmap.xy * x + envmap.yy * y + envmap.zy * z
     dz = envmap.xz * x + envmap.yz * y + envmap.zz * z
-    return dx, dy, dz, u, fast_acos(z) * np.float32(1.0 / math.pi)
+    density = ((one - s) * left + s * right) * envmap.scale
+    return dx, dy, dz, u, fast_acos(z) * np.float32(1.0 / math.pi), density
 
 
 @njit
@@ -425,7 +486,8 @@ def _pdf_many(directions, product, envmap):  # type: ignore[no-untyped-def]
     out = np.empty(len(directions), np.float32)
     for i in range(len(directions)):
         u, v = map_at(directions[i, 0], directions[i, 1], directions[i, 2], envmap)
-        out[i] = envmap_pdf(u, v, product[i], envmap)
+        z = height_in_map(directions[i, 0], directions[i, 1], directions[i, 2], envmap)
+        out[i] = envmap_pdf(u, v, z, product[i], envmap)
     return out
 
 
@@ -440,9 +502,10 @@ def _sample_many(numbers, product, envmap):  # type: ignore[no-untyped-def]
         cell_index = first_cell(number, envmap)
         while number > cell_end(cell_index, envmap):
             cell_index += 1
-        _, column, upper, lower, pdf[i] = cell_at(cell_index, envmap)
-        pdf[i] *= ratio
-        directions[i, 0], directions[i, 1], directions[i, 2], _, _ = direction_in_cell(
-            column, upper, lower, numbers[i, 1], numbers[i, 2], envmap
+        column, upper, lower, a, b, c, d = cell_at(cell_index, envmap)
+        dx, dy, dz, _, _, density = direction_in_cell(
+            column, upper, lower, (a, b, c, d), numbers[i, 1], numbers[i, 2], envmap
         )
+        directions[i, 0], directions[i, 1], directions[i, 2] = dx, dy, dz
+        pdf[i] = density * ratio
     return directions, pdf

@@ -1,8 +1,9 @@
 """The environment map CDF: the power of each sampling cell, and the random numbers that are inverted to it.
 
-Cells follow each other in Morton order, so that equal strata of a random number are compact regions of equal power,
-which an alias table would scatter. That order goes through square blocks one after another, which is how the work is
-divided among threads: results do not depend on their number.
+A cell lies between the centres of four neighbouring texels, so that a lookup in it is one bilinear blend, by which
+directions in the cell are drawn. Cells follow each other in Morton order, so that equal strata of a random number are
+compact regions of equal power, which an alias table would scatter. That order goes through square blocks one after
+another, which is how the work is divided among threads: results do not depend on their number.
 """
 
 from __future__ import annotations
@@ -32,15 +33,16 @@ class Cells:
     Attributes
     ----------
     step : int
-        Texels along a side of a cell.
+        Texels along a side of a place of `grid`.
+    grid : (h / step, w / step) float32 array
+        Luminance: of the texels, or means over step x step of them. Cells lie between its places' centres, in one row
+        more, as those of the first and the last row end at the poles.
     edges : (rows + 1,) array
         z at the upper edge of each row of cells, from 1 to -1.
     runs : (k, 2) uint32 array
         Last random number that falls on a cell, and the cell; the lit cells in Morton order.
     guide : (2^b,) int32 array
         Where to start looking in `runs`, for equal slices of the random numbers.
-    density : (rows, columns) float32 array
-        Probability per solid angle; 0 everywhere when black.
     power : float
         Luminance integrated over all directions.
     shift : int
@@ -57,28 +59,29 @@ class Cells:
     Parameters
     ----------
     texels : (h, w, 4) float32 array
-        Finite linear Rec.709 radiance; the density of its cell is written to the last place.
+        Finite linear Rec.709 radiance; with a `step` of 1, `grid` is in the last place.
     """
 
     def __init__(self, texels: Array) -> None:
         h, w = texels.shape[:2]
         self.step = _step(h, w)
-        rows, columns = h // self.step, w // self.step
-        self.edges = np.cos(np.pi * np.arange(rows + 1) / rows)
-        self.edges[0], self.edges[-1] = 1.0, -1.0
-        solid = -np.diff(self.edges) * (2.0 * math.pi / columns)
-        weights = np.zeros((rows, columns))
+        height, columns = h // self.step, w // self.step
+        self.grid = texels[:, :, 3] if self.step == 1 else np.zeros((height, columns), np.float32)
         red, green, blue = (float(weight) for weight in LUMINANCE)
-        strip = -(-_STRIP // self.step) * self.step
-        luminance = red, green, blue
-        over_range(_weigh, -(-h // strip), strip, texels, luminance, solid, self.step, weights)
+        over_range(_measure, -(-height // _STRIP), texels, (red, green, blue), self.step, self.grid)
+        rows = height + 1
+        self.edges = np.cos(np.pi * np.clip((np.arange(rows + 1) - 0.5) / height, 0.0, 1.0))
+        self.edges[0], self.edges[-1] = 1.0, -1.0
+        self._solid = -np.diff(self.edges) * (2.0 * math.pi / columns)
+        weights = np.zeros((rows, columns))
+        over_range(_weigh, rows, self.grid, self._solid, weights, fewest=_STRIP)
 
         self.shift = 0
-        while -(-rows >> self.shift) * -(-columns >> self.shift) > _MOST_BLOCKS:
+        while -(-height >> self.shift) * -(-columns >> self.shift) > _MOST_BLOCKS:
             self.shift += 1
-        height, width = -(-rows >> self.shift), -(-columns >> self.shift)
-        places = _morton_order(height, width)
-        corners = (np.stack(np.divmod(places, width), axis=1) << self.shift).astype(np.int32)
+        down, across = -(-rows >> self.shift), -(-columns >> self.shift)
+        places = _morton_order(down, across)
+        corners = (np.stack(np.divmod(places, across), axis=1) << self.shift).astype(np.int32)
         side = 1 << self.shift
         inner = np.stack(np.divmod(_morton_order(side, side), side), axis=1).astype(np.int32)
         coarse = max(0, self.shift - _PARTS.bit_length() + 1)
@@ -95,7 +98,7 @@ class Cells:
         with_light = lit > 0
         self.corners, lit = corners[with_light], lit[with_light]
         self.parts = parts[:, with_light] / parts.sum()
-        self.block = np.zeros((height, width), np.int32)
+        self.block = np.zeros((down, across), np.int32)
         self.block.ravel()[places[with_light]] = np.arange(len(lit))
         # Every cell gets one random number, and its share of the others.
         reached = np.append(0.0, np.cumsum(self.parts.sum(axis=0)))
@@ -106,22 +109,27 @@ class Cells:
         self.first = starts[:-1].astype(np.uint32)
         self.runs = np.empty((int(before[-1]), 2), np.uint32)
         self.guide = np.zeros(1 << (rows * columns - 1).bit_length(), np.int32)
-        self.density = np.zeros((rows, columns), np.float32)
-        unit = 2.0**-32 if self.power > 0.0 else 0.0
         dealt = _Blocks(self.corners, inner, before, reached, starts)
-        out = self.runs, self.guide, self.density, texels
-        scale, per_number = 1.0 / parts.sum(), unit / solid
-        over_range(_deal, len(lit), weights, scale, spare, dealt, per_number, self.step, out, fewest=few)
+        scale = 1.0 / parts.sum()
+        over_range(_deal, len(lit), weights, scale, spare, dealt, self.runs, self.guide, fewest=few)
+
+    @property
+    def density(self) -> Array:
+        """(rows, columns) float64 probability of each cell by its solid angle; 0 everywhere when black."""
+        found = np.zeros((len(self._solid), self.grid.shape[1]))
+        if self.power > 0.0:
+            found.ravel()[self.runs[:, 1]] = np.diff(self.runs[:, 0].astype(np.int64), prepend=-1) * 2.0**-32
+        return found / self._solid[:, None]
 
     def part_directions(self) -> Array:
         """(3, p, n) float32 unit directions towards the middles of `parts`, in the environment's frame."""
-        rows, columns = len(self.edges) - 1, self.density.shape[1]
+        rows, columns = len(self.edges) - 1, self.grid.shape[1]
         along = math.isqrt(len(self.parts))
         side = (1 << self.shift) // along
         row, column = np.stack(np.divmod(np.arange(len(self.parts)), along))[:, :, None] * side
         top, left = np.minimum(self.corners[:, 0] + row, rows), np.minimum(self.corners[:, 1] + column, columns)
         z = 0.5 * (self.edges[top] + self.edges[np.minimum(top + side, rows)])
-        turn = 0.5 - 0.5 * (left + np.minimum(left + side, columns)) / columns
+        turn = 0.5 - 0.5 * (left + np.minimum(left + side, columns) - 1) / columns
         ring = np.sqrt(np.maximum(0, 1 - z * z))
         return np.stack([ring * np.cos(2 * np.pi * turn), ring * np.sin(2 * np.pi * turn), z]).astype(np.float32)
 
@@ -168,32 +176,46 @@ def _luminance(texels, row, red, green, blue, out):  # type: ignore[no-untyped-d
 
 
 @njit
-def _weigh(first, last, strip, texels, luminance, solid, step, weights):  # type: ignore[no-untyped-def]
-    """Add to each cell its solid angle times the mean luminance, as the bilinear lookup has it, over its texels.
+def _measure(first, last, texels, luminance, step, grid):  # type: ignore[no-untyped-def]
+    """Write the luminance of strips of the grid.
 
-    The mean over a texel of the bilinear interpolant is three quarters of itself and an eighth of either neighbour,
-    along both axes; columns wrap, rows clamp.
+    Of several texels it is their mean as the bilinear lookup has them, so that it is positive wherever a lookup is:
+    over a texel, the mean of the interpolant is three quarters of itself and an eighth of either neighbour, along both
+    axes; columns wrap, rows clamp.
     """
     h, w = texels.shape[:2]
     red, green, blue = luminance
-    upper, here, lower, mixed = np.empty(w), np.empty(w), np.empty(w), np.empty(w)
-    for s in range(first, last):
-        top, end = s * strip, min(h, (s + 1) * strip)
-        _luminance(texels, max(top - 1, 0), red, green, blue, upper)
-        _luminance(texels, top, red, green, blue, here)
-        for row in range(top, end):
-            _luminance(texels, min(row + 1, h - 1), red, green, blue, lower)
-            for c in range(w):
-                mixed[c] = 0.75 * here[c] + 0.125 * (upper[c] + lower[c])
-            scale = solid[row // step] / (step * step)
-            for cell, c in enumerate(range(0, w, step)):
-                total = 0.0
-                for k in range(c, min(c + step, w)):
-                    before, after = mixed[k - 1 if k else w - 1], mixed[k + 1 if k + 1 < w else 0]
-                    total += 0.75 * mixed[k] + 0.125 * (before + after)
-                weights[row // step, cell] += total * scale
-            for c in range(w):
-                upper[c], here[c] = here[c], lower[c]
+    upper, here, lower = np.empty(w), np.empty(w), np.empty(w)
+    total = np.empty(grid.shape[1])
+    for row in range(first * _STRIP, min(last * _STRIP, len(grid))):
+        total[:] = 0.0
+        for y in range(row * step, (row + 1) * step):
+            _luminance(texels, y, red, green, blue, here)
+            if step > 1:
+                _luminance(texels, max(y - 1, 0), red, green, blue, upper)
+                _luminance(texels, min(y + 1, h - 1), red, green, blue, lower)
+                for x in range(w):
+                    upper[x] = 0.75 * here[x] + 0.125 * (upper[x] + lower[x])
+                for x in range(w):
+                    before, after = upper[x - 1 if x else w - 1], upper[x + 1 if x + 1 < w else 0]
+                    here[x] = 0.75 * upper[x] + 0.125 * (before + after)
+            for x in range(len(total) * step):
+                total[x // step] += here[x]
+        for column in range(len(total)):
+            grid[row, column] = total[column] / (step * step)
+
+
+@njit
+def _weigh(first, last, grid, solid, weights):  # type: ignore[no-untyped-def]
+    """Write to each cell its solid angle times the mean of the luminance at its corners."""
+    height, columns = grid.shape
+    for row in range(first, last):
+        upper, lower = max(row - 1, 0), min(row, height - 1)
+        for c in range(columns):
+            b = c - 1 if c else columns - 1
+            left = np.float64(grid[upper, b]) + np.float64(grid[lower, b])
+            right = np.float64(grid[upper, c]) + np.float64(grid[lower, c])
+            weights[row, c] = 0.25 * (left + right) * solid[row]
 
 
 @njit
@@ -235,8 +257,8 @@ class _Blocks(NamedTuple):
 
 
 @njit
-def _deal(first, last, weights, scale, spare, blocks, per_number, step, out):  # type: ignore[no-untyped-def]
-    """Divide the random numbers of each block among its lit cells; write their densities.
+def _deal(first, last, weights, scale, spare, blocks, runs, guide):  # type: ignore[no-untyped-def]
+    """Divide the random numbers of each block among its lit cells.
 
     Parameters
     ----------
@@ -245,15 +267,10 @@ def _deal(first, last, weights, scale, spare, blocks, per_number, step, out):  #
     spare : int
         Random numbers beyond one for each lit cell.
     blocks : _Blocks
-    per_number : array
-        Density of one random number in a cell of each row.
-    step : int
-        `Cells.step`.
-    out : tuple of array
-        Runs, guide, density and texels of `Cells`; written.
+    runs, guide : array
+        Of `Cells`; written.
     """
     corners, inner, before, reached, starts = blocks
-    runs, guide, density, texels = out
     rows, columns = weights.shape
     width = (np.int64(1) << 32) // len(guide)
     for b in range(first, last):
@@ -268,8 +285,4 @@ def _deal(first, last, weights, scale, spare, blocks, per_number, step, out):  #
                 runs[i - 1, 1] = np.uint32(row * columns + column)
                 for slice_ in range((start + width - 1) // width, (end - 1) // width + 1):
                     guide[slice_] = i - 1
-                density[row, column] = (end - start) * per_number[row]
-                for y in range(row * step, (row + 1) * step):
-                    for x in range(column * step, (column + 1) * step):
-                        texels[y, x, 3] = density[row, column]
                 start = end
