@@ -205,6 +205,31 @@ def test_light_on_a_surface_is_found_with_little_noise(normal: tuple[float, floa
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "large"])
+@pytest.mark.parametrize("normal", [(0, 0, 1), (0.6, 0.0, 0.8), (0.48, -0.64, -0.6)])
+@pytest.mark.parametrize("count", [(0, 16), (8, 24)])
+def test_strategies_together_find_the_irradiance(
+    kind: str, normal: tuple[float, float, float], count: tuple[int, int]
+) -> None:
+    """Environment and cosine samples by the balance heuristic: what tables leave to the others is not lost."""
+    light, n = EnvironmentLight(World(environment=picture(kind))), np.array(normal)
+    cosines, lights = 50_000 * np.array(count) // sum(count)
+    drawn, _ = light.sample(numbers(lights, seed=1), normal)
+    height, turn = np.random.default_rng(2).random((2, cosines)) * [[1.0], [2 * np.pi]]
+    a = np.linalg.svd(n[None])[2]
+    ring = np.sqrt(height)
+    about = ring * np.cos(turn) * a[1][:, None] + ring * np.sin(turn) * a[2][:, None] + np.sqrt(1 - height) * n[:, None]
+    found, seen = 0.0, 0.0
+    for directions in (drawn, about.T.astype(np.float32)):
+        cosine = np.maximum(directions @ n, 0)
+        density = lights * light.pdf(directions, normal).astype(float) + cosines * cosine / np.pi
+        value = light.lookup(directions) @ LUMINANCE * cosine / np.maximum(density, 1e-30)
+        found, seen = found + value.sum(), seen + (value**2).sum()
+    grid, angle = sphere_grid(960, 1920)
+    expected = (light.lookup(grid) @ LUMINANCE * np.maximum(grid @ n, 0)) @ angle
+    assert abs(found - expected) < 5 * np.sqrt(seen) + 3e-3 * expected + 1e-4 * light.power
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "large"])
 def test_where_light_is_there_is_density(kind: str) -> None:
     light = EnvironmentLight(World(environment=picture(kind)))
     directions, _ = sphere_grid(300, 600)

@@ -122,16 +122,18 @@ class Cells:
         return found / self._solid[:, None]
 
     def part_directions(self) -> Array:
-        """(3, p, n) float32 unit directions towards the middles of `parts`, in the environment's frame."""
+        """(4, p, n) float32 unit directions to the middles of `parts`, in the environment's frame, and solid angles."""
         rows, columns = len(self.edges) - 1, self.grid.shape[1]
         along = math.isqrt(len(self.parts))
         side = (1 << self.shift) // along
         row, column = np.stack(np.divmod(np.arange(len(self.parts)), along))[:, :, None] * side
         top, left = np.minimum(self.corners[:, 0] + row, rows), np.minimum(self.corners[:, 1] + column, columns)
-        z = 0.5 * (self.edges[top] + self.edges[np.minimum(top + side, rows)])
-        turn = 0.5 - 0.5 * (left + np.minimum(left + side, columns) - 1) / columns
+        bottom, right = np.minimum(top + side, rows), np.minimum(left + side, columns)
+        z = 0.5 * (self.edges[top] + self.edges[bottom])
+        solid = (self.edges[top] - self.edges[bottom]) * (right - left) * (2 * np.pi / columns)
+        turn = 0.5 - 0.5 * (left + right - 1) / columns
         ring = np.sqrt(np.maximum(0, 1 - z * z))
-        return np.stack([ring * np.cos(2 * np.pi * turn), ring * np.sin(2 * np.pi * turn), z]).astype(np.float32)
+        return np.stack([ring * np.cos(2 * np.pi * turn), ring * np.sin(2 * np.pi * turn), z, solid]).astype(np.float32)
 
 
 def _step(h: int, w: int) -> int:
