@@ -162,6 +162,7 @@ METAL = {"metallic": 1.0, "albedo": 0.8}
 SCENES = (
     Scene("statue", "demosthenes", "sunrise", parts=(Part("demosthenes", (0.3, 0.08), **METAL),)),
     Scene("statue-rough", "demosthenes", "sunrise", parts=(Part("demosthenes", 0.8, albedo=0.6),)),
+    Scene("statue-brushed", "demosthenes", "sunrise", parts=(Part("demosthenes", (0.6, 0.4), **METAL),)),
     Scene("statue-city", "demosthenes", "city", bounces=4, parts=(Part("demosthenes", 0.2, **METAL),)),
     Scene("lamps-indoors", "skull", "interior", parts=(Part("skull", (0.15, 0.7), (0.0, 1.0), albedo=0.7),)),
     Scene("dim", "robot", "night", strength=3.0, parts=(Part("robot", (0.1, 0.9), (1.0, 0.0)),)),

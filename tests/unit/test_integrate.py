@@ -575,7 +575,7 @@ def test_points_of_a_pixel_agree_on_their_samples() -> None:
     for share in np.linspace(0.1, 0.8, 141, dtype=np.float32):
         state = np.zeros((1, POINT_STATE), np.float32)
         state[0, ALPHA] = 0.2**4
-        _allocate.py_func(state, 0, share, sampler)
+        _allocate.py_func(state, 0, share, 1, sampler)
         counts.append(state[0, COUNTS:])
     assert (np.sum(counts, axis=1) == 128).all() and (np.round(counts) == counts).all()
     assert 4 < len(np.unique(counts, axis=0)) < 20

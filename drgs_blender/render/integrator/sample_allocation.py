@@ -25,6 +25,8 @@ POINT_STATE = 16
 #: Part of the samples that go to the light where the surface is all diffuse, and for a specular lobe; less where that
 #: is narrow: the part is `_LIGHT_GLOSSY` from this alpha on.
 _LIGHT_DIFFUSE, _LIGHT_GLOSSY, _WIDE = F(0.75), F(0.5), F(0.03)
+#: The same of metals that reflect each other: there that is what is noisy, and the light is found with few samples.
+_LIGHT_METAL = F(0.25)
 
 
 @njit
@@ -33,7 +35,7 @@ def _rounded(x):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _allocate(state, h, share, sampler):  # type: ignore[no-untyped-def]
+def _allocate(state, h, share, bounces, sampler):  # type: ignore[no-untyped-def]
     """Samples a pixel of each strategy at the h-th point; `share` is the diffuse lobe's part of what it reflects.
 
     Whole numbers in coarse steps: points of one pixel mostly agree, and then their samples add up to these numbers.
@@ -43,7 +45,8 @@ def _allocate(state, h, share, sampler):  # type: ignore[no-untyped-def]
     if sampler.auto:
         total = cosine + ggx + light
         alpha = F(math.sqrt(state[h, ALPHA]))
-        glossy = _LIGHT_GLOSSY * min(ONE, max(F(0.05), alpha / _WIDE))
+        most = _LIGHT_METAL if share == ZERO and bounces > 0 else _LIGHT_GLOSSY
+        glossy = most * min(ONE, max(F(0.05), alpha / _WIDE))
         light = total * min(sampler.most_light, share * _LIGHT_DIFFUSE + (ONE - share) * glossy)
         light = light if envmap + lights > ZERO else ZERO
         ggx = (total - light) * (ONE - share)
@@ -111,7 +114,7 @@ def write_point_states(first, last, points, scene, settings, sampler, scratch): 
         state[h, WEIGHTS + 1], state[h, WEIGHTS + 2], state[h, WEIGHTS + 3] = metal
         state[h, NORMAL], state[h, NORMAL + 1], state[h, NORMAL + 2] = mx, my, mz
         row[h] = U(product_row(normal[i, 0], normal[i, 1], normal[i, 2], envmap))
-        _allocate(state, h, w.diffuse_share(mv, own, weights, shading_model), sampler)
+        _allocate(state, h, w.diffuse_share(mv, own, weights, shading_model), settings.bounces, sampler)
 
 
 @njit
