@@ -581,6 +581,20 @@ def test_points_of_a_pixel_agree_on_their_samples() -> None:
     assert 4 < len(np.unique(counts, axis=0)) < 20
 
 
+def test_metals_that_reflect_each_other_have_fewer_samples_of_the_light() -> None:
+    """With bounces their noise is that of what they reflect; other surfaces have as many as without."""
+    sampler = Sampler._make([0, np.zeros((0, 3), np.uint32), 1, 0, 1, True, *np.float32([64, 32, 32, 1, 0, 1])])
+
+    def of_light(share: float, bounces: int) -> float:
+        state = np.zeros((1, POINT_STATE), np.float32)
+        state[0, ALPHA] = 0.5**4
+        _allocate.py_func(state, 0, np.float32(share), bounces, sampler)
+        return float(state[0, COUNTS + 2])
+
+    assert 0 < of_light(0.0, 1) < of_light(0.0, 0)
+    assert of_light(0.5, 1) == of_light(0.5, 0)
+
+
 def test_no_bit_depends_on_the_neighbours_where_batches_overflow() -> None:
     """Samples of a point that fall into two batches of rays, paths too many for one, lights and sky at once."""
     box = trimesh.creation.box((4, 4, 4))
