@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import bpy
 
-from . import assets, cage_nodes, engine_link, setup_job, world_setup
+from . import assets, carrier_nodes, engine_link, setup_job, world_setup
 
 ENGINE = "DRGS"
 #: Modifiers that follow another object, in the order in which an artist thinks of them.
@@ -56,7 +56,7 @@ def target(context: bpy.types.Context) -> bpy.types.Object | None:
 def poser_of(obj: bpy.types.Object) -> bpy.types.Object | None:
     """The object that deforms a DR-GS object: armature, lattice or cage, in this order."""
     moved_by = {m.type: m.target if m.type == "SURFACE_DEFORM" else m.object for m in obj.modifiers if m.type in BENDS}
-    carriers = (*(moved_by.get(kind) for kind in BENDS), *map(cage_nodes.cage_of, obj.modifiers))
+    carriers = (*(moved_by.get(kind) for kind in BENDS), *map(carrier_nodes.carrier_of, obj.modifiers))
     return next((found for found in carriers if found is not None), None)
 
 

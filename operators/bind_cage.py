@@ -7,12 +7,14 @@ import bpy
 import numpy as np
 from bpy.props import IntProperty
 
-from ..addon import assets, cage_nodes, mesh_arrays
+from ..addon import assets, carrier_nodes, carrier_weights, mesh_arrays
 from ..drgs_blender.core.errors import UsageError
 from . import selection
 from .base import DrgsOperator
 
 NAME = "DR-GS Cage"
+#: Ends the name of the modifier for the cage as it is rendered.
+_RENDERED = " Render"
 #: Voxels along the diagonal from which a new cage is made, before it is thinned out.
 VOXELS = 48
 
@@ -47,10 +49,12 @@ class DRGS_OT_bind_to_cage(DrgsOperator, selection.ObjectMode, bpy.types.Operato
 def bind_to_cage(context: bpy.types.Context, objects: list[bpy.types.Object], cage: bpy.types.Object) -> dict[str, str]:
     """Bind `objects` as they are now to `cage` as it is now; the cage is shown as wires and not rendered.
 
+    Where it has other points in renders than in viewports, there is a modifier for each.
+
     Returns
     -------
     dict
-        Object name -> why Surface Deform did not take it, so that `cage_nodes` carry it.
+        Object name -> why Surface Deform did not take it, so that `carrier_nodes` carry it.
 
     Raises
     ------
@@ -61,33 +65,68 @@ def bind_to_cage(context: bpy.types.Context, objects: list[bpy.types.Object], ca
     selection.in_world(cage, mesh_arrays.read_vertices(shape))
     if not any(p.area > 0 for p in shape.polygons):
         raise UsageError(f'Cage "{cage.name}"', "has no faces that could carry anything", "Give it faces")
-    refused, done = {}, []
+    count = len(shape.vertices)
+    with carrier_weights.as_rendered(cage):
+        rendered = len(cage.evaluated_get(context.evaluated_depsgraph_get()).data.vertices)
+    refused = {}
     for obj in objects:
-        modifier = selection.add_modifier(obj, "SURFACE_DEFORM", NAME, target=cage)
-        done.append((obj, modifier))
-        context.view_layer.update()
-        with context.temp_override(object=obj, active_object=obj, selected_objects=[obj]):
-            try:
-                bpy.ops.object.surfacedeform_bind(modifier=modifier.name)
-                reason = ""
-            except RuntimeError as error:
-                reason = str(error).removeprefix("Error: ").strip().rstrip(".")
-        context.view_layer.update()
-        if not modifier.is_bound:
-            refused[obj.name] = reason or "a face is concave, or an edge has more than two"
+        remove(obj)
+        reason = _surface_deform(context, obj, cage, NAME, count)
+        if not reason and rendered != count:
+            shown = obj.modifiers[NAME]
+            shown.show_render = shown.show_viewport = False
+            with carrier_weights.as_rendered(cage):
+                reason = _surface_deform(context, obj, cage, NAME + _RENDERED, rendered)
+            shown.show_viewport = True
+            obj.modifiers[NAME + _RENDERED].show_viewport = False
+        if reason:
+            refused[obj.name] = reason
     left = [obj for obj in objects if obj.name in refused]
     try:
         _check_carried(left, cage)
     except UsageError:
-        for obj, modifier in done:
-            obj.modifiers.remove(modifier)
+        for obj in objects:
+            remove(obj)
         raise
     for obj in left:
+        remove(obj)
         modifier = selection.add_modifier(obj, "NODES", NAME)
         context.view_layer.update()
-        cage_nodes.carry(obj, cage, modifier)
+        carrier_weights.carry(obj, cage, modifier)
     cage.display_type, cage.hide_render = "WIRE", True
     return refused
+
+
+def remove(obj: bpy.types.Object) -> None:
+    """Take away what `bind_to_cage` added."""
+    counts = dict(obj.get(carrier_nodes.COUNT, {}))
+    for known in (NAME, NAME + _RENDERED):
+        if (modifier := obj.modifiers.get(known)) is not None:
+            obj.modifiers.remove(modifier)
+        counts.pop(known, None)
+    if counts:
+        obj[carrier_nodes.COUNT] = counts
+    elif carrier_nodes.COUNT in obj:
+        del obj[carrier_nodes.COUNT]
+
+
+def _surface_deform(
+    context: bpy.types.Context, obj: bpy.types.Object, cage: bpy.types.Object, name: str, count: int
+) -> str:
+    """Bind by Surface Deform to a cage of `count` points; why it refuses, or nothing."""
+    modifier = selection.add_modifier(obj, "SURFACE_DEFORM", name, target=cage)
+    context.view_layer.update()
+    reason = ""
+    with context.temp_override(object=obj, active_object=obj, selected_objects=[obj]):
+        try:
+            bpy.ops.object.surfacedeform_bind(modifier=modifier.name)
+        except RuntimeError as error:
+            reason = str(error).removeprefix("Error: ").strip().rstrip(".")
+    context.view_layer.update()
+    if not modifier.is_bound:
+        return reason or "a face is concave, or an edge has more than two"
+    obj[carrier_nodes.COUNT] = {**dict(obj.get(carrier_nodes.COUNT, {})), name: count}
+    return ""
 
 
 def _check_carried(objects: list[bpy.types.Object], cage: bpy.types.Object) -> None:
@@ -95,7 +134,7 @@ def _check_carried(objects: list[bpy.types.Object], cage: bpy.types.Object) -> N
     for obj in selection.editable(objects, data=True) if objects else ():
         selection.check_size(obj)
         selection.check_size(cage)
-        cage_nodes.check_free(obj, NAME)
+        carrier_nodes.check_free(obj, NAME)
         if obj.data.users > 1:
             raise UsageError(
                 f'Object "{obj.name}"',

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..addon import assets, cage_nodes, point_nodes
+from ..addon import assets, carrier_nodes, carrier_weights
 from ..drgs_blender.core.errors import UsageError
 from . import selection
 from .base import DrgsOperator
@@ -12,6 +12,12 @@ from .base import DrgsOperator
 NAME = "DR-GS Driver"
 #: What can carry others, as it is evaluated.
 KINDS = "MESH", "POINTCLOUD"
+#: The share of an object's size that may be left of the way from the points that carry a vertex.
+_FAR = 0.02
+TOLD = (
+    '"{}": some of it is beside or amid the points of "{}", not among them, and follows roughly. Fill its volume with '
+    "points, or use a mesh with faces around it"
+)
 
 
 class DRGS_OT_drive_from(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
@@ -25,7 +31,11 @@ class DRGS_OT_drive_from(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
         name="From",
         description="What of the other object carries",
         items=(
-            ("GEOMETRY", "Geometry", "Its faces, or its points where it has no faces, with all modifiers"),
+            (
+                "GEOMETRY",
+                "Geometry",
+                "Its faces, or its points where it has no faces, with all modifiers; points should fill the object",
+            ),
             ("PARTICLES", "Particles", "The particles of its particle system; a mesh of a point for each is added"),
         ),
         default="GEOMETRY",
@@ -40,7 +50,7 @@ class DRGS_OT_drive_from(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
         (carrier,) = others
         for obj in objects:
             selection.check_size(obj)
-            cage_nodes.check_free(obj, NAME)
+            carrier_nodes.check_free(obj, NAME)
             if obj in shaped_by(carrier):
                 problem = f'shapes "{carrier.name}", which should carry it'
                 raise UsageError(f'Object "{obj.name}"', problem, "Remove the modifier there, or apply it")
@@ -52,17 +62,27 @@ class DRGS_OT_drive_from(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
                 )
         made = particles_of(context, carrier) if self.source == "PARTICLES" else None
         try:
-            drive(context, objects, carrier if made is None else made)
+            left = drive(context, objects, carrier if made is None else made)
         except UsageError:
             if made is not None:
                 bpy.data.meshes.remove(made.data)  # and the object
             raise
+        for obj, share in left.items():
+            if share > _FAR:
+                self.warn(TOLD.format(obj.name, (carrier if made is None else made).name))
         selection.select_only(context, objects, objects[-1])
         return {"FINISHED"}
 
 
-def drive(context: bpy.types.Context, objects: list[bpy.types.Object], carrier: bpy.types.Object) -> None:
-    """Let `carrier` carry `objects`: by its faces, or its points where it has none.
+def drive(
+    context: bpy.types.Context, objects: list[bpy.types.Object], carrier: bpy.types.Object
+) -> dict[bpy.types.Object, float]:
+    """Let `carrier` carry `objects`: by its points, and their normals where it has faces.
+
+    Returns
+    -------
+    dict
+        Object -> `carrier_weights.carry`
 
     Raises
     ------
@@ -71,13 +91,14 @@ def drive(context: bpy.types.Context, objects: list[bpy.types.Object], carrier: 
     """
     context.view_layer.update()
     evaluated = carrier.evaluated_get(context.evaluated_depsgraph_get())
-    selection.in_world(carrier, point_nodes.read_points(evaluated))
-    faces = carrier.type == "MESH" and any(p.area > 0 for p in evaluated.data.polygons)
+    selection.in_world(carrier, carrier_weights.read_points(evaluated))
+    left = {}
     for obj in objects:
         modifier = selection.add_modifier(obj, "NODES", NAME)
         context.view_layer.update()
-        (cage_nodes if faces else point_nodes).carry(obj, carrier, modifier)
+        left[obj] = carrier_weights.carry(obj, carrier, modifier)
     context.view_layer.update()
+    return left
 
 
 def shaped_by(carrier: bpy.types.Object) -> set[bpy.types.Object]:

@@ -16,7 +16,7 @@ from ...drgs_blender.core.asset.part import Part, has_surfels, part_of, whole_of
 from ...drgs_blender.core.frame import Adjustment, ObjectState, ProxyMesh
 from ...drgs_blender.core.materials import Image, ShaderAOV
 from ...drgs_blender.core.passes import Pass
-from .. import assets, cache_playback, cage_nodes, mesh_arrays, point_caches, proxies, surfel_points
+from .. import assets, cache_playback, carrier_nodes, mesh_arrays, point_caches, proxies, surfel_points
 from ..viewport_material import is_viewport_material
 from .aov_nodes import aov_values
 from .export_cache import PAINTED, ExportCache, uid
@@ -89,7 +89,7 @@ class DrgsObjects:
             check_modifiers(obj, self._depsgraph)
         elif obj.mode != "EDIT" and obj.original.drgs.surfel_points is None:
             self._separated.add(obj)
-        cage_nodes.check(obj, self._depsgraph, self._warn)
+        carrier_nodes.check(obj, self._depsgraph, self._warn)
         cache_playback.check(obj, self._warn, final=self._depsgraph.mode == "RENDER")
         appearance = (
             obj.drgs.show_captured, obj.drgs.adjustment.values(), str(cache_playback.fracture_state(obj)),

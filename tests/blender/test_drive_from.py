@@ -39,11 +39,13 @@ def grid(count=5, size=1.2):
 AFFINE = Matrix(((1.2, 0.3, 0, 0.4), (-0.2, 0.9, 0.1, -0.1), (0, 0.2, 0.8, 0.3), (0, 0, 0, 1)))
 
 
-@pytest.mark.parametrize("points", [grid(), grid()[:, :2] @ np.eye(2, 3), grid(2)[:1]], ids=["solid", "sheet", "one"])
-def test_nothing_moves_when_it_is_bound(ball, points):
+@pytest.mark.parametrize("size", [1, -0.7], ids=["", "mirrored"])
+@pytest.mark.parametrize("what", ["solid", "sheet", "one", "faces"])
+def test_nothing_moves_when_it_is_bound(ball, what, size):
     ball.matrix_world = Matrix.Translation((2, 0, 1)) @ Matrix.Rotation(0.5, 4, "X")
-    carrier = cloud_of(points)
-    carrier.matrix_world = Matrix.Translation((2.1, 0, 1)) @ Matrix.Rotation(0.2, 4, "Z")
+    points = {"solid": grid(), "sheet": grid()[:, :2] @ np.eye(2, 3), "one": grid(2)[:1]}
+    carrier = mesh_object("Body", *sphere(6, 9)) if what == "faces" else cloud_of(points[what])
+    carrier.matrix_world = Matrix.Translation((2.1, 0, 1)) @ Matrix.Rotation(0.2, 4, "Z") @ Matrix.Scale(size, 4)
     bpy.context.view_layer.update()
     before = world(ball)
     drive(ball, carrier)
@@ -121,6 +123,68 @@ def test_particles_of_a_system_carry_it(ball, scene):
     moved = world(points)[:, 2].mean() - start
     assert moved < -0.1
     assert abs((world(ball) - before)[:, 2].mean() - moved) < 0.03 * abs(moved)
+
+
+def edges_of(obj) -> np.ndarray:
+    return np.array([edge.vertices for edge in obj.data.edges])
+
+
+@pytest.mark.parametrize("faces", [True, False], ids=["faces", "points"])
+@pytest.mark.parametrize("around", [2.0, 3.0, 8.0])
+def test_what_surrounds_it_does_not_tear_it(ball, faces, around):
+    """Carried by a twisted sphere around it, neighbours stay as close as in a twisted ball."""
+    vertices, polygons = sphere(12, 20)
+    ball.location = (0.4, 0.2, 0.1)
+    before = world(ball)
+    carrier = mesh_object("Around", vertices * around, polygons if faces else [])
+    drive(ball, carrier)
+    twist = carrier.modifiers.new("Twist", "SIMPLE_DEFORM")
+    twist.deform_method, twist.deform_axis, twist.angle = "TWIST", "Z", 1.5
+    first, second = edges_of(ball).T
+    length = [np.linalg.norm(p[first] - p[second], axis=1) for p in (world(ball), before)]
+    shear = 1.5 * 1.5 / (2 * around) * np.linalg.norm(before[:, :2], axis=1).max()
+    assert (length[0] / length[1]).max() < 1 + shear and (length[1] / length[0]).max() < 1 + shear
+
+
+@pytest.mark.parametrize("faces", [True, False], ids=["faces", "points"])
+def test_points_that_do_not_fill_it_are_told(ball, faces):
+    vertices, polygons = sphere(12, 20)
+    messages = part("addon.messages")
+    messages.clear()
+    drive(ball, mesh_object("Around", vertices * 1.5, polygons if faces else []))
+    told = [m.text for m in messages.history if m.level == "WARNING"]
+    assert not told if faces else '"ball"' in told[0] and '"Around"' in told[0]
+    messages.clear()
+    ball.modifiers.clear()
+    drive(ball, cloud_of(grid()))
+    assert not messages.history
+
+
+@pytest.mark.parametrize("how", ["drive", "nodes", "cage"])
+def test_what_has_other_points_in_renders_carries_it_there_too(ball, captured, scene, how):
+    """Subdivided once in viewports and twice in renders, as Blender's modifier is when it is added."""
+    vertices, polygons = sphere(6, 9)
+    carrier = mesh_object("Body", vertices * 1.4, polygons)
+    carrier.modifiers.new("Subdivision", "SUBSURF")
+    if how == "nodes":
+        carrier.modifiers["Subdivision"].subdivision_type = "SIMPLE"
+    before = world(ball)
+    select(carrier, ball)
+    assert (bpy.ops.drgs.bind_to_cage if how == "cage" else bpy.ops.drgs.drive_from)() == {"FINISHED"}
+    assert carrier.modifiers[0].levels == 1 and carrier.modifiers[0].render_levels == 2
+    np.testing.assert_allclose(world(ball), before, atol=1e-4)
+    for vertex in carrier.data.vertices:
+        vertex.co.z += 0.7
+    messages = part("addon.messages")
+    messages.clear()
+    bpy.ops.render.render()
+    assert not [m.text for m in messages.history if "follow" in m.text]
+    (rendered,) = captured[-1].objects
+    for shown in (rendered.vertices, world(ball)):
+        np.testing.assert_allclose(shown - before, np.tile((0, 0, 0.7), (len(before), 1)), atol=1e-4)
+    carrier.modifiers[0].render_levels = 3
+    bpy.ops.render.render()
+    assert any('"Body", which carries it, has ' in m.text for m in messages.history)
 
 
 def test_another_number_of_points_is_told(ball, export):
