@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from ..core.asset.model import Asset, Binding, Surfels
 from ..core.color import srgb_to_linear
-from ..core.errors import UsageError
 from ..core.frame import RenderSettings, World
+from ..deform.rigid import pose_by_matrix
 from ..formats.harmonics import basis, whole_bands
 from ..geometry.normals import rotation_matrices
 from ..render.integrator.integrate import integrate
@@ -23,6 +24,8 @@ from ..render.surfels.surfel_bvh import SurfelBVH
 Array = np.ndarray
 Progress = Callable[[str, float], None]
 
+#: Samples by which it is found how open a side of a surfel is.
+_OPEN_SAMPLES = 32
 #: Surfels lit at once: bounds memory and the time until a cancel is seen.
 _BLOCK = 1 << 15
 
@@ -37,10 +40,12 @@ def relit_colours(
 ) -> Array:
     """Light that leaves each surfel along its normal, with shadows and indirect light of the asset's mesh.
 
+    Without a mesh light meets the surfels themselves; see `both_sides`.
+
     Parameters
     ----------
     asset : Asset
-        Its mesh is what light meets; object space is the world.
+        Its mesh, or its surfels, are what light meets; object space is the world.
     surfels : Surfels
         The asset's surfels, posed as `vertices` are.
     vertices : (n, 3) float32 array
@@ -60,7 +65,7 @@ def relit_colours(
     Raises
     ------
     UsageError
-        The asset has no mesh, or the settings are out of range.
+        The settings are out of range.
 
     Examples
     --------
@@ -80,9 +85,16 @@ def relit_colours(
            [0.5, 0.2, 0.1]], dtype=float32)
     """
     mesh = asset.mesh
-    if asset.binding is None:
-        raise UsageError("relit colours", "need a mesh for the light to meet", "Import the surfels with a mesh")
     scene = TraceScene()
+    if asset.binding is None:
+        tree = SurfelBVH()
+        tree.update(pose_by_matrix(surfels, np.eye(4)))
+        scene.update([])
+        size = float(tree.sizes(1)[0])
+        try:
+            return both_sides(scene, EnvironmentLight(world), surfels, 0, size, settings, None, tree, progress)
+        finally:
+            scene.close()
     scene.update([TraceObject("asset", vertices, mesh.faces, mesh.albedo, mesh.roughness, mesh.metallic)])
     points = points_on_mesh(surfels, vertices, mesh.faces, asset.binding)
     try:
@@ -144,23 +156,54 @@ def points_on_mesh(
     return _points(surfels, np.einsum("nk,nkj->nj", binding.barycentric, corners), normal, geometric)
 
 
-def points_of_surfels(surfels: Surfels, owner: int, size: float) -> ShadingPoints:
-    """The centres of `surfels` without a mesh, seen along their normals.
+def both_sides(
+    scene: TraceScene,
+    environment: EnvironmentLight,
+    surfels: Surfels,
+    owner: int,
+    size: float,
+    settings: RenderSettings,
+    lights: Lights | None,
+    tree: SurfelBVH,
+    progress: Progress | None = None,
+) -> Array:
+    """Light that leaves `surfels` without a mesh, (n, 3) float32 linear Rec.709.
+
+    Their normals face either way, and one of the sides may lie in the dark inside of a body, but splats have one colour
+    for both. Sides count by the square of the share of directions from which they are seen, and by their light: what is
+    inside shows its outside, a leaf its lit side.
 
     Parameters
     ----------
-    surfels : Surfels
     owner : int
         The object, by its number in the tree of surfels, that does not shade itself nearby.
     size : float
         Mean larger standard deviation of its surfels, metres.
     """
     normal = rotation_matrices(surfels.rotation.astype(np.float64))[..., 2]
-    return own_surfels(_points(surfels, surfels.centre, normal, normal), owner, size)
+    white = EnvironmentLight(World(colour=(1.0, 1.0, 1.0)))
+    few = replace(settings, samples=_OPEN_SAMPLES, strategy_samples=None, bounces=0)
+    n = len(surfels)
+    white_rough = {"albedo": np.ones((n, 3), np.float32), "roughness": np.ones(n, np.float32)}
+    total, weights = np.zeros((n, 3)), np.zeros((n, 1))
+    for part, side in enumerate((normal, -normal)):
+        points = own_surfels(_points(surfels, surfels.centre, side, side), owner, size)
+        bare = replace(points, metallic=np.zeros(n, np.float32), **white_rough)
+        share = light_components(scene, white, bare, few, None, tree)[:, 0].mean(axis=1, keepdims=True)
+        told = None if progress is None else partial(_half, progress, part)
+        colour = lit_colours(scene, environment, points, settings, lights, tree, told)
+        weight = np.maximum(share, 1e-3) ** 2 * np.maximum(colour.mean(axis=1, keepdims=True), 1e-9)
+        total += weight * colour
+        weights += weight
+    return (total / weights).astype(np.float32)
+
+
+def _half(progress: Progress, part: int, phase: str, done: float) -> None:
+    progress(phase, (part + done) / 2)
 
 
 def own_surfels(points: ShadingPoints, owner: int, size: float) -> ShadingPoints:
-    """The `points` with the numbers of their own surfels, see `points_of_surfels`."""
+    """The `points` with the numbers of their own surfels, see `both_sides`."""
     n = len(points)
     return replace(points, own=np.full(n, owner, np.int32), size=np.full(n, size, np.float32))
 

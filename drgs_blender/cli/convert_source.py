@@ -194,6 +194,10 @@ class FrameSource:
         self._frame = surface_frame(args.input, args.samples, session)
         self.notes: list[str] = []
         self._prepared, self._objects = session.prepare(self._frame)
+        if self._prepared.surfel_bvh is None and any(item.asset.binding is None for item in self._objects):
+            # Sheets would shade what lies on them.
+            self._frame = replace(self._frame, settings=replace(self._frame.settings, rays_see="surfels"))
+            self._prepared, self._objects = session.prepare(self._frame)
         self._visible = [i for i, item in enumerate(self._objects) if item.state.visibility.camera]
         self.names = [self._objects[i].state.name for i in self._visible]
         if args.object:
@@ -302,21 +306,21 @@ class FrameSource:
         return faded(posed, item.asset, item.channels.get("opacity"))
 
     def _lit(self, index: int, progress: FractionBar) -> Splats:
-        from ..build.relit import lit_colours, own_surfels, points_of_surfels, points_on_mesh
+        from ..build.relit import both_sides, lit_colours, own_surfels, points_on_mesh
 
         item, surfels, tree = self._objects[index], self._surfels(index), self._prepared.surfel_bvh
         size = 0.0 if tree is None else float(tree.sizes(len(self._objects))[index])
+        prepared, settings = self._prepared, self._frame.settings
+        light, lights = prepared.environment, prepared.lights
         if item.asset.binding is None:
-            points = points_of_surfels(surfels, index, size)
+            assert tree is not None  # `__init__` sees to it
+            colour = both_sides(prepared.scene, light, surfels, index, size, settings, lights, tree, progress)
         else:
             faces, binding = item.asset.mesh.faces, item.asset.binding
             mirrored = _mirrors(item.state.matrix_world)
             points = points_on_mesh(surfels, item.mesh.vertices, faces, binding, mirrored=mirrored)
             points = points if tree is None else own_surfels(points, index, size)
-        settings = self._frame.settings
-        colour = lit_colours(
-            self._prepared.scene, self._prepared.environment, points, settings, self._prepared.lights, tree, progress
-        )
+            colour = lit_colours(prepared.scene, light, points, settings, lights, tree, progress)
         return splats_of(surfels, colour if item.emission is None else colour + item.emission)
 
 

@@ -27,10 +27,10 @@ _MIRRORED = [0, 2, 1]  # order of the corners of a face whose object is mirrored
 
 
 def check_surface(state: ObjectState, asset: Asset, settings: RenderSettings, captured: bool) -> None:
-    """Refuse an asset of which nothing would be seen, or that light would not meet; `captured` ones need no mesh."""
-    subject, bare = f"object {state.name}", settings.camera_sees == "mesh" or settings.rays_see == "mesh"
-    if bare and not captured and not len(asset.mesh.faces):
-        remedy = "Set Camera Sees and Rays See to Surfels, or import a file whose mesh has faces"
+    """Refuse an asset of which nothing would be seen; `captured` ones need no mesh."""
+    subject = f"object {state.name}"
+    if settings.camera_sees == "mesh" and not captured and not len(asset.mesh.faces):
+        remedy = "Set Camera Sees to Surfels, or import a file whose mesh has faces"
         raise AssetError(subject, f"the mesh of {state.asset} has no faces", remedy)
     if "surfels" in (settings.camera_sees, settings.rays_see) and not len(asset.surfels):
         raise AssetError(subject, f"{state.asset} has no surfels", "Set Camera Sees and Rays See to Mesh")

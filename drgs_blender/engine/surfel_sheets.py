@@ -18,14 +18,16 @@ _COLOURS, _NUMBERS = "albedo", "roughness, metallic"
 
 
 def meets_sheets(state: ObjectState, asset: Asset, frame: Frame) -> bool:
-    """Whether light meets sheets of the object's surfels: it was found to be thin when it was reconstructed.
+    """Whether light meets sheets of the object's surfels: it has no mesh, or was found to be thin when reconstructed.
 
     Not where the camera sees its mesh, and not where its materials are more than surfels have.
     """
     settings, known = frame.settings, asset.provenance.get("report")
-    thin = isinstance(known, Mapping) and known.get("thin") is True and len(asset.surfels) > 0
+    thin = not len(asset.mesh.faces) or (isinstance(known, Mapping) and known.get("thin") is True)
     plain = asset.mesh.textures is None and not state.visibility.shadow_catcher
-    return thin and plain and settings.rays_see == "mesh" and settings.camera_sees == "surfels"
+    return (
+        thin and plain and len(asset.surfels) > 0 and settings.rays_see == "mesh" and settings.camera_sees == "surfels"
+    )
 
 
 def sheet_mesh(state: ObjectState, posed: PosedSurfels) -> MeshState:

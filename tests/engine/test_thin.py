@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from pictures import assert_same_bits, fresh
 
+from drgs_blender.core.asset import Asset, Mesh
 from drgs_blender.core.asset.container import read_asset, write_asset
 from drgs_blender.core.frame import Frame, MeshState, Visibility, World
 from drgs_blender.engine.session import Session
@@ -142,3 +143,23 @@ def test_what_is_asked_for_otherwise_is_met(asset_path, thin_path, frame_of, set
     """Surfels along rays, or the mesh that the camera sees, as of other objects."""
     pictures = [fresh(path, frame_of(path, **settings)) for path in (asset_path, thin_path)]
     assert_same_bits(*pictures)
+
+
+def test_what_has_no_mesh_is_met_as_sheets_and_casts_a_shadow(tmp_path, asset_path, frame_of):
+    """Without any setting; as dark as where rays meet the surfels themselves."""
+    path, below = tmp_path / "bare.drgs", []
+    write_asset(path, Asset(read_asset(asset_path).surfels, Mesh.empty(), None))
+    for rays_see, shadow in (("mesh", False), ("mesh", True), ("surfels", True)):
+        frame = frame_of(path, samples=64, rays_see=rays_see)
+        frame.objects[0].vertices = None
+        frame.objects[0].visibility = Visibility(camera=False, shadow=shadow, diffuse=shadow, glossy=shadow)
+        frame.world = World()
+        corners = np.float32([[-3, -3, -1.05], [3, -3, -1.05], [3, 3, -1.05], [-3, 3, -1.05]])
+        floor = MeshState("floor", corners, np.int32([[0, 1, 2], [0, 2, 3]]), np.eye(4)[None], np.int32([0]))
+        frame.meshes = [floor]
+        picture = fresh(path, frame)
+        assert not picture.warnings
+        below.append(picture["Combined"][..., :3].mean())
+    free, sheets_, surfels = below
+    assert free - surfels > 0.02 * free
+    assert free - sheets_ == pytest.approx(free - surfels, rel=0.3)

@@ -7,7 +7,6 @@ import pytest
 
 from drgs_blender.build.relit import relit_colours
 from drgs_blender.core.asset import Asset, Mesh, Surfels
-from drgs_blender.core.errors import UsageError
 from drgs_blender.core.frame import RenderSettings, World
 from drgs_blender.deform.binding import bind
 from drgs_blender.deform.mesh_driven import MeshDriven
@@ -63,10 +62,30 @@ def test_a_lid_keeps_the_light_out() -> None:
     assert relit_colours(under, asset.surfels, covered.vertices, world, SETTINGS).max() < 0.05
 
 
-def test_without_a_mesh_there_is_nothing_to_light() -> None:
-    asset = Asset(plate().surfels, Mesh.empty())
-    with pytest.raises(UsageError, match="mesh"):
-        relit_colours(asset, asset.surfels, asset.mesh.vertices, World(), SETTINGS)
+def shell(n: int = 800) -> Surfels:
+    """Surfels without a mesh on a sphere, every second one with its normal inwards."""
+    golden = np.arange(n) * np.pi * (3 - np.sqrt(5))
+    z = 1 - 2 * (np.arange(n) + 0.5) / n
+    centre = np.stack([np.sqrt(1 - z**2) * np.cos(golden), np.sqrt(1 - z**2) * np.sin(golden), z], axis=1)
+    towards = np.where(np.arange(n)[:, None] % 2, centre, -centre)
+    rotation = np.concatenate([1 + towards[:, 2:], -towards[:, 1:2], towards[:, :1], np.zeros((n, 1))], axis=1)
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    return Surfels(
+        centre, np.full((n, 2), 0.06), rotation, np.full(n, 0.95), np.full((n, 3), 0.6), np.ones(n), np.zeros(n)
+    )
+
+
+def test_without_a_mesh_the_lit_side_of_each_surfel_counts() -> None:
+    """Surfels of a closed shell show its bright outside, whichever way they face, and shade each other."""
+    surfels = shell()
+    asset, world = Asset(surfels, Mesh.empty()), World(np.ones((8, 16, 3)))
+    colour = relit_colours(asset, surfels, asset.mesh.vertices, world, SETTINGS)[:, 0]
+    square = plate()
+    free = relit_colours(square, square.surfels, square.mesh.vertices, world, SETTINGS).mean()
+    assert 0.85 * free < colour.min() and colour.max() < 1.1 * free
+    half = relit_colours(asset, surfels, asset.mesh.vertices, World(lit_half()), SETTINGS)[:, 0]
+    away = surfels.centre[:, 0] < -0.9
+    assert half[away].max() < 0.15 * half[surfels.centre[:, 0] > 0.9].mean()
 
 
 def test_arrays_that_are_read_only_as_those_of_files_compile_nothing_anew(compiled) -> None:

@@ -12,6 +12,7 @@ from splat_files import covariance, random_splats
 from drgs_blender.cli.main import main
 from drgs_blender.core.asset import Asset, Mesh, Surfels
 from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.color import srgb_to_linear
 from drgs_blender.core.errors import AssetError, VersionError
 from drgs_blender.core.frame import Camera, Frame, Light, MeshState, ObjectState, RenderSettings, Visibility, World
 from drgs_blender.deform.binding import bind
@@ -44,6 +45,25 @@ def frame_of(objects: list[ObjectState], **more: object) -> Frame:
     camera = Camera(np.eye(4), 8, 8, 8.0, 8.0, 4.0, 4.0)
     settings = RenderSettings(bounces=0, shading_model="paper")
     return Frame(1, camera, objects, settings=more.pop("settings", settings), **more)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("rays_see", ["mesh", "surfels"])
+def test_what_has_no_mesh_shows_its_lit_side(tmp_path: Path, rays_see: str) -> None:
+    """Whichever way its surfels face: below a lamp a plate shows what one with a mesh shows."""
+    lamp = Light("sun", "sun", np.eye(4), power=1.0)
+    shown = []
+    for meshless in (False, True):
+        turned = np.diag([1.0, -1, -1, 1]) if meshless else np.eye(4)
+        file = plate(tmp_path / f"{meshless}.drgs", meshless=meshless)
+        state = ObjectState("plate", str(file), matrix_world=turned)
+        settings = RenderSettings(bounces=0, shading_model="paper", rays_see=rays_see)  # type: ignore[arg-type]
+        write_frame_file(tmp_path / "a.drgsframe", frame_of([state], lights=[lamp], settings=settings))
+        out = tmp_path / "relit.ply"
+        assert main(["convert", str(tmp_path / "a.drgsframe"), str(out), "--as", "splats", "--colour", "relit"]) == 0
+        shown.append(read_surfels(out).surfels.sh[:, 0] * 0.28209479 + 0.5)  # type: ignore[index]
+    assert shown[0].min() > 0.1 and shown[0].max() < 0.9
+    linear = [srgb_to_linear(values.astype(np.float64)).mean() for values in shown]
+    assert linear[1] == pytest.approx(linear[0], rel=0.15)  # they overlap
 
 
 def test_frame_files_keep_the_frame(tmp_path: Path) -> None:
