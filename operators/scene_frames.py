@@ -106,9 +106,23 @@ class SceneFrames(CommandOperator):
         elif not any(o.visibility.camera for o in frame.objects):
             what = "selected object" if self.use_selection else "object of the scene"
             raise UsageError("Export", f"no {what} is a DR-GS object that can be seen", "Select or import one")
+        elif kind == "mesh":
+            self._check_meshes(frame, template)
         if self.colour != "relit" or kind not in ("splats", "sequence"):  # nothing lights or shadows anything
             frame.meshes, frame.lights, frame.images = [], [], []
         write_frame_file(frame_path(template, number), frame)
+
+    def _check_meshes(self, frame: Frame, template: str) -> None:
+        """Name objects that have no mesh. UsageError where none has one."""
+        names: dict[bool, list[str]] = {True: [], False: []}
+        for state in frame.objects:
+            if state.visibility.camera:
+                names[len(assets.load(Path(state.asset)).mesh.faces) > 0].append(state.name)
+        if not names[True]:
+            problem = f"has no mesh of its own that could be written: {first_of(names[False])}"
+            raise UsageError("Export", problem, "Choose a format that holds splats, such as glTF splats or 3DGS PLY")
+        if names[False]:
+            self.warn(f"{first_of(names[False])}: has no mesh and is left out; formats that hold splats have it")
 
 
 def draw_colour(layout: bpy.types.UILayout, operator: bpy.types.Operator) -> None:

@@ -175,10 +175,20 @@ def both_sides(
 
     Parameters
     ----------
+    scene : TraceScene
+    environment : EnvironmentLight
+    lights : Lights, optional
+    settings : RenderSettings
+    tree : SurfelBVH
+        These as for `integrate`.
+    surfels : Surfels
+        World space.
     owner : int
         The object, by its number in the tree of surfels, that does not shade itself nearby.
     size : float
         Mean larger standard deviation of its surfels, metres.
+    progress : callable, optional
+        See `relit_colours`.
     """
     normal = rotation_matrices(surfels.rotation.astype(np.float64))[..., 2]
     white = EnvironmentLight(World(colour=(1.0, 1.0, 1.0)))

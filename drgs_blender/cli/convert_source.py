@@ -22,6 +22,7 @@ from .progress import FractionBar
 from .relight import read_environment, rotation_z
 
 if TYPE_CHECKING:
+    from ..core.asset.textures import MeshTextures
     from ..engine.session import PosedObject, Session
     from ..formats.usd_sequence import MovingObject
 
@@ -219,8 +220,6 @@ class FrameSource:
     def mesh(self) -> Mesh:
         """All meshes as one, with the materials they have in the frame."""
         meshes = [self._objects[i].mesh for i in self._visible]
-        if any(self._objects[i].asset.mesh.textures is not None for i in self._visible):
-            self.notes.append("textures of assets are not written of a frame, only the materials of their vertices")
         first = np.cumsum([0, *(len(m.vertices) for m in meshes)])
 
         def joined(name: str) -> Array:
@@ -233,7 +232,45 @@ class FrameSource:
             joined("roughness"),
             joined("metallic"),
             **self._optional_channels(),
+            textures=self._textures(),
         )
+
+    def _textures(self) -> MeshTextures | None:
+        """The images of all meshes, where one has some; of those that are painted or adjusted none."""
+        from ..core.asset.textures import join_textures, no_textures
+        from ..formats.mesh_groups import corner_normals
+
+        parts, normals, shaped = [], [], False
+        for i in self._visible:
+            item = self._objects[i]
+            state, rest, traced = item.state, item.asset.mesh, item.mesh
+            own, part = self._own_textures(item, state.name), no_textures(len(traced.faces))
+            mesh = Mesh(traced.vertices, traced.faces, traced.albedo, traced.roughness, traced.metallic)
+            shading = corner_normals(mesh)
+            if own is not None and len(own.material) == len(traced.faces):
+                mirrored = [0, 2, 1] if _mirrors(state.matrix_world) else [0, 1, 2]  # as the corners of `traced`
+                part = replace(own, uvs=own.uvs[:, mirrored], normals=None)
+                vertices = rest.vertices if state.vertices is None else state.vertices
+                posed = posed_mesh(replace(rest, textures=own), vertices).textures
+                given = state.corner_normals if state.corner_normals is not None or posed is None else posed.normals
+                if given is not None:
+                    shading = given[:, mirrored] @ np.linalg.inv(state.matrix_world[:3, :3])
+                    shading = shading / np.maximum(np.linalg.norm(shading, axis=2, keepdims=True), 1e-30)
+                    shaped = True
+            parts.append(part)
+            normals.append(shading.astype(np.float32))
+        if all(not part.names for part in parts):
+            return None
+        return join_textures(parts, np.concatenate(normals) if shaped else None)
+
+    def _own_textures(self, item: PosedObject, name: str) -> MeshTextures | None:
+        """The images of an object; a note where they are left out."""
+        state, textures = item.state, item.asset.mesh.textures
+        bare = state.adjustment is None and all(getattr(state, channel) is None for channel in MATERIAL_CHANNELS)
+        if textures is not None and not bare:
+            note = f"{name}: is painted or adjusted, so its images are left out for the materials of its vertices"
+            self.notes.append(note)
+        return textures if bare else None
 
     def _optional_channels(self) -> dict[str, Any]:
         """Optional channels of all meshes; neutral where one lacks what another has."""
@@ -276,15 +313,12 @@ class FrameSource:
         normals = state.corner_normals
         if meshes and len(traced.faces):
             rest = item.asset.mesh
-            bare = state.adjustment is None and all(getattr(state, channel) is None for channel in MATERIAL_CHANNELS)
-            if rest.textures is not None and not bare:
-                note = f"{name}: is painted or adjusted, so its images are left out for the materials of its vertices"
-                self.notes.append(note)
+            textures = self._own_textures(item, name)
             mesh = posed_mesh(rest, rest.vertices if state.vertices is None else state.vertices)
             if normals is None and mesh.textures is not None and mesh.textures.normals is not None:
                 normals = corner_normals(mesh)  # which stay where the images do not
             values = {channel: getattr(traced, channel) for channel in BASE_CHANNELS} | item.channels
-            mesh = replace(mesh, **values, textures=mesh.textures if bare else None)
+            mesh = replace(mesh, **values, textures=None if textures is None else mesh.textures)
             if traced.torn is not None and traced.torn.any():
                 self.notes.append(f"{name}: has torn faces, which are written stretched over the gap, not closed")
             if state.particles is not None and state.particles.skin:

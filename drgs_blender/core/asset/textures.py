@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain, count
 from typing import Any
 
 import numpy as np
@@ -189,6 +191,37 @@ def without(textures: MeshTextures, faces: Array) -> MeshTextures | None:
     parted = (number[:, None] >> bits) & 1 > 0
     slots = np.where(parted, -1, kept.slots)
     return _used(replace(kept, slots=slots.astype(np.int32)))
+
+
+def join_textures(parts: Sequence[MeshTextures], normals: Array | None) -> MeshTextures:
+    """Textures of several meshes as those of one with all their faces; `normals` (m, 3, 3) at its corners."""
+    columns: dict[str, list[Array]] = {name: [] for name in ("uvs", "material", "slots", *_FIRST)}
+    names: list[str] = []
+    images: dict[str, Array] = {}
+    for part in parts:
+        for name in ("uvs", "factors", "transforms", "extensions"):
+            columns[name].append(getattr(part, name))
+        for name, first in (("material", len(names)), ("slots", len(images))):
+            numbers = getattr(part, name)
+            columns[name].append(np.where(numbers < 0, -1, numbers + first).astype(np.int32))
+        names += part.names
+        for name, data in part.images.items():
+            free = chain([name], (f"{name}.{i:03d}" for i in count(1)))
+            images[next(n for n in free if n not in images)] = data
+    return MeshTextures(
+        **{name: np.concatenate(arrays) for name, arrays in columns.items()},
+        names=names,
+        images=images,
+        normals=normals,
+    )
+
+
+def no_textures(faces: int) -> MeshTextures:
+    """Those of a mesh of a number of `faces` that has only values of its vertices."""
+    return MeshTextures(
+        np.zeros((faces, 3, 2), np.float32), np.full(faces, -1), np.empty((0, 8)), np.empty((0, FACTOR_COUNT)),
+        np.empty((0, 8, 2, 3)), np.empty((0, 8)), [],
+    )  # fmt: skip
 
 
 def split(textures: MeshTextures, number: Array) -> tuple[MeshTextures, Array]:
