@@ -76,6 +76,7 @@ def make_asset(
     mesh, report, detail = detailed_mesh(
         file, name, up=up, max_triangles=max_triangles, tolerance=TOLERANCE, max_texture=max_texture
     )
+    report["notes"] += _assumed(file, up)
     scale_mesh(mesh, scale, name)
     surfels, binding, report["surfels"] = attach(
         mesh, pretrained, density=density, detail=detail if detail.any else None, most=max_surfels
@@ -197,6 +198,20 @@ def detailed_mesh(
         mesh.source = (mesh.source or SourceVertices.identity(count)).turned(UP_AXES[turned])
     log.info("mesh of %s: %s", name, report)
     return mesh, report, SurfaceDetail(net, materials, frames, divided)
+
+
+def _assumed(file: MeshFile, up: str | None) -> list[str]:
+    """What is taken for granted where a mesh file does not say it."""
+    notes = []
+    if file.up_axis == "unknown" and up is None:
+        notes.append(
+            "the file does not say which axis is up, so Z is assumed; --up y (or Up) turns what lies on its nose"
+        )
+    bare = file.vertex_colours is None and file.vertex_roughness is None and file.vertex_metallic is None
+    if not file.materials and bare:
+        unused = ", though it has texture coordinates" if file.corner_uvs is not None else ""
+        notes.append(f"the file has no material{unused}: it is grey")
+    return notes
 
 
 def _cut_out(net: Net, alpha: Array, which: Array, pictured: Array, name: str, report: dict[str, Any]) -> None:

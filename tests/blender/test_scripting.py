@@ -267,3 +267,18 @@ def test_the_page_names_every_property_and_no_other():
         key = "preferences" if name.startswith("preferences") else re.sub("^object", "obj", name)
         registered[key] = sorted({p.identifier for p in own} - groups)
     assert {group: sorted(names) for group, names in listed.items()} == registered
+
+
+def test_the_page_names_every_value_and_no_other():
+    listed = {}
+    for owner, name, values in re.findall(r"^\| `([^`]+)` \| `(\w+)` \| ([^|]+) \|", section("Values"), re.MULTILINE):
+        listed[owner, name] = re.findall(r"`([^`]+)`", values)
+    owners = {re.sub("^object", "obj", name): rna for name, rna in blender_reference.groups(PACKAGE).items()}
+    owners |= {f"bpy.ops.{name}": rna for name, rna in blender_reference.operators(PACKAGE).items()}
+    registered = {
+        (owner, p.identifier): [item.identifier for item in p.enum_items]
+        for owner, rna in owners.items()
+        for p in blender_reference.properties(rna)
+        if p.type == "ENUM" and not p.is_hidden
+    }
+    assert listed == registered

@@ -67,6 +67,19 @@ def test_images_without_coordinates_are_named():
     assert not mesh_with_materials(file, "plane")[1]["notes"]
 
 
+def test_what_is_assumed_of_a_mesh_is_said():
+    """No axis and no material: both are told, and neither where it is known."""
+    file = plane(1, ramp())
+
+    def told(**given: str) -> str:
+        return " ".join(make_asset(file, density=1, **given).provenance["report"]["notes"])
+
+    assert "Z is assumed" in told() and "no material" not in told()
+    assert "assumed" not in told(up="y")
+    file.materials, file.face_material = [], np.full(len(file.faces), -1)
+    assert "no material, though it has texture coordinates" in told()
+
+
 def test_a_mesh_that_is_divided_says_so():
     """With both numbers and the option, by which the file's own mesh can be kept."""
     squares = np.indices((64, 64)).sum(axis=0) // 4 % 2
