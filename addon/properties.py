@@ -149,7 +149,7 @@ class DrgsSceneSettings(LevelOfDetail, bpy.types.PropertyGroup):
         name="Rays See",
         description="Representation of DR-GS objects for shadows, reflections and indirect light",
         items=(
-            ("mesh", "Mesh", "The mesh that carries the surfels, and sheets of those of thin objects; fast"),
+            ("mesh", "Mesh", "The mesh that carries the surfels; sheets of those that have none, or are thin; fast"),
             (
                 "surfels",
                 "Surfels",

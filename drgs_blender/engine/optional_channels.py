@@ -100,7 +100,9 @@ def channel_faults(state: ObjectState, asset: Asset, shown: Collection[str], set
         found.append(f"{name}: light passes it, so the camera sees its mesh, not its surfels")
     if (passes or emits) and settings.rays_see == "surfels":
         found.append(f"{name}: it emits light or lets light pass, so rays meet its mesh, not its surfels")
-    if not len(asset.mesh.faces) and asset.surfels.emission is not None:
+    if bare and state.visibility.shadow_catcher and settings.rays_see == "mesh":
+        found.append(f"{name}: has no mesh, so as a shadow catcher it is in no reflection. Set Rays See to Surfels")
+    if bare and asset.surfels.emission is not None:
         found.append(f"{name}: has no mesh, so what it emits is seen by the camera alone")
     return found
 

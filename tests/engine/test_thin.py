@@ -163,3 +163,15 @@ def test_what_has_no_mesh_is_met_as_sheets_and_casts_a_shadow(tmp_path, asset_pa
     free, sheets_, surfels = below
     assert free - surfels > 0.02 * free
     assert free - sheets_ == pytest.approx(free - surfels, rel=0.3)
+
+
+def test_a_shadow_catcher_without_a_mesh_is_told(tmp_path, asset_path, frame_of):
+    path = tmp_path / "bare.drgs"
+    write_asset(path, Asset(read_asset(asset_path).surfels, Mesh.empty(), None))
+    frame = frame_of(path, samples=1)
+    frame.objects[0].vertices, frame.world = None, World()
+    frame.objects[0].visibility = Visibility(shadow_catcher=True)
+    (warning,) = fresh(path, frame).warnings
+    assert "has no mesh" in warning and "shadow catcher" in warning
+    frame.settings.rays_see = "surfels"
+    assert not fresh(path, frame).warnings
