@@ -26,6 +26,8 @@ COUNT = 3 * carrier_nodes.THREES
 _NEAR, _AROUND, _REACH = 8, 1.6, 2.5
 #: How far apart points are of which a vertex needs some, in the distance of the nearest one.
 _SPACING = 1.3
+#: Points of which each spacing is a set of its own; of finer ones so many an octave.
+_FEW, _STEPS = 256, 8
 #: Points that are chosen evenly, of as many at most.
 _EVEN, _POOL = 1024, 50_000
 #: What normals, or without these nothing, weigh against points: the square of a share of the way to the points' middle.
@@ -208,7 +210,7 @@ def spacings(points: Array) -> Array:
     left = order[spacing[order] == 0]
     spacing[left] = last * np.sqrt(_EVEN / (_EVEN + 1.0 + np.arange(len(left))))
     spacing[np.isinf(spacing)] = max(spacing[np.isfinite(spacing)].max(initial=0.0), 1e-30)
-    return spacing
+    return np.maximum(spacing, 1e-6 * spacing.max())  # of points in one place
 
 
 def _candidates(vertices: Array, points: Array, spacing: Array, wanted: Array) -> tuple[Array, Array]:
@@ -220,10 +222,13 @@ def _candidates(vertices: Array, points: Array, spacing: Array, wanted: Array) -
     """
     index = np.full((len(vertices), min(COUNT + 1, len(points))), -1)
     distance = np.zeros(index.shape)
-    levels = np.unique(spacing)
-    level = np.searchsorted(levels, wanted * (np.sqrt(0.5) + 1e-9))  # the first that is finer than what counts
+    few = np.unique(np.sort(spacing)[-_FEW:])
+    steps = np.arange(_STEPS * np.log2(few[0] / spacing.min())) / _STEPS
+    levels = np.append(spacing.min() * 2.0**steps, few)
+    # What is finer than this does not count.
+    level = np.searchsorted(levels, np.maximum(wanted * (np.sqrt(0.5) + 1e-9), spacing.min()), side="right") - 1
     for number in np.unique(level):
-        of, kept = np.flatnonzero(level == number), np.flatnonzero(spacing >= levels[min(number, len(levels) - 1)])
+        of, kept = np.flatnonzero(level == number), np.flatnonzero(spacing >= levels[number])
         found, away = lookups.nearest(points[kept], vertices[of], COUNT + 1)
         index[of, : found.shape[1]], distance[of, : found.shape[1]] = kept[found], away
     return index, distance

@@ -40,10 +40,11 @@ AFFINE = Matrix(((1.2, 0.3, 0, 0.4), (-0.2, 0.9, 0.1, -0.1), (0, 0.2, 0.8, 0.3),
 
 
 @pytest.mark.parametrize("size", [1, -0.7], ids=["", "mirrored"])
-@pytest.mark.parametrize("what", ["solid", "sheet", "one", "faces"])
+@pytest.mark.parametrize("what", ["solid", "twice", "sheet", "one", "faces"])
 def test_nothing_moves_when_it_is_bound(ball, what, size):
     ball.matrix_world = Matrix.Translation((2, 0, 1)) @ Matrix.Rotation(0.5, 4, "X")
     points = {"solid": grid(), "sheet": grid()[:, :2] @ np.eye(2, 3), "one": grid(2)[:1]}
+    points["twice"] = np.repeat(grid(), 2, axis=0)
     carrier = mesh_object("Body", *sphere(6, 9)) if what == "faces" else cloud_of(points[what])
     carrier.matrix_world = Matrix.Translation((2.1, 0, 1)) @ Matrix.Rotation(0.2, 4, "Z") @ Matrix.Scale(size, 4)
     bpy.context.view_layer.update()
