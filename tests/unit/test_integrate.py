@@ -581,18 +581,20 @@ def test_points_of_a_pixel_agree_on_their_samples() -> None:
     assert 4 < len(np.unique(counts, axis=0)) < 20
 
 
-def test_metals_that_reflect_each_other_have_fewer_samples_of_the_light() -> None:
-    """With bounces their noise is that of what they reflect; other surfaces have as many as without."""
-    sampler = Sampler._make([0, np.zeros((0, 3), np.uint32), 1, 0, 1, True, *np.float32([64, 32, 32, 1, 0, 1])])
+def test_surfaces_that_reflect_each_other_have_fewer_samples_of_the_light() -> None:
+    """With bounces much noise is of other surfaces' light; among lamps only metals spare samples for it."""
 
-    def of_light(share: float, bounces: int) -> float:
+    def of_light(share: float, bounces: int, lamps: float = 0.0) -> float:
+        shares = np.float32([64, 32, 32, 1 - lamps, lamps, 1])
+        sampler = Sampler._make([0, np.zeros((0, 3), np.uint32), 1, 0, 1, True, *shares])
         state = np.zeros((1, POINT_STATE), np.float32)
         state[0, ALPHA] = 0.5**4
         _allocate.py_func(state, 0, np.float32(share), bounces, sampler)
-        return float(state[0, COUNTS + 2])
+        return float(state[0, COUNTS + 2 :].sum())
 
-    assert 0 < of_light(0.0, 1) < of_light(0.0, 0)
-    assert of_light(0.5, 1) == of_light(0.5, 0)
+    for share in (0.0, 0.8):
+        assert 0 < of_light(share, 1) < of_light(share, 0)
+    assert of_light(0.8, 1, lamps=0.5) == of_light(0.8, 0, lamps=0.5)
 
 
 def test_no_bit_depends_on_the_neighbours_where_batches_overflow() -> None:

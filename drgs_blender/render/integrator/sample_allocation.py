@@ -25,8 +25,9 @@ POINT_STATE = 16
 #: Part of the samples that go to the light where the surface is all diffuse, and for a specular lobe; less where that
 #: is narrow: the part is `_LIGHT_GLOSSY` from this alpha on.
 _LIGHT_DIFFUSE, _LIGHT_GLOSSY, _WIDE = F(0.75), F(0.5), F(0.03)
-#: The same of metals that reflect each other: there that is what is noisy, and the light is found with few samples.
-_LIGHT_METAL = F(0.25)
+#: The same with bounces, where other surfaces' light is noisy too: of diffuse surfaces, where the environment has all
+#: these samples, and of metals.
+_LIGHT_ALONE, _LIGHT_METAL = F(0.625), F(0.25)
 
 
 @njit
@@ -47,7 +48,8 @@ def _allocate(state, h, share, bounces, sampler):  # type: ignore[no-untyped-def
         alpha = F(math.sqrt(state[h, ALPHA]))
         most = _LIGHT_METAL if share == ZERO and bounces > 0 else _LIGHT_GLOSSY
         glossy = most * min(ONE, max(F(0.05), alpha / _WIDE))
-        light = total * min(sampler.most_light, share * _LIGHT_DIFFUSE + (ONE - share) * glossy)
+        diffuse = _LIGHT_ALONE if bounces > 0 and lights == ZERO else _LIGHT_DIFFUSE
+        light = total * min(sampler.most_light, share * diffuse + (ONE - share) * glossy)
         light = light if envmap + lights > ZERO else ZERO
         ggx = (total - light) * (ONE - share)
         if total >= F(3.0):
