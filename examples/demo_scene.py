@@ -35,7 +35,7 @@ from blender_scenes import (
 #: Reconstructed from photographs, see `make_captured.py`.
 CAPTURED = Path(__file__).resolve().parent / "captured"
 FRAMES = 24
-SIZE = 720, 405
+SIZE = 640, 360
 #: One of Blender's own: soft light from above, which fills the sun's shadows.
 WORLD = "courtyard.exr"
 #: Degrees above the horizon, azimuth, W/m2 and colour of the sun, and strength and colour of the sky, at noon and at
@@ -218,7 +218,7 @@ def main(zip_path: Path, blend: Path) -> None:
     add_lamp(Vector((1.02, 1.5, 0.0)))
     add_day()
     add_camera(Vector((-0.05, 0.2, 0.68)), Vector((0.55, -6.5, 1.5)), 55.0)
-    scene.drgs.subpixel_samples = 8
+    scene.drgs.samples, scene.drgs.subpixel_samples = 32, 4
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
 
 
