@@ -142,9 +142,8 @@ def test_light_and_its_density(name: str):
     directions = directions[(directions @ slow.rotation.T)[:, 2].abs() < 0.9998]
     radiance, density = slow.radiance(directions).numpy(), slow.pdf(directions).numpy()
     np.testing.assert_allclose(fast.lookup(directions.numpy()), radiance, rtol=0, atol=1e-4 * radiance.max())
-    # The density is constant in a cell, so a direction on an edge may take either side.
-    near = np.isclose(fast.pdf(directions.numpy()), density, rtol=1e-4, atol=1e-9)
-    assert near.mean() > 0.9995
+    # Beside the sun the density grows by its whole height within a cell: places are exact to a few 1e-6 of one.
+    np.testing.assert_allclose(fast.pdf(directions.numpy()), density, rtol=1e-4, atol=2e-5 * density.max())
 
 
 @pytest.mark.parametrize("name", worlds())

@@ -32,7 +32,7 @@ def surfel_buffer(posed: PosedSurfels, scene: TraceScene, camera: Camera, settin
 def white_light(scene: TraceScene, points: ShadingPoints) -> np.ndarray:
     """(n,) direct light of a uniform white world, nearly without noise."""
     return integrate(
-        scene, EnvironmentLight(World()), points, replace(SETTINGS, strategy_samples=(32, 16, 16)), 1
+        scene, EnvironmentLight(World()), points, replace(SETTINGS, strategy_samples=(64, 32, 128)), 1
     ).total[:, 1]
 
 

@@ -1,7 +1,8 @@
 """Distant light in torch: lat-long radiance, and directions drawn in proportion to it.
 
 The mapping is Blender's (see asset.Environment): u = 0.5 - atan2(y, x) / 2 pi, v = acos(z) / pi, row 0 at +Z. Texel
-centres are at +0.5; between them the lookup is bilinear, periodic in u and clamped in v.
+centres are at +0.5; between them the lookup is bilinear, periodic in u and clamped in v. Directions are drawn in cells
+between the centres of four texels, in proportion to the blend of their luminance, bilinear in azimuth and z.
 """
 
 from __future__ import annotations
@@ -46,10 +47,20 @@ class Light:
         self.rotation, self.colour = rotation, colour
         self.height, self.width = self.image.shape[:2]
         with torch.no_grad():
-            polar = torch.linspace(0, math.pi, self.height + 1, dtype=self.image.dtype, device=self.image.device)
-            self._edges = torch.cos(polar)
-            self.probability = self._texel_probability()
-            self._cumulative = torch.cumsum(self.probability.flatten(), 0)
+            rows = torch.arange(self.height + 2, dtype=self.image.dtype, device=self.image.device) - 0.5
+            self._edges = torch.cos(math.pi * (rows / self.height).clamp(0, 1))
+            weights = torch.tensor(LUMINANCE, dtype=self.image.dtype, device=self.image.device)
+            value = (self.image * self.colour) @ weights
+            if not value.sum() > 0:  # a black world: any density will do
+                value = torch.ones_like(value)
+            right = torch.cat([value[:1], value, value[-1:]])
+            left = torch.roll(right, 1, 1)
+            #: Luminance at the corners of each cell: upper left, upper right, lower left, lower right.
+            self._corners = torch.stack([left[:-1], right[:-1], left[1:], right[1:]])
+            solid = 2 * math.pi / self.width * (self._edges[:-1] - self._edges[1:])
+            power = self._corners.mean(0) * solid.unsqueeze(1)
+            self._power = power.sum()
+            self._cumulative = torch.cumsum(power.flatten() / self._power, 0)
 
     @classmethod
     def from_world(cls, world: World, dtype: torch.dtype = torch.float64, device: str = "cpu") -> Light:
@@ -60,22 +71,6 @@ class Light:
 
         image = None if world.environment is None else tensor(world.environment)
         return cls(image, tensor(world.rotation), tensor(world.colour) * world.strength)
-
-    def _texel_probability(self) -> Tensor:
-        """Probability of each texel: luminance of the *interpolated* picture over the texel times its solid angle.
-
-        The bilinear picture, integrated over a texel, weighs the neighbours (1/8, 3/4, 1/8) along either axis: light
-        that leaks into a black texel is still found.
-        """
-        weights = torch.tensor(LUMINANCE, dtype=self.image.dtype, device=self.image.device)
-        value = (self.image * self.colour) @ weights
-        value = (torch.roll(value, 1, 1) + torch.roll(value, -1, 1)) / 8 + 0.75 * value
-        padded = torch.cat([value[:1], value, value[-1:]])
-        value = (padded[:-2] + padded[2:]) / 8 + 0.75 * value
-        weight = value * (self._edges[:-1] - self._edges[1:]).unsqueeze(1)
-        if not weight.sum() > 0:  # a black world: any density will do
-            weight = weight + (self._edges[:-1] - self._edges[1:]).unsqueeze(1)
-        return weight / weight.sum()
 
     def radiance(self, direction: Tensor) -> Tensor:
         """Radiance (..., 3) that arrives from unit world directions (..., 3)."""
@@ -90,20 +85,32 @@ class Light:
         return ((1 - t) * upper + t * lower) * self.colour
 
     def sample(self, u: Tensor) -> Tensor:
-        """World directions (..., 3) of uniform numbers (..., 3): two place them in a texel, the third picks it."""
+        """World directions (..., 3) of uniform numbers (..., 3): two place them in a cell, the third picks it."""
         index = torch.searchsorted(self._cumulative, u[..., 2].contiguous() * self._cumulative[-1], right=True)
         index = index.clamp(max=len(self._cumulative) - 1)
         row, column = index // self.width, index % self.width
-        across = (column + u[..., 0]) / self.width
-        # Uniform in the cosine, so that the density inside a texel is constant over solid angle.
+        a, b, c, d = self._corners[:, row, column]
+        t = _on_slope(u[..., 1], a + b, c + d)
+        s = _on_slope(u[..., 0], (1 - t) * a + t * c, (1 - t) * b + t * d)
+        across = (column + s - 0.5) / self.width
         upper, lower = self._edges[row], self._edges[row + 1]
-        down = torch.acos((upper + u[..., 1] * (lower - upper)).clamp(-1, 1)) / math.pi
+        down = torch.acos((upper + t * (lower - upper)).clamp(-1, 1)) / math.pi
         return directions_of(across, down) @ self.rotation
 
     def pdf(self, direction: Tensor) -> Tensor:
         """Density of `sample`, per steradian, at unit world directions (..., 3)."""
-        u, v = coordinates_of(direction @ self.rotation.T)
-        column = (u * self.width).long() % self.width
-        row = (v * self.height).long().clamp(0, self.height - 1)
-        solid_angle = 2 * math.pi / self.width * (self._edges[row] - self._edges[row + 1])
-        return self.probability[row, column] / solid_angle
+        local = direction @ self.rotation.T
+        u, v = coordinates_of(local)
+        x = u * self.width + 0.5
+        column, row = torch.floor(x).long(), (v * self.height + 0.5).long().clamp(0, self.height)
+        s, column = x - column, column % self.width
+        upper, lower = self._edges[row], self._edges[row + 1]
+        t = ((upper - local[..., 2]) / (upper - lower)).clamp(0, 1)
+        a, b, c, d = self._corners[:, row, column]
+        return ((1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * c + s * d)) / self._power
+
+
+def _on_slope(number: Tensor, start: Tensor, end: Tensor) -> Tensor:
+    """Places in [0, 1] of random numbers, in proportion to what goes from `start` to `end` there."""
+    root = torch.sqrt(start * start + number * (end * end - start * start))
+    return (number * (start + end) / (start + root).clamp(min=1e-300)).clamp(max=1)
