@@ -24,13 +24,10 @@ Warn = Callable[[str], None]
 #: Gives the pixels of an image, straight; None where it has none.
 Read = Callable[[bpy.types.Image, Warn], Image | None]
 
-#: Assets whose images are hashed at a time, and bytes at the end of a file that tell it from another of its size:
-#: a checksum of a PNG's is among them.
-_ASSETS, _END = 16, 64
+#: Assets whose images are hashed at a time.
+_ASSETS = 16
 #: Textures of assets, and the hash of each of their images.
 _hashes: list[tuple[MeshTextures, dict[str, str]]] = []
-#: Packed files, by their size and end, and the hash of each.
-_packed: dict[tuple[int, bytes], str] = {}
 
 
 class Painted(NamedTuple):
@@ -138,12 +135,7 @@ def _hashes_of(textures: MeshTextures) -> dict[str, str]:
 
 def _hash(file: str | bytes) -> str:
     """Of a file at a path, or a packed one."""
-    if isinstance(file, str):
-        return hashlib.sha256(Path(file).read_bytes()).hexdigest()
-    key = len(file), file[-_END:]
-    if key not in _packed:
-        _packed[key] = hashlib.sha256(file).hexdigest()
-    return _packed[key]
+    return hashlib.sha256(Path(file).read_bytes() if isinstance(file, str) else file).hexdigest()
 
 
 def _as_captured(painted: Painted, textures: MeshTextures) -> Image | None:
@@ -165,7 +157,7 @@ def _file_of(painted: Painted, alpha: bool) -> bytes:
     One that is packed and not saved is packed as that.
     """
     image = painted.image
-    if image.is_dirty and image.packed_file is not None and image.library is None:
+    if ours := image.is_dirty and image.packed_file is not None and image.library is None:
         image.file_format = "PNG"
         image.pack()
     if not image.is_dirty and image.source == "FILE" and image.packed_file is not None:
@@ -179,6 +171,9 @@ def _file_of(painted: Painted, alpha: bool) -> bytes:
         made.pixels.foreach_set(np.ravel(pixels / np.float32(255)))
         made.file_format = "PNG"
         made.pack()
-        return bytes(made.packed_file.data)
+        data = bytes(made.packed_file.data)
     finally:
         bpy.data.images.remove(made)
+    if ours:  # so that it is known as the new file's
+        image.pack(data=data, data_len=len(data))
+    return data
