@@ -54,7 +54,7 @@ def test_painted_specular_and_coat_look_as_in_cycles(scene, ball, sees):
     floor.data.materials.append(bpy.data.materials[floor.name])
     scene.camera.location, scene.camera.rotation_euler = (0, -5, 0.6), (np.pi / 2 - 0.1, 0, 0)
     parity.light(scene)
-    parity.set_up(scene, 64, samples=256, bounces=2, subpixels=64)
+    parity.set_up(scene, 64, samples=1024 if sees == "surfels" else 256, bounces=2, subpixels=64)
     scene.drgs.camera_sees = sees
     limit = 40.0
     if sees == "surfels":
