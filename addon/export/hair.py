@@ -198,17 +198,17 @@ class Hair:
         self._places: tuple[tuple[Array, ...], Array] | None = None
         self.strands, self.tubes, self.name = strands, made, obj.data.name
         self.polygons = range(len(made.faces))
-        self._is_curves = obj.type != "MESH"  # or points: values are its own
-        self.color_attributes: Any = () if self._is_curves else self._data.color_attributes
+        self._has_values = obj.type != "MESH"  # else they are those of the emitter
+        self.color_attributes: Any = () if self._has_values else self._data.color_attributes
 
     def as_pointer(self) -> int:
         """Unlike that of the mesh on which it grows."""
-        return self._data.as_pointer() + (not self._is_curves)
+        return self._data.as_pointer() + (not self._has_values)
 
     @property
     def uv_layers(self) -> list[str]:
         """Names of its UV maps, those of the roots."""
-        if self._is_curves:
+        if self._has_values:
             return [a.name for a in self._data.attributes if a.data_type == "FLOAT2" and a.domain == "CURVE"]
         return [layer.name for layer in self._data.uv_layers]
 
@@ -217,7 +217,7 @@ class Hair:
 
         "" is the one that renders: of Curves the first.
         """
-        if self._is_curves:
+        if self._has_values:
             names = self.uv_layers
             roots = attribute_values(self._data, name or names[0]) if names and (not name or name in names) else None
         else:
@@ -232,7 +232,7 @@ class Hair:
             values = self._info(name)
             return np.column_stack((values, values, values, np.ones_like(values))).astype(np.float32)
         found = attribute_values(self._data, name)
-        return found if found is None or self._is_curves else self._at_roots(found, self._data.attributes[name].domain)
+        return found if found is None or self._has_values else self._at_roots(found, self._data.attributes[name].domain)
 
     def layer(self, ref: LayerRef) -> Array | None:
         """(m, 3, 2) or (m, 3, 4) float32 at the corners of the faces, as of `LayerRef.values`."""
@@ -262,7 +262,7 @@ class Hair:
     def _domain(self, name: str) -> str:
         if name in HAIR_INFO:
             return HAIR_INFO[name]
-        return str(self._data.attributes[name].domain) if self._is_curves else "CURVE"
+        return str(self._data.attributes[name].domain) if self._has_values else "CURVE"
 
     def _info(self, name: str) -> Array:
         """What the node Hair Info says: (n,) the part of the way to the tip, or (k,) a random number."""
@@ -289,7 +289,7 @@ class Hair:
     def _generated(self) -> Array:
         """(k, 3): of particles the root in the mesh's texture space, of Curves the root."""
         roots = self._roots()
-        if self._is_curves:
+        if self._has_values:
             return roots
         size = np.array(self._data.texspace_size)
         size = np.divide(0.5, size, out=np.zeros(3), where=size != 0)

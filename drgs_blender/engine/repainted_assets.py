@@ -7,7 +7,6 @@ import io
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +16,8 @@ from ..core.errors import AssetError
 from ..core.frame import ObjectState
 from ..core.materials import Image
 from ..core.repainted_textures import carried_paint, pictures_of, repainted
-from ..ipc.change_detection import reuse_equal
 from .asset_textures import decoded
+from .derived_assets import DerivedAssets
 from .loaded_assets import LoadedAsset
 
 Array = np.ndarray
@@ -26,24 +25,8 @@ Array = np.ndarray
 _paintings = itertools.count(1)
 
 
-class _Known(NamedTuple):
-    """What is loaded of an asset, the images painted over it, and what that makes of it."""
-
-    whole: LoadedAsset
-    images: Sequence[Image]
-    made: LoadedAsset
-
-
-class RepaintedAssets:
-    """Looks materials up in painted images; kept from one frame to the next, shared by instances."""
-
-    def __init__(self) -> None:
-        self._last: list[_Known] = []
-        self._used: list[_Known] = []
-
-    def begin(self) -> None:
-        """A frame begins: what the last one did not use is forgotten."""
-        self._last, self._used = self._used, []
+class RepaintedAssets(DerivedAssets[Sequence[Image]]):
+    """Looks materials up in painted images."""
 
     def loaded(self, whole: LoadedAsset, state: ObjectState) -> tuple[LoadedAsset, ObjectState]:
         """What is loaded for an object with its painted images, and its state, in which these are what is captured.
@@ -53,19 +36,11 @@ class RepaintedAssets:
         mesh = whole.asset.mesh
         if not state.images or mesh.textures is None:
             return whole, state
-        found = None
-        for entry in (*self._used, *self._last):
-            if entry.whole is whole and reuse_equal(state.images, entry.images) is entry.images:
-                found = entry
-                break
-        if found is None:
-            found = _Known(whole, reuse_equal(state.images, None), _made(whole, state))
-        if all(found is not used for used in self._used):
-            self._used.append(found)
-        if found.made.driven is None and whole.driven is not None:
-            found.made.driven = whole.driven.repainted(found.made.asset.mesh, found.made.asset.surfels)
+        made = self.of(whole, state.images, lambda: _made(whole, state))
+        if made.driven is None and whole.driven is not None:
+            made.driven = whole.driven.repainted(made.asset.mesh, made.asset.surfels)
         painted = {name: getattr(state, name) for name in MATERIAL_CHANNELS}
-        return found.made, replace(state, images=[], **carried_paint(mesh, found.made.asset.mesh, painted))
+        return made, replace(state, images=[], **carried_paint(mesh, made.asset.mesh, painted))
 
 
 def _made(whole: LoadedAsset, state: ObjectState) -> LoadedAsset:

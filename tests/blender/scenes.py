@@ -70,6 +70,15 @@ def asset_of(vertices: np.ndarray, faces: np.ndarray, environment: np.ndarray | 
     return model.Asset(surfels, mesh, binding, light)
 
 
+def import_surfels_alone(folder):
+    """An object of the ball's surfels, without a mesh, whose file is in a folder."""
+    container, model = (part(f"drgs_blender.core.asset.{name}") for name in ("container", "model"))
+    path = folder / "cloud.drgs"
+    container.write_asset(path, model.Asset(asset_of(*sphere()).surfels, model.Mesh.empty()))
+    bpy.ops.import_scene.drgs(filepath=str(path))
+    return bpy.context.object
+
+
 def write_ball(path: Path, environment: np.ndarray | None = None) -> Path:
     """Write the sphere as an asset."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,17 @@ import bpy
 import numpy as np
 import pytest
 from mathutils import Matrix, Vector
-from scenes import armature_object, asset_of, mesh_object, new_world, part, read_exr, select, sphere
+from scenes import (
+    armature_object,
+    asset_of,
+    import_surfels_alone,
+    mesh_object,
+    new_world,
+    part,
+    read_exr,
+    select,
+    sphere,
+)
 
 pytestmark = pytest.mark.blender_api
 
@@ -17,12 +27,8 @@ pytestmark = pytest.mark.blender_api
 @pytest.fixture
 def cloud(scene, tmp_path):
     """The ball's surfels alone, moved and turned."""
-    container, model = (part(f"drgs_blender.core.asset.{name}") for name in ("container", "model"))
-    path = tmp_path / "cloud.drgs"
-    container.write_asset(path, model.Asset(asset_of(*sphere()).surfels, model.Mesh.empty()))
-    bpy.ops.import_scene.drgs(filepath=str(path))
+    obj = import_surfels_alone(tmp_path)
     scene.drgs.rays_see = "surfels"
-    obj = bpy.context.object
     obj.matrix_world = Matrix.Translation((1, 2, 0.5)) @ Matrix.Rotation(0.4, 4, "Z")
     bpy.context.view_layer.update()
     return obj
@@ -333,12 +339,7 @@ def test_surfels_are_edited_and_cropped_where_they_are_seen(cloud, scene):
     add_proxy()
     moved_up(cloud, 2.0)
     count = len(cloud.data.vertices)
-    box = bpy.data.objects.new("Box", None)
-    scene.collection.objects.link(box)
-    box.empty_display_type, box.matrix_world = "CUBE", cloud.matrix_world @ Matrix.Translation((0, 0, 3))
-    bpy.context.view_layer.update()
-    select(box, cloud)
-    assert bpy.ops.drgs.crop() == {"FINISHED"}
+    crop_to_upper_half(cloud, scene, lifted=2)
     kept = part("addon.surfel_points").left_of(cloud, part("addon.assets").load(part("addon.assets").file_of(cloud)))
     assert 0 < len(kept) < len(centres(cloud)) and (centres(cloud)[kept, 2] > -0.05).all()
     assert len(cloud.data.vertices) == count
@@ -349,10 +350,10 @@ def test_surfels_are_edited_and_cropped_where_they_are_seen(cloud, scene):
     np.testing.assert_allclose(shown, centres(cloud)[kept] + (0, 0, 2), atol=1e-4)
 
 
-def crop_to_upper_half(cloud, scene):
+def crop_to_upper_half(cloud, scene, lifted=0):
     box = bpy.data.objects.new("Box", None)
     scene.collection.objects.link(box)
-    box.empty_display_type, box.matrix_world = "CUBE", cloud.matrix_world @ Matrix.Translation((0, 0, 1))
+    box.empty_display_type, box.matrix_world = "CUBE", cloud.matrix_world @ Matrix.Translation((0, 0, 1 + lifted))
     bpy.context.view_layer.update()
     select(box, cloud)
     assert bpy.ops.drgs.crop() == {"FINISHED"}

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import bpy
 import pytest
-from scenes import asset_of, part, read_exr, sphere
+from scenes import import_surfels_alone, part, read_exr
 
 
 @pytest.fixture
 def cloud(scene, tmp_path):
     """The ball's surfels alone."""
-    container, model = (part(f"drgs_blender.core.asset.{name}") for name in ("container", "model"))
-    path = tmp_path / "cloud.drgs"
-    container.write_asset(path, model.Asset(asset_of(*sphere()).surfels, model.Mesh.empty()))
-    bpy.ops.import_scene.drgs(filepath=str(path))
-    return bpy.context.object
+    return import_surfels_alone(tmp_path)
 
 
 def test_it_is_rendered_without_any_setting(cloud, scene):

@@ -111,14 +111,19 @@ def test_surfels_follow_what_they_are_told_to(relight, folder, tmp_path, capsys)
         assert told in capsys.readouterr().err
 
 
+def particles() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places of particles in a cube around the ball, gradients that deform nothing, and their lattice."""
+    axis = np.linspace(-1.4, 1.4, 8)
+    rest = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3).astype(np.float32)
+    cells = np.eye(4) / 0.4
+    cells[:3, 3], cells[3, 3] = 4.0, 1.0
+    return rest, np.tile(np.eye(3, dtype=np.float16), (len(rest), 1, 1)), cells
+
+
 def test_torn_and_flowing_matter_is_shown_as_it_is_asked_for(relight, folder, tmp_path, capsys):
     """The upper half is lifted off: closed in green or hollow; of water, boxes of particles instead of the mesh."""
     mesh = read_asset(folder / "lit.drgs").mesh
-    axis = np.linspace(-1.4, 1.4, 8)
-    rest = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3).astype(np.float32)
-    still = np.tile(np.eye(3, dtype=np.float16), (len(rest), 1, 1))
-    cells = np.eye(4) / 0.4
-    cells[:3, 3], cells[3, 3] = 4.0, 1.0
+    rest, still, cells = particles()
 
     def bake(name, model, given):
         cache, settings = ParticleCache(tmp_path / name), {"material": {"model": model}, "regions": []}
@@ -163,11 +168,7 @@ def test_torn_and_flowing_matter_is_shown_as_it_is_asked_for(relight, folder, tm
 def test_what_has_broken_stays_so_in_every_frame_that_is_rendered_alone(folder, tmp_path, capsys, inside):
     """Torn and pushed together; a cache of before is told, and shows the last frame as if nothing had happened."""
     mesh = read_asset(folder / "lit.drgs").mesh
-    axis = np.linspace(-1.4, 1.4, 8)
-    rest = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3).astype(np.float32)
-    still = np.tile(np.eye(3, dtype=np.float16), (len(rest), 1, 1))
-    cells = np.eye(4) / 0.4
-    cells[:3, 3], cells[3, 3] = 4.0, 1.0
+    rest, still, cells = particles()
     bonds = Bonds(rest, cells)
 
     def lifted(places, by):
