@@ -36,7 +36,8 @@ HEADER, _REST, _STATE = "cache.json", "rest.drgp", "state.drgp"
 _NAME = re.compile(r"frame_(-?\d+)\.drgp")
 _AGAIN = "Bake again"
 #: Of the bits of a half, the same number in single precision: a third of the time that a conversion takes.
-_SINGLE = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)
+with np.errstate(invalid="ignore"):  # processors of Arm report the signalling NaNs among them
+    _SINGLE = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
