@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import api_reference
+import plots
 from sphinx.cmd.build import main as sphinx
 from sphinx.util.inventory import InventoryFile
 
@@ -46,6 +47,8 @@ NAVIGATION = {
         "CONTRIBUTING.md",
     ),
 }
+#: The page beside whose tables plots are drawn, by tools/plots.py.
+BENCHMARKS = "docs/benchmarks.md"
 #: Folders, below the laid out sources, of the two references.
 PYTHON, BLENDER = "reference/python", "reference/blender"
 #: Part of its natural size in which a diagram is shown.
@@ -129,8 +132,13 @@ class Page:
         self.files: list[str] = []
 
     def text(self, pages: set[str]) -> str:
-        """The page as the site's generator takes it, which has `pages`: links as they are there, diagrams drawn."""
+        """The page as the site's generator takes it, with the links of a site of `pages`, diagrams and plots drawn."""
         text = self.linked(pages)
+        if self.name == BENCHMARKS:
+            try:
+                text = plots.with_plots(text)
+            except plots.PlotError as error:
+                raise DocsError(f"{self.name}: {error}. Correct it, or PLOTS in tools/plots.py") from error
         return re.sub(r"^```mermaid\n(.*?)^```$", self._diagram, text, flags=re.DOTALL | re.MULTILINE)
 
     def linked(self, pages: set[str]) -> str:

@@ -40,7 +40,7 @@ def faults(text: str) -> list[str]:
 
 
 def strings(module: Path) -> Iterator[str]:
-    """Docstrings of a module with such a word somewhere, and strings of several words: descriptions, labels, messages."""
+    """Docstrings, descriptions, labels and messages, of a module that has such a word somewhere."""
     text = module.read_text(encoding="utf-8")
     if AMERICAN.keys().isdisjoint(re.findall(r"[a-z]+", text)):
         return
