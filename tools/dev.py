@@ -135,9 +135,10 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "demo-simulation", run_demo_simulation, "bake and render matter; see examples/demo_simulation.py"
     )
     extension = command("extension", run_extension, "build the extension's zip; arguments go to tools/extension.py")
-    command("docs", run_docs, "build the site of the documentation in build/docs/html; any warning ends it")
+    about = "build the site of the documentation in build/docs/html; any warning ends it; --links also asks other sites"
+    docs = command("docs", run_docs, about)
     bench = command("bench", run_bench, "measure; further arguments go to bench/run.py")
-    for sub in (test, check, demo, simulation, extension, bench):
+    for sub in (test, check, demo, simulation, extension, docs, bench):
         sub.set_defaults(passes_on=True)
     clean = command("clean", run_clean, "remove build products and caches")
     clean.add_argument("--all", action="store_true", help="also the environments")
@@ -492,7 +493,7 @@ def run_docs(args: argparse.Namespace) -> int:
         code = subprocess.run(command, cwd=ROOT, timeout=REFERENCE_SECONDS).returncode
     except subprocess.TimeoutExpired as error:
         raise Failure(f"tools/blender_reference.py did not end within {REFERENCE_SECONDS} s; run it alone") from error
-    return code or run([generator, ROOT / "tools" / "docs.py"])
+    return code or run([generator, ROOT / "tools" / "docs.py", *args.rest])
 
 
 def with_both(program: str, rest: Sequence[str]) -> int:

@@ -13,8 +13,10 @@ import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import api_reference
+import plots
 from sphinx.cmd.build import main as sphinx
 from sphinx.util.inventory import InventoryFile
 
@@ -46,6 +48,8 @@ NAVIGATION = {
         "CONTRIBUTING.md",
     ),
 }
+#: The page beside whose tables plots are drawn, by tools/plots.py.
+BENCHMARKS = "docs/benchmarks.md"
 #: Folders, below the laid out sources, of the two references.
 PYTHON, BLENDER = "reference/python", "reference/blender"
 #: Part of its natural size in which a diagram is shown.
@@ -108,6 +112,29 @@ def trees() -> Iterator[str]:
         yield "\n".join(["", "```{toctree}", ":hidden:", f":caption: {title}", "", *entries, "```", ""])
 
 
+def anchors(text: str) -> set[str]:
+    """Names by which the headings of a page are linked to, as GitHub makes them."""
+    headings = re.findall(
+        r"^#+ (.+?)\s*$", re.sub(r"^```.*?^```$", "", text, flags=re.DOTALL | re.MULTILINE), re.MULTILINE
+    )
+    return {
+        re.sub(r"[^\w -]", "", re.sub(r"\]\([^)]*\)", "", heading).lower()).replace(" ", "-") for heading in headings
+    }
+
+
+def fault_of(address: str) -> str:
+    """What is wrong with a link out of the site, as far as that is known without the network; "" for nothing."""
+    parts = urlsplit(address)
+    host = parts.hostname or ""
+    if parts.scheme == "mailto":
+        return ""
+    if parts.scheme != "https":
+        return "which is not https"
+    if not re.fullmatch(r"([a-z0-9-]+\.)+[a-z]{2,}", host) or re.search(r"(^|\.)(example|test|invalid)(\.|$)", host):
+        return "which is no site's address"
+    return "which has a placeholder" if re.search(r"[<>{}…]|\.\.\.|TODO|XXX|\s", address) else ""
+
+
 class Page:
     """A page of the repository.
 
@@ -129,8 +156,13 @@ class Page:
         self.files: list[str] = []
 
     def text(self, pages: set[str]) -> str:
-        """The page as the site's generator takes it, which has `pages`: links as they are there, diagrams drawn."""
+        """The page as the site's generator takes it, with the links of a site of `pages`, diagrams and plots drawn."""
         text = self.linked(pages)
+        if self.name == BENCHMARKS:
+            try:
+                text = plots.with_plots(text)
+            except plots.PlotError as error:
+                raise DocsError(f"{self.name}: {error}. Correct it, or PLOTS in tools/plots.py") from error
         return re.sub(r"^```mermaid\n(.*?)^```$", self._diagram, text, flags=re.DOTALL | re.MULTILINE)
 
     def linked(self, pages: set[str]) -> str:
@@ -141,12 +173,17 @@ class Page:
     def _link(self, found: re.Match[str], pages: set[str]) -> str:
         """A link as it is in the site: to a page, to a module's reference, or to a file that is copied."""
         path, mark, anchor = found[2].partition("#")
-        if re.match(r"[a-z]+:", found[2]) or not path:
+        if re.match(r"[a-z]+:", found[2]):
+            if problem := fault_of(found[2]):
+                raise DocsError(f"{self.name}: links to {found[2]}, {problem}. Correct the link")
             return found[0]
-        here = (self.root / self.name).parent
-        target = (here / path).resolve()
-        if not target.exists() or not target.is_relative_to(self.root):
+        here = self.root / self.name
+        target = (here.parent / path).resolve() if path else here
+        is_there = target.exists() and target.is_relative_to(self.root)
+        if not is_there or (anchor and target.suffix == ".md" and anchor not in anchors(target.read_text("utf-8"))):
             raise DocsError(f"{self.name}: links to {found[2]}, which is not there. Correct the link")
+        if not path:
+            return found[0]
         inside = target.relative_to(self.root)
         name = inside.as_posix()
         up = "../" * (len(Path(self.name).parts) - 1)
@@ -194,15 +231,21 @@ def main(argv: list[str] | None = None) -> int:
     """Build the site; the return value is the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=BUILD, help="folder of source and html; default build/docs")
+    parser.add_argument(
+        "--links", action="store_true", help="ask, over the network, whether links out of the site hold"
+    )
     args = parser.parse_args(argv)
     source, html = args.out / "source", args.out / "html"
     try:
         modules = lay_out(ROOT, source, args.out / "blender")
         shutil.rmtree(html, ignore_errors=True)
-        options = ["-W", "--keep-going", "-q", "-E", "-j", "auto", "-b", "html", "-d", str(args.out / "doctrees")]
-        if code := sphinx([*options, "-c", str(ROOT / "tools" / "site"), str(source), str(html)]):
+        options = ["-W", "--keep-going", "-q", "-j", "auto", "-d", str(args.out / "doctrees")]
+        options += ["-c", str(ROOT / "tools" / "site"), str(source)]
+        if code := sphinx(["-E", "-b", "html", *options, str(html)]):
             return code
         check(modules, html)
+        if args.links and (code := sphinx(["-b", "linkcheck", *options, str(args.out / "links")])):
+            return code
     except DocsError as error:
         print(f"docs.py: {error}", file=sys.stderr)
         return 1

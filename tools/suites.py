@@ -159,12 +159,12 @@ KERNELS = "kernels"
 
 
 def lint(python: Path, root: Path, folder: Path) -> Job:
-    """Formats, rules and types.
+    """Formats, rules, spelling and types.
 
     The extension is named as its folder: only from within a package does ``..drgs_blender`` lead anywhere. A dot would
     divide that name, so in such a folder the extension's types go unchecked.
     """
-    tools = [["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"]]
+    tools = [["ruff", "check", "."], ["ruff", "format", "--check", "."], ["codespell_lib"], ["mypy"]]
     if "." not in root.name:
         tools.append(["mypy", "-p", f"{root.name}.addon", "-p", f"{root.name}.operators", "-m", root.name])
     return Job(LINT, [[str(python), "-m", *tool] for tool in tools], folder / "lint.log")

@@ -64,3 +64,13 @@ def test_names_of_the_code_exist() -> None:
             if "_" in name or re.search("[a-z][A-Z]", name)
         }
         assert not named - known, page.name
+
+
+def test_the_table_of_the_readme_has_every_command_as_it_is_typed() -> None:
+    parser = build_parser()
+    (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    rows = re.findall(r"^\| `drgs ([^`]+)` \|", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    for row in rows:
+        words = shlex.split(re.sub(r"[\[\]]", "", row))
+        assert parser.parse_args(join_values(words)).command == words[0], row
+    assert {row.split()[0] for row in rows} == set(commands.choices)

@@ -133,9 +133,41 @@ def test_a_link_to_nowhere_is_an_error_and_one_to_a_source_is_the_reference(
     (tmp_path / "Makefile").touch()
     page = docs.Page(tmp_path, "docs/a.md")
     (tmp_path / "docs/a.md").write_text("[f](../drgs_blender/core/frame.py) [m](../Makefile) [r](../README.md#x)")
-    (tmp_path / "README.md").touch()
+    (tmp_path / "README.md").write_text("# A page: `x`\n\n## X\n")
     expected = "[f](../reference/python/drgs_blender.core.frame.md) [m](../Makefile) [r](../index.md#x)"
     assert page.linked({"docs/a.md"}) == expected and page.files == ["Makefile"]
     (tmp_path / "docs/a.md").write_text("[b](b.md)")
     with pytest.raises(docs.DocsError, match=r"a\.md: links to b\.md"):
         page.linked({"docs/a.md"})
+    for link in ("../README.md#y", "#y"):
+        (tmp_path / "docs/a.md").write_text(f"# A\n\n[b]({link})")
+        with pytest.raises(docs.DocsError, match=f"links to {re.escape(link)}, which is not there"):
+            page.linked({"docs/a.md"})
+
+
+def test_anchors_are_those_of_github(docs: types.ModuleType) -> None:
+    text = "# One: `two_2`, [three](a.md)\n```\n# none\n```\n## Cards of AMD, Intel & Apple\n"
+    assert docs.anchors(text) == {"one-two_2-three", "cards-of-amd-intel--apple"}
+
+
+@pytest.mark.parametrize(
+    ("address", "fault"),
+    (
+        ("https://docs.blender.org/manual/en/latest/", ""),
+        ("mailto:someone@blender.org", ""),
+        ("http://blender.org", "not https"),
+        ("https://example.org/x", "no site's address"),
+        ("https://localhost/x", "no site's address"),
+        ("https://", "no site's address"),
+        ("https://github.com/<owner>/drgs", "placeholder"),
+    ),
+)
+def test_a_link_out_of_the_site_is_whole(docs: types.ModuleType, address: str, fault: str, tmp_path: Path) -> None:
+    assert fault in docs.fault_of(address) and bool(fault) == bool(docs.fault_of(address))
+    (tmp_path / "a.md").write_text(f"[x]({address})")
+    page = docs.Page(tmp_path, "a.md")
+    if fault:
+        with pytest.raises(docs.DocsError, match=fault):
+            page.linked({"a.md"})
+    else:
+        assert page.linked({"a.md"}) == f"[x]({address})"

@@ -190,12 +190,15 @@ def test_a_suite_leaves_tests_to_others_unless_they_are_asked_for(suites, tmp_pa
 
 
 def test_types_of_the_extension_are_checked_where_a_package_can_be_named_as_its_folder(suites, tmp_path):
-    checked = suites.lint(Path("python"), tmp_path / "drgs-blender", tmp_path).commands[2:]
-    assert [command[2:] for command in checked] == [
+    def checked(folder):
+        commands = suites.lint(Path("python"), tmp_path / folder, tmp_path).commands
+        return [command[2:] for command in commands if "mypy" in command]
+
+    assert checked("drgs-blender") == [
         ["mypy"],
         ["mypy", "-p", "drgs-blender.addon", "-p", "drgs-blender.operators", "-m", "drgs-blender"],
     ]
-    assert len(suites.lint(Path("python"), tmp_path / "drgs-blender-1.0", tmp_path).commands) == 3
+    assert checked("drgs-blender-1.0") == [["mypy"]]
 
 
 def test_types_of_every_tool_are_checked():
