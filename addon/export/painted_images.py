@@ -109,15 +109,24 @@ def _shown(obj: bpy.types.Object, warn: Warn) -> list[bpy.types.Image]:
     for material in dict.fromkeys(slot.material for slot in obj.original.material_slots):
         if material is None or material.node_tree is None:
             continue
-        for node in material.node_tree.nodes:
-            if node.type != "TEX_IMAGE":
-                continue
+        for node in _image_nodes(material.node_tree):
             if node.image is not None and KEY in node.image:
                 found.add(node.image)
             elif KEY in material and any(output.is_linked for output in node.outputs):
                 what = "no image" if node.image is None else f'an image, "{node.image.name}", that is none of its asset'
                 warn(f'"{obj.name}": its material "{material.name}" shows {what}; the asset\'s own is rendered')
     return sorted(found, key=lambda image: image.name_full)
+
+
+def _image_nodes(tree: bpy.types.NodeTree) -> Iterator[bpy.types.Node]:
+    """Nodes with an image in a tree and in the groups within it."""
+    trees = [tree]
+    for each in trees:  # grows
+        for node in each.nodes:
+            if node.type == "TEX_IMAGE":
+                yield node
+            elif node.type == "GROUP" and node.node_tree is not None and node.node_tree not in trees:
+                trees.append(node.node_tree)
 
 
 def _names(image: bpy.types.Image, hashes: dict[str, str]) -> list[str]:
