@@ -48,7 +48,8 @@ class _Picture(NamedTuple):
 def pictures_of(textures: MeshTextures, images: Sequence[Image]) -> dict[tuple[str, bool], Array]:
     """Pixels of painted `images`, which have the names of an asset's; what has another name or no bytes is left out.
 
-    Alpha is that of images whose files have any. One that is albedo and opacity at once counts as both, though its encoding is that of the albedo.
+    Alpha is that of images whose files have any. One that is albedo and opacity at once counts as both, though its
+    encoding is that of the albedo.
     """
     found: dict[tuple[str, bool], Array] = {}
     names = list(textures.images)
