@@ -51,6 +51,15 @@ def painted_images(obj: bpy.types.Object, asset: Asset, warn: Warn, read: Read =
     return [replace(found.picture, name=found.name) for found in _found(obj, asset, warn, read)]
 
 
+def are_painted(obj: bpy.types.Object, asset: Asset) -> bool:
+    """Whether images of the asset's are painted over on an object; their pixels are not read."""
+    if asset.mesh.textures is None:
+        return False
+    hashes = _hashes_of(asset.mesh.textures)
+    shown = (image for image in _shown(obj, lambda text: None) if _names(image, hashes))
+    return any(image_parts.ask_file(image, _hash) not in hashes.values() for image in shown)
+
+
 def with_painted_images(obj: bpy.types.Object, asset: Asset, warn: Warn) -> Asset:
     """The asset of an object, or what is left of it, with its images as painted; packed ones are packed anew."""
     found = list(_found(obj, asset, warn, read_picture))
@@ -75,9 +84,7 @@ def _found(obj: bpy.types.Object, asset: Asset, warn: Warn, read: Read) -> Itera
     textures = asset.mesh.textures
     if textures is None:
         return
-    made = lambda: (textures, _hashes_of(textures))  # noqa: E731
-    _, hashes = lookups.recall(_hashes, lambda known: known[0] is textures, made, _ASSETS)
-    uses = uses_of(textures)
+    hashes, uses = _hashes_of(textures), uses_of(textures)
     shown: dict[tuple[str, bool], str] = {}
     for image in _shown(obj, warn):
         if image_parts.ask_file(image, _hash) in hashes.values():
@@ -139,7 +146,12 @@ def _names(image: bpy.types.Image, hashes: dict[str, str]) -> list[str]:
 
 
 def _hashes_of(textures: MeshTextures) -> dict[str, str]:
-    return {name: hashlib.sha256(data.tobytes()).hexdigest() for name, data in textures.images.items()}
+    """Of the images of an asset, by their names; found once."""
+
+    def found() -> tuple[MeshTextures, dict[str, str]]:
+        return textures, {name: hashlib.sha256(data.tobytes()).hexdigest() for name, data in textures.images.items()}
+
+    return lookups.recall(_hashes, lambda known: known[0] is textures, found, _ASSETS)[1]
 
 
 def _hash(file: str | bytes) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import bmesh
 import bpy
@@ -165,6 +166,25 @@ def test_what_is_painted_within_node_groups_is_rendered(ball, export, depth):  #
     bpy.context.view_layer.update()
     assert not exported().frame.objects[0].images
     assert [text for text in export()[1] if "mine" in text and "none of its asset" in text]
+
+
+def test_the_header_says_that_splats_show_painted_images_once_they_are_saved(ball, tmp_path):  # noqa: F811
+    surfels, views = part("addon.viewport.surfels"), part("addon.viewport.views")
+    window = SimpleNamespace(type="WINDOW", as_pointer=lambda: 7)
+    context = SimpleNamespace(area=SimpleNamespace(regions=[window]), region=window)
+
+    def told():
+        surfels._share(context, bpy.context.evaluated_depsgraph_get())
+        surfels.cache.end()
+        return surfels.reduction(views.name_of(window))
+
+    assert not told()
+    paint(image_of("albedo"), PAINT)
+    bpy.context.view_layer.update()
+    assert "Save Edited Asset" in told()
+    bpy.ops.drgs.save_asset(filepath=str(tmp_path / "kept.drgs"), use_saved=True)
+    bpy.context.view_layer.update()
+    assert not told()
 
 
 @pytest.mark.parametrize("kind", ["WEBP", "TARGA"])
