@@ -13,6 +13,7 @@ import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
+from ..drgs_blender.core.own_python import SET_UP
 from ..drgs_blender.core.system import WINDOWS, replace
 
 #: The extension's folder: what the engine needs and the engine itself come with it.
@@ -42,9 +43,9 @@ RECONSTRUCT = Group("reconstruct", 200e6, 900e6)
 CAPTURE = Group("capture", 200e6, 480e6)
 #: NVIDIA Warp, for graphics cards.
 GPU = Group("gpu", 150e6, 400e6)
+#: OpenUSD, and what reads 3MF and COLLADA.
+FILES = Group("files", 35e6, 180e6)
 CUDA_BYTES = 3e9
-
-_STAMP = "drgs-engine.json"
 
 
 @functools.cache
@@ -113,7 +114,7 @@ def alive(folder: Path) -> bool:
 
 def read_stamp(folder: Path) -> dict[str, object]:
     try:
-        found = json.loads((folder / _STAMP).read_text(encoding="utf-8"))
+        found = json.loads((folder / SET_UP).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
@@ -121,9 +122,9 @@ def read_stamp(folder: Path) -> dict[str, object]:
 
 def write_stamp(folder: Path, **entries: object) -> None:
     """Remember what is done in `folder`."""
-    partial = folder / f"{_STAMP}.part"
+    partial = folder / f"{SET_UP}.part"
     partial.write_text(json.dumps(read_stamp(folder) | entries, indent=2), encoding="utf-8")
-    replace(partial, folder / _STAMP)
+    replace(partial, folder / SET_UP)
 
 
 def site_packages(folder: Path) -> Path:

@@ -22,6 +22,7 @@ from .engine_command import print_line
 _PURPOSES = {
     engine_environment.RECONSTRUCT: "PyTorch, which From Photographs needs",
     engine_environment.CAPTURE: "COLMAP, OpenCV and PyAV, which find the cameras of photographs and videos",
+    engine_environment.FILES: "readers and writers of USD, 3MF and COLLADA",
 }
 
 
@@ -64,6 +65,13 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         default=False,
         options={"SKIP_SAVE"},
     )
+    files: BoolProperty(
+        name="USD, 3MF and COLLADA",
+        description="Also fetch OpenUSD, lxml and pycollada, which read splats in USD files, write USD sequences, and "
+        "read meshes in 3MF and COLLADA files",
+        default=False,
+        options={"SKIP_SAVE"},
+    )
     index: StringProperty(
         name="Extra Package Index",
         description="Address of a package index that is asked too. Empty: those that pip is configured with",
@@ -83,6 +91,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
             self.reconstruct = self.reconstruct or not self._missing(engine_environment.RECONSTRUCT)
             self.capture = self.capture or not self._missing(engine_environment.CAPTURE)
             self.gpu = self.gpu or not self._missing(engine_environment.GPU)
+            self.files = self.files or not self._missing(engine_environment.FILES)
         return context.window_manager.invoke_props_dialog(self, width=440, confirm_text="Set Up")
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -104,6 +113,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         layout.prop(self, "reconstruct")
         layout.prop(self, "capture")
         layout.prop(self, "gpu")
+        layout.prop(self, "files")
         column = layout.column(align=True)
         if groups:
             fetch, disk = (sum(getattr(g, size) for g in groups) / 1e6 for size in ("download", "disk"))
@@ -129,6 +139,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
             engine_environment.RECONSTRUCT: self.reconstruct,
             engine_environment.CAPTURE: self.capture,
             engine_environment.GPU: self.gpu,
+            engine_environment.FILES: self.files,
         }
         return [group for group, chosen in wanted.items() if chosen]
 

@@ -51,6 +51,15 @@ def painted_images(obj: bpy.types.Object, asset: Asset, warn: Warn, read: Read =
     return [replace(found.picture, name=found.name) for found in _found(obj, asset, warn, read)]
 
 
+def are_painted(obj: bpy.types.Object, asset: Asset) -> bool:
+    """Whether images of the asset's are painted over on an object; their pixels are not read."""
+    if asset.mesh.textures is None:
+        return False
+    hashes = _hashes_of(asset.mesh.textures)
+    shown = (image for image in _shown(obj, lambda text: None) if _names(image, hashes))
+    return any(image_parts.ask_file(image, _hash) not in hashes.values() for image in shown)
+
+
 def with_painted_images(obj: bpy.types.Object, asset: Asset, warn: Warn) -> Asset:
     """The asset of an object, or what is left of it, with its images as painted; packed ones are packed anew."""
     found = list(_found(obj, asset, warn, read_picture))
@@ -75,9 +84,7 @@ def _found(obj: bpy.types.Object, asset: Asset, warn: Warn, read: Read) -> Itera
     textures = asset.mesh.textures
     if textures is None:
         return
-    made = lambda: (textures, _hashes_of(textures))  # noqa: E731
-    _, hashes = lookups.recall(_hashes, lambda known: known[0] is textures, made, _ASSETS)
-    uses = uses_of(textures)
+    hashes, uses = _hashes_of(textures), uses_of(textures)
     shown: dict[tuple[str, bool], str] = {}
     for image in _shown(obj, warn):
         if image_parts.ask_file(image, _hash) in hashes.values():
@@ -109,15 +116,24 @@ def _shown(obj: bpy.types.Object, warn: Warn) -> list[bpy.types.Image]:
     for material in dict.fromkeys(slot.material for slot in obj.original.material_slots):
         if material is None or material.node_tree is None:
             continue
-        for node in material.node_tree.nodes:
-            if node.type != "TEX_IMAGE":
-                continue
+        for node in _image_nodes(material.node_tree):
             if node.image is not None and KEY in node.image:
                 found.add(node.image)
             elif KEY in material and any(output.is_linked for output in node.outputs):
                 what = "no image" if node.image is None else f'an image, "{node.image.name}", that is none of its asset'
                 warn(f'"{obj.name}": its material "{material.name}" shows {what}; the asset\'s own is rendered')
     return sorted(found, key=lambda image: image.name_full)
+
+
+def _image_nodes(tree: bpy.types.NodeTree) -> Iterator[bpy.types.Node]:
+    """Nodes with an image in a tree and in the groups within it."""
+    trees = [tree]
+    for each in trees:  # grows
+        for node in each.nodes:
+            if node.type == "TEX_IMAGE":
+                yield node
+            elif node.type == "GROUP" and node.node_tree is not None and node.node_tree not in trees:
+                trees.append(node.node_tree)
 
 
 def _names(image: bpy.types.Image, hashes: dict[str, str]) -> list[str]:
@@ -130,7 +146,12 @@ def _names(image: bpy.types.Image, hashes: dict[str, str]) -> list[str]:
 
 
 def _hashes_of(textures: MeshTextures) -> dict[str, str]:
-    return {name: hashlib.sha256(data.tobytes()).hexdigest() for name, data in textures.images.items()}
+    """Of the images of an asset, by their names; found once."""
+
+    def found() -> tuple[MeshTextures, dict[str, str]]:
+        return textures, {name: hashlib.sha256(data.tobytes()).hexdigest() for name, data in textures.images.items()}
+
+    return lookups.recall(_hashes, lambda known: known[0] is textures, found, _ASSETS)[1]
 
 
 def _hash(file: str | bytes) -> str:

@@ -24,7 +24,7 @@ def draw_engine(layout: bpy.types.UILayout, context: bpy.types.Context, always: 
     if fault := engine_bundle.fault():
         wrapped(layout, context, f"The packages that came with the extension {fault}", "ERROR")
     if engine_link.origin() == "bundle":
-        text = "Set Up Engine is for more: photographs, NVIDIA cards"
+        text = "Set Up Engine is for more: photographs, NVIDIA cards, USD files"
         wrapped(layout, context, text, "BLANK1")
     if engine_environment.needs_network(engine_link.engine_folder()) and not bpy.app.online_access:
         wrapped(layout, context, "The set-up fetches Python packages; Blender is offline", "INTERNET_OFFLINE")

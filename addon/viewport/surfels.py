@@ -6,6 +6,7 @@ points are seen before them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -20,8 +21,9 @@ from ...drgs_blender.core.frame import ProxyMesh
 from ...drgs_blender.core.level_of_detail import Detail
 from ...drgs_blender.core.material_adjustments import edited_asset
 from .. import assets, mesh_arrays, proxies, surfel_points
-from ..export.export_cache import ExportCache, uid
+from ..export.export_cache import PAINTED, ExportCache, uid
 from ..export.objects import appearance_of
+from ..export.painted_images import are_painted
 from ..level_of_detail import most_surfels
 from . import draw, views
 
@@ -32,7 +34,7 @@ _WIDTH = 2.5
 cache = ExportCache()
 #: Orders of the surfels of assets, by their centres.
 _orders: mesh_arrays.OfArrays[Detail] = mesh_arrays.OfArrays(8)
-#: What viewports show in place of all surfels, in words, by `views.name_of`.
+#: What viewports show in place of all surfels as they are painted, in words, by `views.name_of`.
 _reductions: dict[str, str] = {}
 
 
@@ -44,7 +46,7 @@ def forget() -> None:
 
 
 def reduction(name: str) -> str:
-    """What a viewport shows in place of all surfels, in words; "" where it shows them."""
+    """What a viewport shows in place of all surfels as they are painted, in words; "" where it shows them."""
     return _reductions.get(name, "")
 
 
@@ -121,10 +123,13 @@ def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
 
 
 def _share(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> float:
-    """The part of all surfels that the scene's limit allows, which the viewport's header says."""
+    """The part of all surfels that the scene's limit allows. The viewport's header says it, and what is not shown."""
     name, most, whole = views.name_of(context.region), most_surfels(depsgraph.scene), number(depsgraph)
     share = most / whole if 0 < most < whole else 1.0
-    told = f"{most:,} of {whole:,} surfels" if share < 1.0 else ""
+    parts = [f"{most:,} of {whole:,} surfels"] if share < 1.0 else []
+    if any(_is_painted(obj) for obj in _visible(depsgraph)):
+        parts.append("Splats show painted images after Save Edited Asset")
+    told = "  |  ".join(parts)
     if told != reduction(name):
         for other in context.area.regions:
             if other.type == "HEADER":
@@ -135,8 +140,25 @@ def _share(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> float:
 
 def number(depsgraph: bpy.types.Depsgraph) -> int:
     """Surfels of all visible objects, as far as these were not cut; those of instances once more."""
-    shown = (i.object for i in depsgraph.object_instances if i.show_self and assets.is_drgs(i.object))
-    return sum(0 if (found := _shown(obj, depsgraph)) is None else len(found[0].surfels) for obj in shown)
+    shown = (_shown(obj, depsgraph) for obj in _visible(depsgraph))
+    return sum(0 if found is None else len(found[0].surfels) for found in shown)
+
+
+def _visible(depsgraph: bpy.types.Depsgraph) -> Iterator[bpy.types.Object]:
+    """DR-GS objects; those of instances once more."""
+    return (i.object for i in depsgraph.object_instances if i.show_self and assets.is_drgs(i.object))
+
+
+def _is_painted(obj: bpy.types.Object) -> bool:
+    """Whether images of its asset are painted over on an object: the engine alone gives their colours to surfels."""
+
+    def found() -> bool:
+        try:
+            return are_painted(obj, assets.load(assets.file_of(obj)))
+        except DrgsError:  # reported when the object is rendered
+            return False
+
+    return cache.get((PAINTED, uid(obj)), (uid(obj), uid(obj.data)), found)
 
 
 def _state(obj: bpy.types.Object) -> tuple[tuple[Any, ...], tuple[int, ...]]:

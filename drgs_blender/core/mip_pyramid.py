@@ -10,6 +10,9 @@ from .color import srgb_to_linear, to_unit
 
 Array = np.ndarray
 
+#: Rows of an image that are made linear at a time.
+_ROWS = 64
+
 
 class TextureImage(Protocol):
     """An image, and how it lies in texture coordinates; as `formats.files.Image`."""
@@ -170,7 +173,10 @@ def _linear(pixels: Array, srgb: bool) -> Array:
     if not srgb or pixels.dtype.kind != "u":
         return to_unit(pixels)
     values = np.arange(np.iinfo(pixels.dtype).max + 1, dtype=pixels.dtype)
-    found: Array = srgb_to_linear(to_unit(values)).take(pixels)
+    table, found = srgb_to_linear(to_unit(values)), np.empty(pixels.shape, np.float32)
+    for first in range(0, len(pixels), _ROWS):  # numpy makes 8 bytes of each index, and checks them twice
+        rows = slice(first, first + _ROWS)
+        table.take(pixels[rows], out=found[rows], mode="clip")
     return found
 
 

@@ -8,6 +8,9 @@ import numpy as np
 
 Array = np.ndarray
 
+#: Rows that are divided by a colour at a time.
+_ROWS = 64
+
 
 @dataclass(frozen=True, slots=True)
 class Pass:
@@ -129,7 +132,13 @@ def with_colours(names: tuple[str, ...]) -> tuple[str, ...]:
 
 def without_colour(light: Array, colour: Array) -> Array:
     """(h, w, 3) float32 `light` / `colour`; where a channel has none, the mean of the others, as in Cycles."""
-    known = colour != 0
-    out = np.where(known, light / np.where(known, colour, 1), 0)
-    grey = out.sum(axis=-1, keepdims=True) / np.maximum(known.sum(axis=-1, keepdims=True), 1)
-    return np.where(known, out, grey).astype(np.float32)
+    made = np.zeros(light.shape, np.float32)
+    for first in range(0, len(light), _ROWS):  # what is computed on the way takes more memory than the pass
+        rows = slice(first, first + _ROWS)
+        if not light[rows].any():
+            continue
+        known = colour[rows] != 0
+        out = np.where(known, light[rows] / np.where(known, colour[rows], 1), 0)
+        grey = out.sum(axis=-1, keepdims=True) / np.maximum(known.sum(axis=-1, keepdims=True), 1)
+        made[rows] = np.where(known, out, grey)
+    return made

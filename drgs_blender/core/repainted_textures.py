@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .asset.model import MATERIAL_CHANNELS, Asset, Mesh
-from .asset.textures import ALBEDO, COLOURED, EXTENSIONS, FACTORS, NORMAL, OPACITY, SLOTS, MeshTextures
+from .asset.textures import ALBEDO, COLOURED, EXTENSIONS, FACTORS, NORMAL, OPACITY, SLOTS, MeshTextures, has_alpha
 from .materials import Image
 from .mip_pyramid import Pyramid
 
@@ -48,7 +48,8 @@ class _Picture(NamedTuple):
 def pictures_of(textures: MeshTextures, images: Sequence[Image]) -> dict[tuple[str, bool], Array]:
     """Pixels of painted `images`, which have the names of an asset's; what has another name or no bytes is left out.
 
-    One that is albedo and opacity at once counts as both, though its encoding is that of the albedo.
+    Alpha is that of images whose files have any. One that is albedo and opacity at once counts as both, though its
+    encoding is that of the albedo.
     """
     found: dict[tuple[str, bool], Array] = {}
     names = list(textures.images)
@@ -59,7 +60,7 @@ def pictures_of(textures: MeshTextures, images: Sequence[Image]) -> dict[tuple[s
             continue
         pixels = np.full((*image.pixels.shape[:2], 4), 255, np.uint8)
         pixels[..., :3] = image.pixels[..., : min(image.pixels.shape[2], 3)]
-        if image.pixels.shape[2] == 4:
+        if image.pixels.shape[2] == 4 and has_alpha(textures.images[image.name].tobytes()):
             pixels[..., 3] = image.pixels[..., 3]
         pixels.flags.writeable = False
         coloured = image.encoding == "srgb"
@@ -87,7 +88,7 @@ def repainted(asset: Asset, before: Pictures, now: Pictures, files: Mapping[tupl
     now : mapping
         Those that are painted.
     files : mapping
-        The same as PNG or JPEG files, (bytes,) uint8.
+        The same as PNG or JPEG files, or their beginnings, (bytes,) uint8.
     """
     mesh, surfels, textures = asset.mesh, asset.surfels, asset.mesh.textures
     assert textures is not None
@@ -122,7 +123,7 @@ def repainted(asset: Asset, before: Pictures, now: Pictures, files: Mapping[tupl
             found[name] = made = own if name in found else own.copy()
             new = np.clip(value[changed], 0, MATERIAL_CHANNELS[name].limit)
             made[rows[changed]] = new if own.ndim == 2 else new[:, 0]
-    of_mesh["textures"] = _with_files(textures, files)
+    of_mesh["textures"] = _with_files(textures, now, files)
     return replace(asset, mesh=replace(mesh, **of_mesh), surfels=replace(surfels, **of_surfels))
 
 
@@ -148,15 +149,15 @@ def _painted(textures: MeshTextures, now: Pictures) -> Iterator[tuple[int, int, 
                 yield slot, int(k), key
 
 
-def _with_files(textures: MeshTextures, files: Mapping[tuple[str, bool], Array]) -> MeshTextures:
+def _with_files(textures: MeshTextures, now: Pictures, files: Mapping[tuple[str, bool], Array]) -> MeshTextures:
     """Textures with other files; an image that is painted as a colour and not as data, or so, becomes two."""
     images, slots = dict(textures.images), textures.slots.copy()
     names, coloured = list(images), np.isin(np.arange(len(SLOTS)), COLOURED)
     for (name, colour), data in files.items():
         uses = (textures.slots == names.index(name)) & (coloured == colour)
         others = (textures.slots == names.index(name)) & (coloured != colour)
-        other = files.get((name, not colour))
-        if others.any() and (other is None or not np.array_equal(other, data)):
+        other = now.get((name, not colour))
+        if others.any() and (other is None or not np.array_equal(other, now[name, colour])):
             own = f"{name} ({'colour' if colour else 'data'})"
             slots[uses] = len(images) if own not in images else list(images).index(own)
             images[own] = data

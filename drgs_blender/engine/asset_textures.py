@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import InitVar, dataclass, field, replace
 
 import numpy as np
@@ -18,6 +19,8 @@ from ..core.texture_adjustments import COLOUR
 from ..deform.face_frames import local_normals, posed_normals
 
 Array = np.ndarray
+#: Pixels, as `decoded`, of an image file by its name and content; None where they are not known.
+PixelsOf = Callable[[tuple[str, Array]], Array | None]
 
 #: Texels that are recoloured at a time.
 _TOGETHER = 1 << 20
@@ -29,22 +32,22 @@ class TexturedAsset:
 
     Attributes
     ----------
-    alike : TexturedAsset, optional
-        Of an asset that shares image files with it, whose pixels are taken.
+    known : callable, optional
+        Gives pixels of image files that need not be decoded; None of others.
     faults : list of str
         Images that cannot be used; values of vertices stand for them.
     """
 
     asset: Asset
     key: str
-    alike: InitVar[TexturedAsset | None] = None
+    known: InitVar[PixelsOf | None] = None
     textures: MeshTextures = field(init=False)
     faults: list[str] = field(default_factory=list)
     _vertices: Array = field(init=False)
     _images: dict[tuple[object, ...], Image] = field(default_factory=dict)
     _local: Array | None = None
 
-    def __post_init__(self, alike: TexturedAsset | None) -> None:
+    def __post_init__(self, known: PixelsOf | None) -> None:
         mesh = self.asset.mesh
         assert mesh.textures is not None
         given, self._vertices = mesh.textures, keep(mesh.vertices)
@@ -55,7 +58,7 @@ class TexturedAsset:
         for number in np.unique(slots[slots >= 0]):
             uses = slots == number
             try:
-                pixels = alike.pixels_of(files[number]) if alike is not None else None
+                pixels = None if known is None else known(files[number])
                 if pixels is None:
                     pixels = decoded(files[number][1], f"{self.key}, image {files[number][0]}")
             except AssetError as error:

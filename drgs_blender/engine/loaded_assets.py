@@ -11,7 +11,7 @@ from ..core.errors import AssetError
 from ..core.frame import ObjectState
 from ..core.level_of_detail import Detail
 from ..deform.mesh_driven import MeshDriven
-from .asset_textures import TexturedAsset
+from .asset_textures import PixelsOf, TexturedAsset
 from .captured_objects import Glow, glow_of
 
 #: Surfels of the first level of detail that is made of an asset; others are its beginnings.
@@ -34,8 +34,8 @@ class LoadedAsset:
         What of the file could not be used.
     painting : int
         Number of the images painted over its own, unlike those of other objects of the file; 0: none are.
-    alike : TexturedAsset, optional
-        Textures that share images with its own.
+    pixels_of : callable, optional
+        Gives the pixels of image files that need not be decoded, as `TexturedAsset.pixels_of`.
     levels : dict of int to LoadedAsset
         Its most needed surfels by their number, see `first`.
     larger : LoadedAsset, optional
@@ -49,7 +49,7 @@ class LoadedAsset:
     textured: TexturedAsset | None = None
     faults: list[str] = field(default_factory=list)
     painting: int = 0
-    alike: TexturedAsset | None = None
+    pixels_of: PixelsOf | None = None
     levels: dict[int, LoadedAsset] = field(default_factory=dict)
     larger: LoadedAsset | None = None
     _detail: Detail | None = None
@@ -107,5 +107,5 @@ class LoadedAsset:
         """Its textures, decoded when an object first needs them."""
         if self.textured is None:
             name = f"{key} (painting {self.painting})" if self.painting else key
-            self.textured = TexturedAsset(self.asset, name, self.alike)
+            self.textured = TexturedAsset(self.asset, name, self.pixels_of)
         return self.textured

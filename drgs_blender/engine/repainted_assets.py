@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import itertools
+import struct
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -57,12 +57,18 @@ def _made(whole: LoadedAsset, state: ObjectState) -> LoadedAsset:
     before, files = {}, {}
     for (name, coloured), pixels in now.items():
         data = textures.images[name]
-        files[name, coloured] = _encoded(pixels if has_alpha(data.tobytes()) else pixels[..., :3])
+        files[name, coloured] = _header(pixels, has_alpha(data.tobytes()))
         with contextlib.suppress(AssetError):  # a damaged file; what is painted over it is shown all the same
             before[name, coloured] = _pixels(whole, name, state.asset)
     made = repainted(whole.asset, before, now, files)
-    number, alike = next(_paintings), whole.textured_of(state.asset)
-    return LoadedAsset(made, whole.stamp, faults=[*whole.faults, *faults], painting=number, alike=alike)
+    others = whole.textured_of(state.asset)
+
+    def pixels_of(file: tuple[str, Array]) -> Array | None:
+        painted = next((now[key] for key, header in files.items() if header is file[1]), None)
+        return others.pixels_of(file) if painted is None else painted
+
+    number, told = next(_paintings), [*whole.faults, *faults]
+    return LoadedAsset(made, whole.stamp, faults=told, painting=number, pixels_of=pixels_of)
 
 
 def _pixels(whole: LoadedAsset, name: str, key: str) -> Array:
@@ -74,10 +80,8 @@ def _pixels(whole: LoadedAsset, name: str, key: str) -> Array:
     return decoded(file[1], f"{key}, image {name}") if known is None else known
 
 
-def _encoded(pixels: Array) -> Array:
-    """A PNG file of pixels, (bytes,) uint8; quickly, for it is read at once."""
-    from PIL import Image as Pillow
-
-    data = io.BytesIO()
-    Pillow.fromarray(np.ascontiguousarray(pixels)).save(data, "PNG", compress_level=1)
-    return np.frombuffer(data.getbuffer(), np.uint8)
+def _header(pixels: Array, alpha: bool) -> Array:
+    """The beginning of a PNG file of pixels, (bytes,) uint8: it says what of them counts; they need not be read."""
+    height, width = pixels.shape[:2]
+    fields = struct.pack(">I4sIIBBBBB", 13, b"IHDR", width, height, 8, 6 if alpha else 2, 0, 0, 0)
+    return np.frombuffer(b"\x89PNG\r\n\x1a\n" + fields, np.uint8)

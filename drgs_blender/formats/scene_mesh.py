@@ -13,6 +13,7 @@ import numpy as np
 from ..core.asset.tensors import parse_json
 from ..core.color import srgb_to_linear
 from ..core.errors import AssetError
+from ..core.own_python import install_remedy
 from . import trimesh_scene
 from .files import Image, MaterialFile, MeshFile
 from .obj import beside, load_texture
@@ -22,7 +23,6 @@ from .trimesh_scene import ABOUT
 
 Array = np.ndarray
 
-_NOT_INSTALLED = ("needs the packages lxml and pycollada", "Install them: pip install lxml pycollada")
 _REMEDY = "Import it in another program and export glTF (.glb), which is read whole"
 #: What of a file is left out: elements of its XML, and what they are called.
 _LEFT_OUT = {
@@ -64,7 +64,9 @@ def read_scene_mesh(path: Path) -> MeshFile:
         lxml or pycollada is not installed.
     """
     kind = trimesh_scene.kind_of(path)
-    arrays = read_in_subprocess(path, trimesh_scene.__name__, kind, _NOT_INSTALLED)
+    remedy = f"Install them: {install_remedy('lxml pycollada', 'USD, 3MF and COLLADA')}"
+    missing = "needs the packages lxml and pycollada", remedy
+    arrays = read_in_subprocess(path, trimesh_scene.__name__, kind, missing)
     about = parse_json(arrays[ABOUT].tobytes(), str(path))
     found, pieces = about["found"], about["pieces"]
     left_out = [name for tags, name in _LEFT_OUT[kind].items() if any(found.get(tag) for tag in tags)]

@@ -15,6 +15,7 @@ import numpy as np
 from ..core.asset.archive import replace_by
 from ..core.errors import DeviceError, WriteError
 from ..core.file_types import USD_KERNELS
+from ..core.own_python import install_remedy
 from . import usd_stage
 from .axes import UP_AXES
 from .files import SurfelFile
@@ -29,7 +30,6 @@ Array = np.ndarray
 
 #: What to do for what is not read.
 MESHES = "For its meshes, import it in Blender and export glTF (.glb), which is read"
-_NOT_INSTALLED = ("needs the package usd-core", "Install it: pip install usd-core")
 _NAMES = (b".usda", b".usdc", b".usd")
 
 
@@ -51,7 +51,9 @@ def read_usd_splats(path: Path) -> SurfelFile:
         usd-core is not installed.
     """
     check_crate(path)
-    arrays = read_in_subprocess(path, usd_stage.__name__, "USD", _NOT_INSTALLED, {NO_SPLATS: MESHES}, SECONDS, PATIENCE)
+    arrays = read_in_subprocess(
+        path, usd_stage.__name__, "USD", _not_installed(), {NO_SPLATS: MESHES}, SECONDS, PATIENCE
+    )
     up = arrays.pop(UP).tobytes().decode(errors="replace")
     pieces = []
     for i in range(sum(name.endswith("/matrix") for name in arrays)):
@@ -131,4 +133,9 @@ def check_usd(subject: str) -> None:
     try:
         import pxr  # noqa: F401
     except ImportError as error:
-        raise DeviceError(subject, *_NOT_INSTALLED) from error
+        raise DeviceError(subject, *_not_installed()) from error
+
+
+def _not_installed() -> tuple[str, str]:
+    """What is missing, and what to do."""
+    return "needs the package usd-core", f"Install it: {install_remedy('usd-core', 'USD, 3MF and COLLADA')}"

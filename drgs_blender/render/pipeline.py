@@ -107,8 +107,6 @@ def render(
 
     report(0.0, "Projecting")
     scene, lights = prepared.scene, prepared.lights
-    with interruptible(check):
-        visible = VisibleSurfaces(prepared, frame, parameters, backend)
     film, numbers = Film(camera, settings, parameters), object_numbers(scene)
     mattes = [
         CryptoFilm(kind, scene, frame)
@@ -127,25 +125,32 @@ def render(
         for then in (prepared.previous, prepared.following, past)
     ]
     end = 1.0 if settings.denoise == "none" else 0.9
-    batches = Batches(prepared, frame, check, backend)
-    height = backend.strip_factor * strip_height(right - left, settings.subpixel_count)
-    for y0 in range(top, bottom, height):
-        report(end * (y0 - top) / (bottom - top), "Rendering")
-        y1 = min(y0 + height, bottom)
+
+    def draw_strips() -> None:
+        """Fill the films; what this takes, the splats above all, is given back before the light is denoised."""
         with interruptible(check):
-            buffer = visible.rows(y0, y1)
-        check()
-        radiance = batches.light(buffer)
-        film.add(buffer, radiance, numbers, prepared.seen)
-        for matte in mattes:
-            matte.add(buffer)
-        surfaces.add(buffer)
-        groups.add(buffer, radiance)
-        if lights is not None and lights.seen:
-            film.pixels.emission[y0 - top : y1 - top] += visible_lights(lights.tables, parameters, left, buffer)
-        for motion in moving:
-            if motion is not None:
-                motion.add(buffer, scene)
+            visible = VisibleSurfaces(prepared, frame, parameters, backend)
+        batches = Batches(prepared, frame, check, backend)
+        height = backend.strip_factor * strip_height(right - left, settings.subpixel_count)
+        for y0 in range(top, bottom, height):
+            report(end * (y0 - top) / (bottom - top), "Rendering")
+            y1 = min(y0 + height, bottom)
+            with interruptible(check):
+                buffer = visible.rows(y0, y1)
+            check()
+            radiance = batches.light(buffer)
+            film.add(buffer, radiance, numbers, prepared.seen)
+            for matte in mattes:
+                matte.add(buffer)
+            surfaces.add(buffer)
+            groups.add(buffer, radiance)
+            if lights is not None and lights.seen:
+                film.pixels.emission[y0 - top : y1 - top] += visible_lights(lights.tables, parameters, left, buffer)
+            for motion in moving:
+                if motion is not None:
+                    motion.add(buffer, scene)
+
+    draw_strips()
     seen = film.pixels
     motions = [None if motion is None else motion.motion(seen.position, seen.coverage) for motion in moving]
     signal = None

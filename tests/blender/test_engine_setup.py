@@ -344,15 +344,18 @@ def test_what_finds_cameras_is_a_part_of_its_own_and_the_set_up_says_what_it_add
     link, operator = part("addon.engine_link"), part("operators.engine_setup")
     monkeypatch.delenv("DRGS_ENGINE")
     monkeypatch.setattr(environment, "state", lambda folder: "ready")
-    lacking = {environment.CAPTURE}
+    lacking = {environment.CAPTURE, environment.FILES}
     monkeypatch.setattr(environment, "needs_network", lambda folder, source=None, group=None: group in lacking)
     assert link.lacks_capture() and not link.lacks_reconstruction()
     cls = operator.DRGS_OT_engine_setup
-    fields = SimpleNamespace(reconstruct=True, capture=True, gpu=False, afresh=False, layout=Labels())
+    fields = SimpleNamespace(reconstruct=True, capture=True, gpu=False, files=True, afresh=False, layout=Labels())
     for name in ("_groups", "_extras", "_missing"):
         setattr(fields, name, getattr(cls, name).__get__(fields))
     cls.draw(fields, bpy.context)
-    assert " ".join(fields.layout.texts).startswith("Adds COLMAP, OpenCV and PyAV, which find the cameras of")
+    texts = " ".join(fields.layout.texts)
+    assert (
+        texts.startswith("Adds COLMAP, OpenCV and PyAV, which find the cameras of") and "USD, 3MF and COLLADA" in texts
+    )
     monkeypatch.setenv("DRGS_ENGINE", str(tmp_path))  # an environment of the user's own says itself what it lacks
     assert not link.lacks_capture()
 

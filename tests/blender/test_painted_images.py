@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import bmesh
 import bpy
@@ -122,6 +123,68 @@ def test_what_is_in_the_place_of_an_image_and_not_rendered_is_told(ball, export,
     paint(image_of("albedo"), PAINT)
     name, problem = change(ball)
     assert [text for text in export()[1] if name in text and problem in text]
+
+
+def _grouped(obj, image, depth):
+    """Put the nodes of an image into groups, `depth` within each other; the innermost group."""
+    tree = bpy.data.node_groups.new("innermost", "ShaderNodeTree")
+    tree.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
+    end, texture = tree.nodes.new("NodeGroupOutput"), tree.nodes.new("ShaderNodeTexImage")
+    texture.image = image
+    tree.links.new(texture.outputs["Color"], end.inputs[0])
+    outer = tree
+    for _ in range(depth - 1):
+        inner, outer = outer, bpy.data.node_groups.new("outer", "ShaderNodeTree")
+        outer.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
+        node, end = outer.nodes.new("ShaderNodeGroup"), outer.nodes.new("NodeGroupOutput")
+        node.node_tree = inner
+        outer.links.new(node.outputs[0], end.inputs[0])
+    for material in obj.data.materials:
+        nodes, links = material.node_tree.nodes, material.node_tree.links
+        for plain in [node for node in nodes if node.type == "TEX_IMAGE" and node.image == image]:
+            group = nodes.new("ShaderNodeGroup")
+            group.node_tree = outer
+            for link in list(plain.outputs["Color"].links):
+                links.new(group.outputs[0], link.to_socket)
+            nodes.remove(plain)
+    return tree
+
+
+@pytest.mark.parametrize("depth", [1, 2])
+def test_what_is_painted_within_node_groups_is_rendered(ball, export, depth):  # noqa: F811
+    """And forgotten in viewports once the group shows the image no more."""
+    exported = lambda: part("addon.viewport.scenes").exported(bpy.context.evaluated_depsgraph_get())  # noqa: E731
+    image = image_of("albedo")
+    inner = _grouped(ball, image, depth)
+    bpy.context.view_layer.update()
+    assert not exported().frame.objects[0].images
+    paint(image, PAINT)
+    bpy.context.view_layer.update()
+    (sent,) = exported().frame.objects[0].images
+    assert sent.name == "albedo" and tuple(sent.pixels[3, 3]) == GREEN
+    next(node for node in inner.nodes if node.type == "TEX_IMAGE").image = bpy.data.images.new("mine", 4, 4)
+    bpy.context.view_layer.update()
+    assert not exported().frame.objects[0].images
+    assert [text for text in export()[1] if "mine" in text and "none of its asset" in text]
+
+
+def test_the_header_says_that_splats_show_painted_images_once_they_are_saved(ball, tmp_path):  # noqa: F811
+    surfels, views = part("addon.viewport.surfels"), part("addon.viewport.views")
+    window = SimpleNamespace(type="WINDOW", as_pointer=lambda: 7)
+    context = SimpleNamespace(area=SimpleNamespace(regions=[window]), region=window)
+
+    def told():
+        surfels._share(context, bpy.context.evaluated_depsgraph_get())
+        surfels.cache.end()
+        return surfels.reduction(views.name_of(window))
+
+    assert not told()
+    paint(image_of("albedo"), PAINT)
+    bpy.context.view_layer.update()
+    assert "Save Edited Asset" in told()
+    bpy.ops.drgs.save_asset(filepath=str(tmp_path / "kept.drgs"), use_saved=True)
+    bpy.context.view_layer.update()
+    assert not told()
 
 
 @pytest.mark.parametrize("kind", ["WEBP", "TARGA"])

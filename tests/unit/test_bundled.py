@@ -73,3 +73,10 @@ def test_what_is_absent_is_installed_where_the_engine_is(monkeypatch, bundled, s
     monkeypatch.setattr(own_python, "bundled", bundled)
     remedy = libraries.install_command(["av"])
     assert said in remedy and ("pip install" in remedy) == (said == "pip install")
+
+
+def test_what_an_environment_of_set_up_engine_lacks_comes_by_set_up_engine(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    assert "pip install" in libraries.install_command(["av"])
+    (tmp_path / own_python.SET_UP).touch()
+    assert "Set Up Engine" in libraries.install_command(["av"])

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
 from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
 from drgs_blender.render import pipeline
-from drgs_blender.render.denoise.demodulation import demodulate
-from drgs_blender.render.denoise.svgf_spatial import denoise
+from drgs_blender.render.denoise.demodulation import CERTAINTY, LIGHT, demodulate
+from drgs_blender.render.denoise.svgf_spatial import denoise, prepare, smooth
 from drgs_blender.render.film.film import Film
 from drgs_blender.render.film.guides import Guides
 from drgs_blender.render.lights.environment import EnvironmentLight
@@ -62,6 +64,31 @@ def test_constants_stay_to_rounding(split: bool) -> None:
             expected[:, :, 0::2] += expected[:, :, 1::2]
             expected[:, :, 1::2] = 0
         assert np.allclose(out, expected, rtol=2e-5, atol=1e-7)
+
+
+def test_it_takes_the_memory_of_the_light_twice_and_of_the_guide_once() -> None:
+    components, variance = (np.tile(part, (8, 8, *[1] * (part.ndim - 2))) for part in light_of(np.ones((H, W)), wall()))
+    guides = Guides(*(np.tile(part, (8, 8, *[1] * (part.ndim - 2))) for part in wall()))
+    denoise(components, variance, guides)  # compiles
+    signal = demodulate(components, variance, guides)
+    needed = signal.guide.nbytes + 2 * signal.light.nbytes
+    tracemalloc.start()
+    denoise(components, variance, guides)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1.1 * needed
+
+
+def test_what_is_smoothed_stays_unless_it_may_be_overwritten() -> None:
+    signal = prepare(*light_of(np.full((H, W), 2.0), wall(), noise=0.3), wall())
+    before = signal.light.copy()
+    out = smooth(signal).light
+    np.testing.assert_array_equal(
+        signal.light[:, [*range(CERTAINTY), *range(LIGHT, before.shape[1])]],
+        before[:, [*range(CERTAINTY), *range(LIGHT, before.shape[1])]],
+    )
+    again = smooth(signal, spare=demodulate(*light_of(np.full((H, W), 1.0), wall()), wall()).light).light
+    np.testing.assert_array_equal(again[:, LIGHT:], out[:, LIGHT:])
 
 
 def test_noise_goes_and_energy_stays() -> None:

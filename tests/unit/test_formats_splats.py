@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from splat_files import covariance, damaged, random_splats, refusals
 
+from drgs_blender.core import own_python
 from drgs_blender.core.asset import Surfels
 from drgs_blender.core.color import linear_to_srgb, srgb_to_linear
 from drgs_blender.core.errors import AssetError, DeviceError
@@ -555,15 +556,21 @@ def Xform "Root"
         read_surfels(tmp_path / "b.usda")
 
 
-def test_usd_without_its_package_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The package hides behind a module of its name that cannot be imported."""
+@pytest.mark.parametrize(
+    ("bundled", "said"), [([], "pip install usd-core"), ([sys.executable], 'Set Up Engine .* "USD, 3MF and COLLADA"')]
+)
+def test_usd_without_its_package_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bundled: list[str], said: str
+) -> None:
+    """The package hides behind a module of its name that cannot be imported; zips of the extension have none."""
+    monkeypatch.setattr(own_python, "bundled", bundled)
     (tmp_path / "pxr.py").write_text("raise ImportError")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setitem(sys.modules, "pxr", None)
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
-    with pytest.raises(DeviceError, match="pip install usd-core"):
+    with pytest.raises(DeviceError, match=said):
         read_surfels(tmp_path / "a.usda")
-    with pytest.raises(DeviceError, match="pip install usd-core"):
+    with pytest.raises(DeviceError, match=said):
         write_usd_splats(tmp_path / "b.usda", random_splats(3))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import sys
 import zipfile
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from PIL import Image as Pillow
 from scene_files import binary_stl, collada, model, off, text_stl, threemf
 
 from drgs_blender.cli.main import main
+from drgs_blender.core import own_python
 from drgs_blender.core.color import srgb_to_linear
 from drgs_blender.core.errors import AssetError, DeviceError
 from drgs_blender.formats.files import MeshFile
@@ -250,10 +252,17 @@ def test_small_files_do_not_unpack_to_large_ones(tmp_path: Path) -> None:
         read(tmp_path, "a.3mf", data.getvalue())
 
 
-def test_without_its_packages_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("bundled", "said"),
+    [([], "pip install lxml pycollada"), ([sys.executable], 'Set Up Engine .* "USD, 3MF and COLLADA"')],
+)
+def test_without_its_packages_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bundled: list[str], said: str
+) -> None:
+    monkeypatch.setattr(own_python, "bundled", bundled)
     (tmp_path / "sitecustomize.py").write_text("import sys; sys.modules['lxml'] = None\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with pytest.raises(DeviceError, match=r"a\.3mf: needs the packages .* pip install lxml pycollada"):
+    with pytest.raises(DeviceError, match=rf"a\.3mf: needs the packages .* {said}"):
         read(tmp_path, "a.3mf", threemf(model(TRIANGLE, np.array([[0, 1, 2]]))))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import weakref
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from drgs_blender.core.errors import Cancelled, UsageError
 from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
 from drgs_blender.core.passes import BY_NAME
 from drgs_blender.render import pipeline
+from drgs_blender.render.film.cryptomatte import CryptoFilm
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.prepared_scene import PreparedScene
 from drgs_blender.render.scene.trace_scene import TraceScene
@@ -47,6 +49,30 @@ def test_strips_and_batches_do_not_change_a_bit(
         again = pipeline.render(PreparedScene(scene, light, posed), this)
         for name in ALL:
             assert np.array_equal(again[name], whole[name]), (height, name)
+
+
+def test_what_strips_take_is_given_back_before_light_is_denoised(
+    ball: tuple[TraceScene, PosedSurfels, EnvironmentLight], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, posed, light = ball
+    made: list[weakref.ref[pipeline.VisibleSurfaces]] = []
+    denoised, kept = pipeline.denoised, []
+
+    class Watched(pipeline.VisibleSurfaces):
+        def __init__(self, *given: object) -> None:
+            super().__init__(*given)  # type: ignore[arg-type]
+            made.append(weakref.ref(self))
+
+    monkeypatch.setattr(pipeline, "VisibleSurfaces", Watched)
+    monkeypatch.setattr(pipeline, "denoised", lambda *given: (kept.append(made[0]()), denoised(*given))[1])
+    pipeline.render(PreparedScene(scene, light, posed), frame(look_along_y(16), denoise="svgf"))
+    assert len(made) == 1 and kept == [None]
+
+
+def test_passes_of_cryptomatte_are_written_once(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
+    film = CryptoFilm("object", ball[0], frame(look_along_y(16)))
+    passes = film.passes()
+    assert all(np.shares_memory(pixels, passes[name]) for name, pixels in film.passes().items())
 
 
 @pytest.mark.alone

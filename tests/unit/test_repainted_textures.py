@@ -192,6 +192,21 @@ def test_a_file_that_is_colour_and_data_is_parted_where_one_is_painted() -> None
     assert files[made.slots[0, ALBEDO]][1].tobytes() == png(red).tobytes()
 
 
+def test_what_is_painted_on_colour_and_on_data_of_one_file_is_met_as_it_is() -> None:
+    """To the bit, each in its place, and nowhere encoded."""
+    asset = textured({"both": uniform((200, 128, 50))["albedo"]}, slots=(0, 0, -1, -1))
+    now = np.random.default_rng(1).integers(0, 256, (2, 64, 64, 3), np.uint8)
+    given = [Image("both", now[0], "srgb"), Image("both", now[1], "linear")]
+    state = ObjectState("thing", "both.drgs", images=given)
+    made, _ = RepaintedAssets().loaded(LoadedAsset(asset, (0, 0, 0)), state)
+    held = made.textured_of("both.drgs")
+    for slot, pixels in zip((ALBEDO, ROUGHNESS), now, strict=True):
+        found = held.image(int(held.textures.slots[0, slot]), slot).pixels
+        np.testing.assert_array_equal(found[..., :3], pixels)
+        assert (found[..., 3] == 255).all()
+    assert not held.faults and sum(len(data) for _, data in held.textures.files) < now.size / 10
+
+
 def test_albedo_with_its_alpha_is_one_image() -> None:
     """A file that is albedo and, by its alpha, opacity: what is painted on it is both."""
     rgba = np.full((4, 4, 4), (200, 100, 50, 255), np.uint8)

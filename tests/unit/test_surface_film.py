@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -170,6 +171,19 @@ def test_without_colour_is_cycles_division() -> None:
     light = np.array([[[0.4, 0.2, 0.0], [0.1, 0.2, 0.3], [0.0, 0.0, 0.0]]], np.float32)
     colour = np.array([[[0.8, 0.1, 0.0], [0.5, 0.5, 0.5], [0.0, 0.0, 0.0]]], np.float32)
     np.testing.assert_allclose(without_colour(light, colour), [[[0.5, 2, 1.25], [0.2, 0.4, 0.6], [0, 0, 0]]], rtol=1e-6)
+
+
+def test_division_by_colour_takes_hardly_more_memory_than_the_pass() -> None:
+    """And rows are divided apart: each as it is alone."""
+    rng = np.random.default_rng(3)
+    light, colour = rng.random((2, 640, 50, 3), np.float32)
+    light[100:300], colour[colour < 0.2] = 0, 0
+    tracemalloc.start()
+    made = without_colour(light, colour)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2 * made.nbytes
+    np.testing.assert_array_equal(made, [without_colour(a[None], b[None])[0] for a, b in zip(light, colour)])
 
 
 def test_mean_of_blurred_pictures_recombines(scene: Scene) -> None:

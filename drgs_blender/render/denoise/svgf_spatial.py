@@ -79,22 +79,44 @@ def denoise(
     -------
     (h, w, 4, 3) float32 array
     """
-    signal = prepare(components, variance, guides, split)
+    return modulate(_smooth_light(components, variance, guides, split, check), guides)
+
+
+def _smooth_light(
+    components: Array, variance: Array, guides: Guides, split: bool, check: Callable[[], None]
+) -> Signal:  # fmt: skip
+    """All of `denoise` but the last step, before which its arrays are gone."""
+    given = demodulate(components, variance, guides, split)
+    signal = _clamped(given)
     check()
-    return modulate(smooth(signal, check), guides)
+    return smooth(signal, check, given.light)
 
 
 def prepare(components: Array, variance: Array, guides: Guides, split: bool = True) -> Signal:
     """Light to be filtered: demodulated, its fireflies clamped; parameters as of `denoise`."""
-    signal = demodulate(components, variance, guides, split)
+    return _clamped(demodulate(components, variance, guides, split))
+
+
+def _clamped(signal: Signal) -> Signal:
+    """The same light without fireflies."""
     clamped = np.zeros_like(signal.light)
     over_range(_clamp_fireflies, len(clamped), signal.guide, signal.spans, signal.light, clamped, fewest=ROWS)
     return Signal(signal.guide, clamped, signal.spans)
 
 
-def smooth(signal: Signal, check: Callable[[], None] = lambda: None) -> Signal:
-    """All levels of the a-trous filter."""
-    light, out, other = signal.light, np.zeros_like(signal.light), np.zeros_like(signal.light)
+def smooth(signal: Signal, check: Callable[[], None] = lambda: None, spare: Array | None = None) -> Signal:
+    """All levels of the a-trous filter.
+
+    Parameters
+    ----------
+    signal : Signal
+    check : callable
+        As of `denoise`.
+    spare : array, optional
+        Light of another signal with the same guide. It and that of `signal` are then overwritten; else neither is.
+    """
+    light = signal.light
+    out, other = (np.zeros_like(light), np.zeros_like(light)) if spare is None else (spare, light)
     for level in range(LEVELS):
         check()
         over_range(_weigh, len(light), sigma_of(level), signal.guide, signal.spans, light, fewest=ROWS)

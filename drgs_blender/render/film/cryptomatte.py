@@ -32,7 +32,7 @@ class CryptoFilm:
         self._kind, self._scene, self._origin, self._width = kind, scene, (x0, y0), frame.camera.width
         objects = [item.name for item in frame.objects] + [mesh.name for mesh in frame.meshes]
         self._identities = identities(objects if kind == "object" else [*scene.mesh_materials.names, DRGS_MATERIAL])
-        self.pixels = np.zeros((y1 - y0, x1 - x0, 2 * PASSES_PER_KIND, 2), np.float32)
+        self._passes = [np.zeros((y1 - y0, x1 - x0, 4), np.float32) for _ in range(PASSES_PER_KIND)]
 
     def add(self, buffer: GBuffer) -> None:
         """Take the samples of a strip."""
@@ -43,14 +43,15 @@ class CryptoFilm:
             owner = scene.source[buffer.object_index]
         else:
             owner = scene.mesh_materials.of(buffer.face - scene.vertex_faces)
-        rows, out = buffer.point_rows(x0, self._width), self.pixels[y0 - top : y1 - top]
+        rows = buffer.point_rows(x0, self._width)
+        out = np.zeros((y1 - y0, self._passes[0].shape[1], 2 * PASSES_PER_KIND, 2), np.float32)
         over_range(_rank, y1 - y0, rows, self._identities[owner], out, fewest=ROWS)
+        for i, pixels in enumerate(self._passes):
+            pixels[y0 - top : y1 - top] = out[:, :, 2 * i : 2 * i + 2].reshape(*pixels[y0 - top : y1 - top].shape)
 
     def passes(self) -> dict[str, Array]:
         """Name -> (h, w, 4) float32."""
-        height, width = self.pixels.shape[:2]
-        both = self.pixels.reshape(height, width, PASSES_PER_KIND, 4)
-        return {f"{KINDS[self._kind]}{i:02}": np.ascontiguousarray(both[:, :, i]) for i in range(PASSES_PER_KIND)}
+        return {f"{KINDS[self._kind]}{i:02}": pixels for i, pixels in enumerate(self._passes)}
 
 
 @njit
