@@ -1,9 +1,9 @@
-"""A video as of a phone, for want of one: Cycles walks around a cow on a patterned table. For Blender's Python.
+"""A video as of a phone, for want of one: Cycles walks around a cow on a patterned floor. For Blender's Python.
 
     blender -b --python examples/phone_video.py -- walk.mp4
     .venv-blender/bin/python examples/phone_video.py walk.mp4
 
-Once around and up, 40 frames of 400 x 300 pixels, a minute or two on two cores. Nothing is known of the
+Once around and up, 36 frames of 320 x 240 pixels, a minute or two on two cores. Nothing is known of the
 cameras afterwards.
 """
 
@@ -18,11 +18,11 @@ import numpy as np
 from mathutils import Vector
 
 EXAMPLES = Path(__file__).resolve().parent
-FRAMES, SIZE, SAMPLES = 40, (400, 300), 12
-#: Metres: the cow, the table, how far the phone is away.
-HEIGHT, TABLE, DISTANCE = 0.2, 1.2, 0.62
-#: Degrees above the table, at the beginning and at the end.
-LOW, HIGH = 18.0, 52.0
+FRAMES, SIZE, SAMPLES = 36, (320, 240), 12
+#: Metres: the cow, the floor, how far the phone is away.
+HEIGHT, FLOOR, DISTANCE = 0.2, 3.0, 0.62
+#: Degrees above the floor, at the beginning and at the end.
+LOW, HIGH = 32.0, 58.0
 
 
 def add_material(name: str, image: bpy.types.Image, roughness: float) -> None:
@@ -40,21 +40,21 @@ def add_material(name: str, image: bpy.types.Image, roughness: float) -> None:
     mesh.materials.append(material)
 
 
-def add_table() -> None:
-    """A table whose picture is noise of many scales, which looks alike nowhere."""
-    random, side = np.random.default_rng(1), 768
+def add_floor() -> None:
+    """A floor whose picture is noise of many scales, which looks alike nowhere."""
+    random, side = np.random.default_rng(1), 960
     colour = np.full((side, side, 3), 0.4)
-    for cells in (12, 24, 48, 96, 192):
+    for cells in (30, 60, 120, 240, 480):
         colour += 0.5 * (random.random((cells, cells, 3)).repeat(side // cells, 0).repeat(side // cells, 1) - 0.5)
-    image = bpy.data.images.new("table", side, side)
+    image = bpy.data.images.new("floor", side, side)
     pixels = np.dstack([np.clip(colour, 0.02, 0.98), np.ones((side, side, 1))])
     image.pixels.foreach_set(pixels.astype(np.float32).ravel())
-    bpy.ops.mesh.primitive_plane_add(size=TABLE)
-    add_material("table", image, 0.6)
+    bpy.ops.mesh.primitive_plane_add(size=FLOOR)
+    add_material("floor", image, 0.6)
 
 
 def add_cow() -> None:
-    """Spot the cow, `HEIGHT` high, her feet on the table."""
+    """Spot the cow, `HEIGHT` high, her feet on the floor."""
     bpy.ops.wm.obj_import(filepath=str(EXAMPLES / "spot" / "spot_triangulated.obj"))
     cow = bpy.context.object
     bpy.ops.object.transform_apply()
@@ -95,7 +95,7 @@ def add_walk(scene: bpy.types.Scene) -> None:
 def main() -> None:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
-    add_table()
+    add_floor()
     add_cow()
     add_light(scene)
     add_walk(scene)
