@@ -102,7 +102,9 @@ def test_lights_differ_and_albedo_does_not(follow):
     for picture in pictures:
         assert 0.1 < (picture[..., 3] > 0.5).mean() < 0.9
     assert np.abs(pictures[0] - pictures[2]).mean() > 0.01
-    found = re.findall(r"albedo (\[[^]]+\]), (\d+)%", (desk / "printed.txt").read_text(encoding="utf-8"))
+    printed = (desk / "printed.txt").read_text(encoding="utf-8")
+    assert "kind: frame" in printed and "ViewLayer.Albedo: 320 x 240 x 3" in printed
+    found = re.findall(r"albedo (\[[^]]+\]), (\d+)%", printed)
     albedo = np.array([[float(number) for number in re.findall(r"[\d.]+", text)] for text, _ in found])
     assert albedo.shape == (3, 3) and np.ptp(albedo, axis=0).max() < 0.02
     assert all(0 < int(part) < 100 for _, part in found)
