@@ -33,6 +33,7 @@ NAVIGATION = {
         "docs/glossary.md",
         "CHANGELOG.md",
     ),
+    "Tutorials": tuple(f"docs/tutorials/{name}.md" for name in ("dance", "relight", "simulate", "farm", "scripting")),
     "Guides": (
         *("docs/rendering.md", "docs/simulation.md", "docs/deformation.md", "docs/decoupling.md", "docs/capture.md"),
         *("docs/reconstruct-settings.md", "docs/published-sets.md"),

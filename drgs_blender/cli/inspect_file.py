@@ -74,7 +74,7 @@ def inspect_file(path: Path, axes: str = "opengl", up: str | None = None) -> dic
         from ..core.asset.container import inspect_asset
 
         return {"kind": "asset", **inspect_asset(path)}
-    if magic == _EXR and (frame := inspect_frame(path)):
+    if magic == _EXR and (frame := inspect_frame(path) or inspect_layers(path)):
         return frame
     from ..ipc.frame_file import SUFFIX
 
@@ -158,6 +158,31 @@ def inspect_frame(path: Path) -> dict[str, Any] | None:
     height, width = pictures["Combined"].shape[:2]
     passes = {name: summary(picture) for name, picture in pictures.items()}
     return {"kind": "frame", "width": width, "height": height, "passes": passes, "metadata": dict(metadata)}
+
+
+def inspect_layers(path: Path) -> dict[str, Any] | None:
+    """Describe a multi-layer EXR of another program, such as Blender writes at F12; None of those of one layer."""
+    import OpenEXR
+
+    from ..render.film.frame_files import PREFIX
+
+    channels: dict[str, np.ndarray] = {}
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            if any(str(key).startswith(PREFIX) for part in file.parts for key in part.header):
+                return None  # a frame of DR-GS that is damaged
+            for part in file.parts:
+                channels |= {name: channel.pixels for name, channel in part.channels.items()}
+    except (OSError, RuntimeError, ValueError, TypeError):  # damaged: who reads it as an environment says how
+        return None
+    layers: dict[str, list[np.ndarray]] = {}
+    for name, pixels in channels.items():
+        layers.setdefault(name.rpartition(".")[0], []).append(pixels)
+    if len(layers) < 2:
+        return None
+    height, width = next(iter(channels.values())).shape[:2]
+    passes = {name or "Combined": summary(np.stack(planes, axis=-1)) for name, planes in layers.items()}
+    return {"kind": "frame", "width": width, "height": height, "passes": passes}
 
 
 def summary(array: np.ndarray) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import blender_reference
 import bpy
 import numpy as np
 import pytest
+from doc_blocks import blocks
 from physics_scenes import cache_of
 from scenes import PACKAGE, ROOT, part, read_exr, write_ball, write_exr
 from test_motion import READ
@@ -40,7 +41,7 @@ def examples(page: str) -> dict[str, str]:
     parts = re.split(r"^### (.+)\n", page, flags=re.MULTILINE)[1:]
     found = {}
     for title, text in zip(parts[::2], parts[1::2]):
-        (found[title],) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+        (found[title],) = (code for language, code in blocks(text) if language == "python")
     return found
 
 

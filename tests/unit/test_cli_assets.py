@@ -8,6 +8,7 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
@@ -175,6 +176,25 @@ def test_inspect_knows_every_kind(cube, tmp_path, capsys):
     assert described(tmp_path / "paint.png", capsys)["kind"] == "environment"
     assert main(["inspect", str(cube)]) == 0
     assert "faces: 12 x 3 int32" in capsys.readouterr().out
+
+
+def test_inspect_names_the_passes_of_another_program(tmp_path, capsys):
+    """Blender writes multi-layer files with a part for each pass, or one part for all."""
+    planes = {
+        f"ViewLayer.{name}": np.full((3, 5), k, np.float32) for k, name in enumerate(("Combined.R", "Combined.A"))
+    }
+    depth = {"ViewLayer.Depth.Z": np.full((3, 5), 7, np.float32)}
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    parts = [OpenEXR.Part(dict(header), dict(one), name) for name, one in (("Combined", planes), ("Depth", depth))]
+    OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
+    OpenEXR.File(dict(header), planes | depth).write(str(tmp_path / "one.exr"))
+    OpenEXR.File(dict(header), {c: np.ones((2, 4), np.float32) for c in "RGB"}).write(str(tmp_path / "light.exr"))
+    for name in ("parts.exr", "one.exr"):
+        frame = described(tmp_path / name, capsys)
+        assert (frame["kind"], frame["width"], frame["height"]) == ("frame", 5, 3)
+        assert frame["passes"]["ViewLayer.Depth"] == {"shape": [3, 5, 1], "dtype": "float32", "range": [7, 7]}
+        assert frame["passes"]["ViewLayer.Combined"]["shape"] == [3, 5, 2]
+    assert described(tmp_path / "light.exr", capsys)["kind"] == "environment"
 
 
 def test_inspect_shows_the_first_of_many_names_and_counts_them():

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from doc_blocks import blocks
 
 from drgs_blender.cli.main import build_parser, join_values
 from drgs_blender.core.passes import PASSES
@@ -20,9 +21,11 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 def typed() -> Iterator[tuple[str, str]]:
     """(page, command line) of every command of `drgs` in a block of code."""
     for page in PAGES:
-        for line in page.read_text(encoding="utf-8").replace("\\\n", " ").splitlines():
+        text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        shell = "".join(code for language, code in blocks(text) if language == "sh")
+        for line in [*text.splitlines(), *(" " * 4 + line for line in shell.splitlines() if line[:1] != " ")]:
             if found := re.match(r" {4,}(?:RUN |\.venv/bin/)?drgs (.*)", line):
-                yield page.name, found[1]
+                yield page.name, re.split(r" \|\|? ", found[1].replace("$matter", "jelly"))[0]
 
 
 COMMANDS = list(typed())
