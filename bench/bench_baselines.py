@@ -9,6 +9,7 @@ what is left out, is left out of learning and of rendering. Rows are kept; a row
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,14 @@ from other_methods import Baked, Prefiltered, split_sum
 from report import OUT, store_row, table, write_section
 
 from drgs_blender.cli.evaluate import session_renderer
-from drgs_blender.core.asset import Environment
+from drgs_blender.core.asset import Asset, Environment
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.frame import Camera, RenderSettings, Visibility, World
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.compare import Posed, Renderer, compare
 from drgs_blender.evaluate.truth import read_truth
+from drgs_blender.reconstruct.capture.capture import Capture
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling
 from drgs_blender.reconstruct.optim.schedule import Schedule
 from drgs_blender.reconstruct.pipeline import Settings, reconstruct
@@ -76,9 +78,10 @@ METHODS = {
 }
 
 
-def renderer(session: Session, key: str, method: Method, samples: int) -> Renderer:
+def renderer(session: Session, key: str, method: Method, samples: int, denoise: Any = "none") -> Renderer:
     """Renders as `method` does."""
-    lit = session_renderer(session, key, RenderSettings(samples, **method.rendering), method.visibility)
+    settings = RenderSettings(samples, denoise=denoise, **method.rendering)
+    lit = session_renderer(session, key, settings, method.visibility)
     asset = session.asset(key)
     baked = Baked(asset) if method.picture == "baked" else None
     lights: dict[bytes, Prefiltered] = {}
@@ -102,19 +105,24 @@ def renderer(session: Session, key: str, method: Method, samples: int) -> Render
     return draw
 
 
-def row(folder: Path, name: str, options: argparse.Namespace) -> list[str]:
-    """Cells of a method."""
-    method = METHODS[name]
-    learning, decoupling = options.steps
+def learned(capture: Capture, method: Method, steps: Sequence[int]) -> tuple[Asset, Path]:
+    """What a method learns in so many steps of surfels, and of materials and light; where it is kept."""
+    learning, decoupling = steps
     settings = Settings(schedule=Schedule(iterations=learning), materials=method.learning is not None)
     changes = {"iterations": decoupling, **(method.learning or {})}
     settings = replace(settings, decoupling=Decoupling(normals=True, **changes))
-    capture = read_capture(folder)
-    asset = reconstruct(capture, settings, folder=FOLDER / folder.name)
+    asset = reconstruct(capture, settings, folder=FOLDER / capture.name)
     if asset.environment is None:
         asset.environment = Environment(np.ones((8, 16, 3), np.float32))
-    path = FOLDER / f"{folder.name}.drgs"
+    path = FOLDER / f"{capture.name}.drgs"
     write_asset(path, asset)
+    return asset, path
+
+
+def row(folder: Path, name: str, options: argparse.Namespace) -> list[str]:
+    """Cells of a method."""
+    method, capture = METHODS[name], read_capture(folder)
+    asset, path = learned(capture, method, options.steps)
     session = Session()
     draw = renderer(session, session.load_asset(path), method, options.samples)
     report = compare(asset, capture, read_truth(folder), draw)

@@ -35,7 +35,7 @@ from drgs_blender.simulation.settings import parse_settings
 Array = np.ndarray
 
 FIGURE = ROOT / "docs" / "images" / "broken.png"
-HEALING = FIGURE.with_name("cracks.png")
+HEALING = FIGURE.with_name("cracks.webp")
 FOLDER = OUT / "broken"
 LAST, AZIMUTH = 24, -40
 #: Views from which rays are cast, and rays of each along a side of the picture.
@@ -256,7 +256,7 @@ def main() -> None:
         "bonds, faces of the mesh that were cut, and faces inside (of the most that there are at once). *These, kept*: "
         "the same by what caches keep, and what that costs: of a frame's bytes, and of the time that computes it. Cut "
         "faces are also others where a crack grows, whose line is smoothed."
-        f"\n\n{mended}\n\n![Frames in a row, judged each by itself, and as they are kept](images/cracks.png)"
+        f"\n\n{mended}\n\n![Frames in a row, judged each by itself, and as they are kept](images/cracks.webp)"
     )
     write_section("broken", "Broken and flowing matter", body)
 

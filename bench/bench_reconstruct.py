@@ -243,13 +243,8 @@ def ablations(options: argparse.Namespace, part: str = "ablations") -> None:
     write_section(f"reconstruct-{part}", title, body + table(head, cells))
 
 
-def variants(options: argparse.Namespace) -> None:
-    """Free surfels against surfels on the mesh, with and without what the paper lets them learn."""
-    capture = read_capture(options.capture, options.size, 8)
-    warm(capture)
-    schedule = Schedule(iterations=options.iterations or 1500, surfels=10000)
-    training, row = trained(capture, schedule, None)
-    rows = store_row(ROWS / "variants.json", "P: free surfels", row)
+def on_mesh(training: Training, capture: Capture, schedule: Schedule) -> Iterator[tuple[str, Gaussians, float]]:
+    """Of each variant of surfels on the mesh of `training`: name, what it learned, processor seconds."""
     mesh, _ = mesh_of(training.gaussians, capture, training.region)
     light = training.gaussians.light
     for name, fixed in (
@@ -262,10 +257,19 @@ def variants(options: argparse.Namespace) -> None:
         again = Training(capture, training.region, schedule.on_mesh(ON_MESH), attached)
         while not again.finished:
             again.step()
-        result = {"surfels": len(attached), "cpu": processor_seconds() - begun} | held_out_metrics(
-            again.gaussians, capture
-        )
-        rows = store_row(ROWS / "variants.json", name, result)
+        yield name, again.gaussians, processor_seconds() - begun
+
+
+def variants(options: argparse.Namespace) -> None:
+    """Free surfels against surfels on the mesh, with and without what the paper lets them learn."""
+    capture = read_capture(options.capture, options.size, 8)
+    warm(capture)
+    schedule = Schedule(iterations=options.iterations or 1500, surfels=10000)
+    training, row = trained(capture, schedule, None)
+    rows = store_row(ROWS / "variants.json", "P: free surfels", row)
+    for name, gaussians, seconds in on_mesh(training, capture, schedule):
+        row = {"surfels": len(gaussians), "cpu": seconds} | held_out_metrics(gaussians, capture)
+        rows = store_row(ROWS / "variants.json", name, row)
     cells = [(n, r["surfels"], *(formatted(r[k]) for k in ("psnr", "ssim", "cpu"))) for n, r in rows.items()]
     head = ("Variant", "Surfels", "PSNR dB", "SSIM", "processor s")
     body = f"{options.capture.name}, {schedule.iterations} steps, and {ON_MESH:g} of them again on the mesh.\n\n"

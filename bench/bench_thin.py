@@ -244,10 +244,12 @@ def main() -> None:
 
 
 def save(path: Path, pictures: list[Array]) -> None:
-    """Pictures side by side as PNG."""
+    """Pictures side by side as PNG, or WebP by the path's suffix."""
     from PIL import Image
 
-    Image.fromarray((255 * to_srgb(np.concatenate(pictures, axis=1)[..., :3]) + 0.5).astype(np.uint8)).save(path)
+    pixels = 255 * to_srgb(np.concatenate(pictures, axis=1)[..., :3]) + 0.5
+    how = {"quality": 92, "method": 6} if path.suffix == ".webp" else {"optimize": True}
+    Image.fromarray(pixels.astype(np.uint8)).save(path, **how)
 
 
 if __name__ == "__main__":

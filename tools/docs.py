@@ -26,6 +26,7 @@ BUILD = ROOT / "build" / "docs"
 NAVIGATION = {
     "Start": (
         "docs/user-guide.md",
+        "docs/gallery.md",
         "docs/expectations.md",
         "docs/scripting.md",
         "docs/command-line.md",
@@ -37,7 +38,7 @@ NAVIGATION = {
     "Guides": (
         *("docs/rendering.md", "docs/simulation.md", "docs/deformation.md", "docs/decoupling.md", "docs/capture.md"),
         *("docs/reconstruct-settings.md", "docs/published-sets.md"),
-        *("docs/gpu.md", "docs/benchmarks.md", "docs/paper.md"),
+        *("docs/gpu.md", "docs/benchmarks.md", "docs/paper.md", "docs/paper-figures.md"),
     ),
     "Formats and farm": (
         *("docs/formats.md", "docs/relightable-splats.md", "docs/asset-format.md"),

@@ -6,6 +6,7 @@ import argparse
 import re
 import shlex
 from collections.abc import Iterator
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -77,3 +78,45 @@ def test_the_table_of_the_readme_has_every_command_as_it_is_typed() -> None:
         words = shlex.split(re.sub(r"[\[\]]", "", row))
         assert parser.parse_args(join_values(words)).command == words[0], row
     assert {row.split()[0] for row in rows} == set(commands.choices)
+
+
+PICTURES = sorted((ROOT / "docs" / "images").iterdir())
+#: Pages that say below each picture which program makes it.
+GALLERIES = [ROOT / "docs" / f"{name}.md" for name in ("gallery", "paper-figures", "benchmarks")]
+
+
+def shown(page: Path) -> list[tuple[str, str]]:
+    """Each picture of a page, as it names it, and what is below it in its section."""
+    sections = re.split("^## ", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return [(m[1], text[m.end() :]) for text in sections for m in re.finditer(r"!\[[^]]*\]\(([^)]+)\)", text)]
+
+
+def test_pictures_are_shown_and_small() -> None:
+    named = {(page.parent / name).resolve() for page in PAGES for name, _ in shown(page)}
+    assert {path for path in named if not path.is_file()} == set()
+    assert set(PICTURES) - named == set()
+    assert [path.name for path in PICTURES if path.stat().st_size > 700_000] == []
+
+
+@pytest.mark.parametrize("page", GALLERIES, ids=lambda page: page.stem)
+def test_programs_below_pictures_exist(page: Path) -> None:
+    targets = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for name, below in shown(page):
+        made_by = re.search(r"`(?:make ([\w-]+)|python (\S+\.py)([^`]*))`", below)
+        assert made_by, f"{name}: no program"
+        target, program, options = made_by.groups()
+        if target:
+            assert re.search(rf"^{target}\b|[: ]{target}\b", targets, re.MULTILINE), name
+            continue
+        source = (ROOT / program).read_text(encoding="utf-8")
+        flags = re.findall(r"(?<!\S)--[a-z][\w-]*", options)
+        assert [flag for flag in flags if f'"{flag}"' not in source] == [], name
+        if part := re.fullmatch(r"images/gallery-(\w+)\.webp", name):
+            assert f"--part {part[1]}" in options and f'"{part[1]}":' in source
+
+
+def test_each_picture_has_a_page_that_names_its_program() -> None:
+    named = {Path(name).name for page in GALLERIES for name, _ in shown(page)}
+    patterns = re.findall(r"`docs/images/([^`]+)`", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"))
+    left = [path.name for path in PICTURES if path.name not in named]
+    assert [name for name in left if not any(fnmatch(name, pattern) for pattern in patterns)] == []

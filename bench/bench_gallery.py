@@ -1,0 +1,304 @@
+"""Pictures of the gallery: what figures of the paper show, of captured objects.
+
+python bench/bench_gallery.py --part composed lights poses thin [--size 256] [--samples 128]
+python bench/bench_gallery.py --part methods variants --scenes scenes [--steps 3000 1000]
+
+The first four show examples/captured. The other two learn from photographs, a quarter of an hour in all: scenes are
+those of `drgs evaluate --make-scenes scenes --objects spot --train 40 --test 8`. Writes docs/images/gallery-PART.webp.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bench_baselines import METHODS, learned, renderer
+from bench_matter_pictures import simulated
+from bench_reconstruct import on_mesh, trained
+from bench_thin import bent, fur, surfels_of
+from judge import environments, look_at, to_srgb
+from light_ablation import ALONE
+from ours import SESSION, pinhole
+from PIL import Image, ImageDraw, ImageFont
+from report import OUT, ROOT
+
+from drgs_blender.core.asset import Asset, Mesh
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.frame import Camera, Frame, Light, MeshState, ObjectState, RenderSettings, World
+from drgs_blender.core.materials import Material
+from drgs_blender.engine.session import Session
+from drgs_blender.evaluate.compare import compare
+from drgs_blender.evaluate.truth import read_truth
+from drgs_blender.formats.registry import read_environment
+from drgs_blender.reconstruct.capture.training_views import composed as photograph
+from drgs_blender.reconstruct.held_out import drawn
+from drgs_blender.reconstruct.optim.schedule import Schedule
+from drgs_blender.reconstruct.readers import read_capture
+
+Array = np.ndarray
+#: A title and what stands below it, (h, w, 3) sRGB in 0..1.
+Tile = tuple[str, Array]
+
+FOLDER = OUT / "gallery"
+IMAGES = ROOT / "docs" / "images"
+CAPTURED = ROOT / "examples" / "captured"
+#: Lights: a name for artists, the HDRI of Blender's, its strength.
+LIGHTS = {
+    "outdoors, bright": ("city", 0.55), "outdoors, dim": ("night", 0.45), "indoors, bright": ("studio", 0.7),
+    "indoors, dim": ("interior", 0.06), "sunset": ("sunset", 0.8),
+}  # fmt: skip
+#: Pascals of the jelly, and the frame that is shown of its fall.
+MODULUS, FALLEN = 4e4, 13
+#: Pixels between tiles, and height of a title.
+GAP, TITLE = 6, 20
+
+
+def sheet(part: str, rows: list[list[Tile]]) -> None:
+    """Write tiles of one size as the picture of a part."""
+    height, width, _ = rows[0][0][1].shape
+    across, down = width + GAP, height + TITLE + GAP
+    picture = Image.new("RGB", (across * len(rows[0]) - GAP, down * len(rows) - GAP), "white")
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
+    for y, row in enumerate(rows):
+        for x, (title, pixels) in enumerate(row):
+            tile = Image.fromarray((255 * np.clip(pixels, 0, 1) + 0.5).astype(np.uint8))
+            picture.paste(tile, (x * across, y * down + TITLE))
+            draw.text((x * across + 3, y * down + 2), title, fill="black", font=font)
+    picture.save(IMAGES / f"gallery-{part}.webp", quality=88, method=6)
+
+
+def encoded(linear: Array) -> Array:
+    """(h, w, 3) sRGB of a linear picture, over white."""
+    return to_srgb(linear[..., :3] + 1 - linear[..., 3:])
+
+
+def bend(vertices: Array, turn: float, lean: float) -> Array:
+    """Vertices twisted about the vertical by degrees from foot to top, and leant in parts of their height."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    middle, up = (low + high)[:2] / 2, (vertices[:, 2] - low[2]) / (high[2] - low[2])
+    angle = np.radians(turn) * up
+    x, y = (vertices[:, :2] - middle).T
+    moved = vertices.copy()
+    moved[:, 0] = middle[0] + np.cos(angle) * x - np.sin(angle) * y + lean * (high[2] - low[2]) * up**2
+    moved[:, 1] = middle[1] + np.sin(angle) * x + np.cos(angle) * y
+    return moved
+
+
+def standing(
+    name: str, height: float, x: float = 0.0, y: float = 0.0, turn: float = 0.0, bent: tuple[float, float] | None = None
+) -> ObjectState:
+    """A captured object on the ground, so tall at rest, turned about the vertical by degrees, `bent` as of `bend`."""
+    key = SESSION.load_asset(CAPTURED / f"{name}.drgs")
+    vertices = SESSION.asset(key).mesh.vertices
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    scale, a = height / float(high[2] - low[2]), np.radians(turn)
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+    matrix[:3, 3] = np.array([x, y, 0]) - matrix[:3, :3] @ np.append((low + high)[:2] / 2, low[2])
+    return ObjectState(name, key, matrix, None if bent is None else bend(vertices, *bent))
+
+
+def ground(roughness: float = 0.5, grey: float = 0.5) -> MeshState:
+    """So large that its edge is out of sight."""
+    corners = np.float32([[-40, -40, 0], [40, -40, 0], [40, 40, 0], [-40, 40, 0]])
+    faces, look = np.int32([[0, 1, 2], [0, 2, 3]]), [Material("ground", (grey,) * 3, roughness)]
+    return MeshState("ground", corners, faces, np.eye(4)[None], np.zeros(1, np.int32), materials=look)
+
+
+@dataclass(frozen=True)
+class View:
+    """Of what stands at the origin: metres across, its middle's height, degrees from above, height over width."""
+
+    width: float
+    middle: float = 0.5
+    above: float = 22.0
+    shape: float = 1.0
+
+    def camera(self, size: int) -> Camera:
+        a, e, fov = np.radians(-70), np.radians(self.above), np.radians(24)
+        away = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)]) * self.width / 2 / np.tan(fov / 2)
+        target = np.array([0.0, 0.0, self.middle])
+        matrix = look_at(target + away, target).tolist()
+        return pinhole({"matrix_world": matrix, "fov_x": 24.0, "width": size, "height": round(size * self.shape)})
+
+
+def shown(
+    objects: list[ObjectState],
+    light: tuple[str, float],
+    view: View,
+    options: argparse.Namespace,
+    *,
+    floor: MeshState | None = None,
+    lamps: tuple[Light, ...] = (),
+    passes: tuple[str, ...] = ("Combined",),
+    **settings: Any,
+) -> dict[str, Array]:
+    """Passes of objects under a light of `LIGHTS`, on a `floor` or on a transparent film."""
+    world = World(read_environment(environments() / f"{light[0]}.exr").radiance, strength=light[1])
+    given: dict[str, Any] = {"bounces": 3, "subpixel_samples": 16, "denoise": "svgf"} | settings
+    how = RenderSettings(options.samples, film_transparent=floor is None, **given)
+    meshes = [] if floor is None else [floor]
+    return SESSION.render(Frame(1, view.camera(options.size), objects, world, how, passes, meshes, list(lamps)))
+
+
+def poses(options: argparse.Namespace) -> list[list[Tile]]:
+    """Objects at rest and bent: normals, and under two lights."""
+    rows = []
+    for name, turn, how in (("spot", 150, (60, 0.2)), ("robot", 30, (50, -0.25))):
+        row: list[Tile] = []
+        for title, pose in (("at rest", None), ("bent", how)):
+            state = standing(name, 1.0, turn=turn, bent=pose)
+            view = View(1.35, above=12.0)
+            passes = ("Combined", "Normal", "Coverage")
+            made = shown([state], LIGHTS["outdoors, bright"], view, options, passes=passes)
+            share = np.clip(made["Coverage"], 0, 1)
+            row.append((f"normals, {title}", (made["Normal"] / 2 + 0.5) * share + 1 - share))
+            row.append((f"{title}, city", encoded(made["Combined"])))
+            if pose is not None:
+                made = shown([state], LIGHTS["sunset"], view, options)
+                row.append((f"{title}, sunset", encoded(made["Combined"])))
+        rows.append(row)
+    return rows
+
+
+def lights(options: argparse.Namespace) -> list[list[Tile]]:
+    """A mesh-driven, a particle-driven and a thin object in the bright and the dim, outdoors and indoors."""
+    fallen = standing("cat", 1.0, turn=-60)
+    mesh = SESSION.asset(fallen.asset).mesh
+    material = {"name": "jelly", "youngs_modulus": MODULUS, "density": 1000.0}
+    low = float(mesh.vertices[:, 2].min())
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    particles, vertices = simulated("gallery-cat", mesh, {"material": material}, FALLEN).driving(FALLEN)
+    fallen = replace(fallen, vertices=np.ascontiguousarray(vertices, np.float32), particles=particles)
+    fallen.matrix_world[2, 3] -= fallen.matrix_world[2, 2] * (float(vertices[:, 2].min()) - low)
+    subjects = [
+        ("mesh-driven", standing("robot", 1.0, turn=30, bent=(50, -0.25)), View(1.55)),
+        ("particle-driven", fallen, View(1.35, 0.4)),
+        ("thin", standing("fern", 0.5, turn=20, bent=(30, 0.5)), View(1.6, 0.2)),
+    ]
+    rows = []
+    for about, state, view in subjects:
+        row = []
+        for title in ("outdoors, bright", "outdoors, dim", "indoors, bright", "indoors, dim"):
+            made = shown([state], LIGHTS[title], view, options, floor=ground())
+            row.append((f"{about}: {title}", encoded(made["Combined"])))
+        rows.append(row)
+    return rows
+
+
+def lamp(x: float) -> Light:
+    """A square light beside the scene."""
+    place = np.array([x, -1.6, 2.4])
+    return Light("lamp", "area", look_at(place, np.array([0, 0, 0.3])), power=200.0, size_x=0.4)
+
+
+def composed(options: argparse.Namespace) -> list[list[Tile]]:
+    """Four captures on a polished floor: a lamp from two sides, and all that they do to each other left out."""
+    scene = [
+        standing("robot", 1.0, -0.15, 0.3, 20), standing("cat", 0.75, 0.75, 0.05, -100),
+        standing("spot", 0.55, 0.15, -0.55, 120), standing("fern", 0.35, -0.85, -0.25, 0),
+    ]  # fmt: skip
+    view, light = View(2.4, 0.35, above=19.0, shape=0.8), ("forest", 0.21)
+    floor = ground(0.12, 0.3)
+    alone = [replace(state, visibility=ALONE) for state in scene], replace(floor, visibility=ALONE)
+    row = []
+    for title, (states, plane), at, bounces in (
+        ("lamp on the left", (scene, floor), -2.2, 3), ("lamp on the right", (scene, floor), 2.2, 3),
+        ("without shadows and reflections", alone, 2.2, 0),
+    ):  # fmt: skip
+        made = shown(states, light, view, options, floor=plane, lamps=(lamp(at),), bounces=bounces)
+        row.append((title, encoded(made["Combined"])))
+    return [row]
+
+
+def thin(options: argparse.Namespace) -> list[list[Tile]]:
+    """A captured fern and a ball of fur that is given as surfels, relit and bent."""
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    mesh, path = fur(), FOLDER / "fur.drgs"
+    write_asset(path, Asset(surfels_of("fur", mesh), Mesh.empty()))
+    ball = ObjectState("fur", SESSION.load_asset(path))
+    bowed = replace(ball, proxy=bent(path, mesh)[1])
+    rest, moved = (standing("fern", 0.5, turn=20, bent=how) for how in (None, (50, 0.9)))
+    rows = []
+    for name, (still, changed), view, how in (
+        ("fern", (rest, moved), View(1.5, 0.2, above=30.0), {}),
+        ("fur", (ball, bowed), View(1.7), {"rays_see": "surfels"}),
+    ):
+        row = []
+        for title, state, light in (
+            ("outdoors", still, "outdoors, bright"), ("sunset", still, "sunset"), ("bent", changed, "sunset"),
+        ):  # fmt: skip
+            made = shown([state], LIGHTS[light], view, options, floor=ground(), **how)
+            row.append((f"{name}, {title}", encoded(made["Combined"])))
+        rows.append(row)
+    return rows
+
+
+#: Column -> the row of bench_baselines.py.
+SHOWN_METHODS = {
+    "DR-GS": "DR-GS",
+    "as IRGS": "no metallic, the paper's lobe (as IRGS)",
+    "as Ref-Gaussian": "no shadows, no inter-reflection (as split-sum shading: Ref-Gaussian)",
+    "as GSP, PhysGaussian": "colours of the day with harmonics, carried by particles (as GSP, PhysGaussian)",
+}
+#: Row -> the set of the truth; the view that is shown.
+SHOWN_SETS, VIEW = {"photographed light, bent": "posed", "relit": "relit-city", "relit, bent": "posed-city"}, 1
+
+
+def methods(options: argparse.Namespace) -> list[list[Tile]]:
+    """What other methods leave out, each learned from the same photographs, beside Cycles."""
+    folder = options.scenes / "spot"
+    truth, capture = read_truth(folder), read_capture(folder, 128)
+    assert truth is not None
+    wanted = [item for item in truth.sets if item.name in SHOWN_SETS.values()]
+    sets = [replace(item, views=item.views[VIEW : VIEW + 1], maps=item.maps[VIEW : VIEW + 1]) for item in wanted]
+    few, unseen = replace(truth, sets=sets), replace(capture, views=capture.training)
+    found: dict[str, dict[str, Array]] = {}
+    for title, name in SHOWN_METHODS.items():
+        asset, path = learned(capture, METHODS[name], options.steps)
+        session = Session()
+        draw = renderer(session, session.load_asset(path), METHODS[name], options.samples, "svgf")
+
+        def show(name: str, _: int, ours: Array, true: Array, title: str = title) -> None:
+            found.setdefault("Cycles", {})[name] = true
+            found.setdefault(title, {})[name] = ours
+
+        compare(asset, unseen, few, draw, show=show)
+    return [[(f"{title}: {row}", found[title][name]) for title in found] for row, name in SHOWN_SETS.items()]
+
+
+def variants(options: argparse.Namespace) -> list[list[Tile]]:
+    """Surfels that are free, and on the mesh with and without what Algorithm 1 lets them learn: a view left out."""
+    capture = read_capture(options.scenes / "spot", 200, 8)
+    view, schedule = capture.testing[VIEW], Schedule(iterations=1500, surfels=10000)
+    training, _ = trained(capture, schedule, None)
+    tiles = [("photograph", photograph(view, capture)), ("P: free", drawn(training.gaussians, view, capture))]
+    tiles += [(name, drawn(gaussians, view, capture)) for name, gaussians, _ in on_mesh(training, capture, schedule)]
+    return [tiles[:3], tiles[3:]]
+
+
+PARTS: dict[str, Callable[[argparse.Namespace], list[list[Tile]]]] = {
+    "composed": composed, "lights": lights, "poses": poses, "thin": thin, "methods": methods, "variants": variants,
+}  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--part", nargs="+", choices=PARTS, default=["composed", "lights", "poses", "thin"])
+    parser.add_argument("--scenes", type=Path, help="folder with spot, for methods and variants")
+    parser.add_argument("--steps", type=int, nargs=2, default=(3000, 1000), help="of surfels, of materials and light")
+    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--samples", type=int, default=128)
+    options = parser.parse_args()
+    for part in options.part:
+        if part in ("methods", "variants") and options.scenes is None:
+            parser.error(f"--part {part} needs --scenes")
+        sheet(part, PARTS[part](options))
+
+
+if __name__ == "__main__":
+    main()
