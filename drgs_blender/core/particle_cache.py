@@ -6,8 +6,7 @@
                                 matter that can break which bonds have broken until then (bits)
     CACHE/state.drgp            all that the next frame depends on, to go on after an interruption
 
-Positions are in the space that `cache.json` names: that of the object. The files are stored zips (asset.archive); numpy
-alone reads them.
+Positions are in the space of the object. The files are stored zips (asset.archive); numpy alone reads them.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ HEADER, _REST, _STATE = "cache.json", "rest.drgp", "state.drgp"
 _NAME = re.compile(r"frame_(-?\d+)\.drgp")
 _AGAIN = "Bake again"
 #: Of the bits of a half, the same number in single precision: a third of the time that a conversion takes.
-with np.errstate(invalid="ignore"):  # processors of Arm report the signalling NaNs among them
+with np.errstate(invalid="ignore"):  # of NaNs, on Arm
     _SINGLE = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)
 
 
