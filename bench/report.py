@@ -18,7 +18,8 @@ OUT = ROOT / "out" / "bench"
 
 HEADER = """# Benchmarks
 
-Every figure here was measured by a program in `bench/`, which wrote its own section. `make bench` runs them all.
+Every figure here was measured by a program in `bench/`, which wrote its own section. `make bench` runs them all. Some
+tables have a plot below them in the site that `make docs` builds, drawn from their numbers.
 """
 
 
