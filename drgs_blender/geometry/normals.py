@@ -73,7 +73,6 @@ class VertexNormals:
         self.start, corner = corner_table(self.faces, self.n_vertices)
         self.place = np.empty(len(corner), np.int32)
         self.place[corner] = np.arange(len(corner), dtype=np.int32)
-        self._weighted = np.empty((len(corner), 3), np.float32)
 
     def __call__(self, vertices: Array) -> Array:
         """Return the (n, 3) float32 unit normals of `vertices` (n, 3), in the frame of reference of `vertices`."""
@@ -95,9 +94,10 @@ class VertexNormals:
         normals : (n, 3) float32 array
             Written.
         """
+        weighted = np.empty((len(self.place), 3), np.float32)  # not kept: the largest array of all that a mesh needs
         corners = plain(vertices), plain(faces), self.place
-        empty = sum(over_range(_weigh, len(faces), *corners, self._weighted, fewest=ELEMENTS))
-        over_range(_sum, len(normals), self._weighted, self.start, normals, fewest=ELEMENTS)
+        empty = sum(over_range(_weigh, len(faces), *corners, weighted, fewest=ELEMENTS))
+        over_range(_sum, len(normals), weighted, self.start, normals, fewest=ELEMENTS)
         return empty
 
 

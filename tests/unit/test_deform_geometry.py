@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import trimesh
 
@@ -25,6 +27,18 @@ def test_angle_weights_match_trimesh_on_an_irregular_mesh():
         np.add.at(expected, mesh.faces[:, k], mesh.face_normals * mesh.face_angles[:, k, None])
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     np.testing.assert_allclose(VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices), expected, atol=2e-6)
+
+
+def test_what_is_kept_of_a_mesh_is_its_faces_and_their_order_about_vertices():
+    """What is computed on the way is more than that, and given back."""
+    mesh = trimesh.creation.icosphere(5)
+    VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)  # compiles
+    tracemalloc.start()
+    normals = VertexNormals(mesh.faces, len(mesh.vertices))
+    found = normals(mesh.vertices)
+    kept = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert kept < 1.1 * sum(array.nbytes for array in (normals.faces, normals.start, normals.place, found))
 
 
 def test_degenerate_faces_weigh_nothing_and_lonely_vertices_stay_finite():

@@ -47,7 +47,10 @@ def light_parts(light: Array, noisy: Array, transmitted: Array | None, colours: 
 
 def add_light(light: Array, environment: Array, emission: Array, opaque: Array | np.float32) -> Array:
     """(h, w, 4) float32 Combined of (h, w, 4, 3) light, what is behind it and what surfaces emit."""
+    colour = light[:, :, 0] + light[:, :, 1]
+    for part in (light[:, :, 2], light[:, :, 3], environment, emission):
+        colour += part
     out = np.empty((*light.shape[:2], 4), np.float32)
-    out[..., :3] = light[:, :, 0] + light[:, :, 1] + light[:, :, 2] + light[:, :, 3] + environment + emission
+    out[..., :3] = colour
     out[..., 3] = opaque
     return out
