@@ -13,19 +13,20 @@ import sys
 from pathlib import Path
 
 import bpy
-import demo_scene
-from blender_scenes import add_camera, environment
 from mathutils import Matrix, Vector
 
-#: Last frames of the turntable: in the captured light; while the camera turns; while another light turns.
-CAPTURED, ROUND, TURN = 16, 56, 80
-#: Shots on the stage: first and last frame, lens, and where the camera stands and looks at begin and end.
-SHOTS = {
-    "jelly": (1, 22, 66.0, ((-0.25, -3.6, 0.8), (-0.35, -3.3, 0.78)), ((-1.1, -0.2, 0.42), (-1.1, -0.2, 0.42))),
-    "bones": (23, 48, 60.0, ((-0.75, -4.4, 1.05), (0.35, -4.4, 1.05)), ((-0.05, 0.35, 0.78), (-0.05, 0.35, 0.78))),
-    "gold": (49, 72, 56.0, ((2.1, -3.1, 1.1), (1.5, -2.9, 1.05)), ((1.2, 0.2, 0.72), (1.2, 0.2, 0.74))),
-    "night": (73, 112, 64.0, ((0.5, -6.5, 1.45), (0.35, -6.0, 1.35)), ((-0.08, 0.2, 0.66), (-0.08, 0.2, 0.66))),
-}  # fmt: skip
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+import demo_scene
+from blender_scenes import add_camera, environment
+from demo_shots import CAPTURED, ROUND, SHOTS, TURN
+
+#: Of the shots on the stage: lens, and where the camera stands and looks at begin and end.
+CAMERAS = {
+    "jelly": (66.0, ((-0.25, -3.6, 0.8), (-0.35, -3.3, 0.78)), ((-1.1, -0.2, 0.42), (-1.1, -0.2, 0.42))),
+    "bones": (60.0, ((-0.75, -4.4, 1.05), (0.35, -4.4, 1.05)), ((-0.05, 0.35, 0.78), (-0.05, 0.35, 0.78))),
+    "gold": (56.0, ((2.1, -3.1, 1.1), (1.5, -2.9, 1.05)), ((1.2, 0.2, 0.72), (1.2, 0.2, 0.74))),
+    "night": (64.0, ((0.5, -6.5, 1.45), (0.35, -6.0, 1.35)), ((-0.08, 0.2, 0.66), (-0.08, 0.2, 0.66))),
+}
 FRAMES = SHOTS["night"][1]
 #: As `demo_scene.EVENING`; the lamp is all the light.
 NIGHT = (4.0, 62.0, 0.15, (1.0, 0.35, 0.14), 0.07, (0.35, 0.5, 1.0))
@@ -78,7 +79,7 @@ def stage(zip_path: Path, blend: Path) -> None:
     demo_scene.begin(zip_path, blend, FRAMES)
     scene = bpy.context.scene
     cat = demo_scene.add_all(FRAMES, BEAT)["cat"]
-    first, last = SHOTS["gold"][:2]
+    first, last = SHOTS["gold"]
     metal = cat.drgs.adjustment
     names = ("metallic_low", "roughness_high", "contrast", "brightness", "tint")
     for frame, values in (
@@ -88,10 +89,11 @@ def stage(zip_path: Path, blend: Path) -> None:
         for name, value in zip(names, values):
             setattr(metal, name, value)
             metal.keyframe_insert(name, frame=frame)
-    first, last = SHOTS["night"][:2]
+    first, last = SHOTS["night"]
     demo_scene.add_lamp(demo_scene.LAMP, first + 20)
     demo_scene.add_day(first + 2, last - 8, NIGHT)
-    for name, (start, end, lens, places, targets) in SHOTS.items():
+    for name, (lens, places, targets) in CAMERAS.items():
+        start, end = SHOTS[name]
         add_camera(Vector(targets[0]), Vector(places[0]), lens)
         camera = scene.camera
         camera.name = name
