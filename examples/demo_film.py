@@ -73,7 +73,7 @@ def steps(out: Path) -> list[Step]:
         render = [*drgs, "render", out / "stage.blend", "--frames", span, "--out", noisy]
         render += ["--denoise", "none", "--passes", "temporal"]
         denoise = [*drgs, "denoise", noisy, "--frames", span, "--sequence", span, "--out", clean]
-        denoise += ["--passes", "Combined", "--window", "3"]
+        denoise += ["--passes", "Combined"]
         count = last - first + 1
         found.append(Step(name, f"Rendering {name}", render, 2.5 * count, (found[-1].name,)))
         found.append(Step(f"{name}, denoised", f"Denoising {name}", denoise, 1.0 * count, (name,)))

@@ -40,18 +40,7 @@ def turntable(zip_path: Path, blend: Path) -> None:
     scene = bpy.context.scene
     scene.render.film_transparent = True
     bpy.ops.import_scene.drgs(filepath=str(demo_scene.CAPTURED / "robot.drgs"), use_environment=True)
-    view = json.loads((demo_scene.CAPTURED / "robot.json").read_text(encoding="utf-8"))
-    add_camera(Vector(), Vector((0, -1, 0)))
-    camera = scene.camera
-    camera.data.sensor_fit, camera.data.angle = "VERTICAL", math.radians(view["fov_x"])  # the photograph is square
-    start = Matrix(view["matrix_world"])
-    for frame in range(1, TURN + 1):
-        part = min((frame - 1) / (ROUND - 1), 1.0)
-        turn = Matrix.Rotation(2 * math.pi * part * part * (3 - 2 * part), 4, "Z")
-        camera.matrix_world = turn @ start
-        camera.rotation_mode = "QUATERNION"
-        camera.keyframe_insert("location", frame=frame)
-        camera.keyframe_insert("rotation_quaternion", frame=frame)
+    go_around("robot")
     other = environment("sunset.exr")
     nodes, links = scene.world.node_tree.nodes, scene.world.node_tree.links
     image, mapping = nodes.new("ShaderNodeTexEnvironment"), nodes.new("ShaderNodeMapping")
@@ -70,8 +59,37 @@ def turntable(zip_path: Path, blend: Path) -> None:
         part = max(frame - CAPTURED, 0) / (TURN - CAPTURED)
         rotation.default_value = (0, 0, math.radians(120 + 420 * part))
         rotation.keyframe_insert("default_value", index=2, frame=frame)
-    scene.drgs.samples, scene.drgs.subpixel_samples = 24, 8
+    scene.drgs.samples, scene.drgs.subpixel_samples = 16, 8
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
+
+
+def go_around(name: str) -> None:
+    """The camera of an object's photograph goes around it once."""
+    view = json.loads((demo_scene.CAPTURED / f"{name}.json").read_text(encoding="utf-8"))
+    add_camera(Vector(), Vector((0, -1, 0)))
+    camera = bpy.context.scene.camera
+    camera.data.sensor_fit, camera.data.angle = "VERTICAL", math.radians(view["fov_x"])  # the photograph is square
+    start = Matrix(view["matrix_world"])
+    for frame in range(1, TURN + 1):
+        part = min((frame - 1) / (ROUND - 1), 1.0)
+        turn = Matrix.Rotation(2 * math.pi * part * part * (3 - 2 * part), 4, "Z")
+        camera.matrix_world = turn @ start
+        camera.rotation_mode = "QUATERNION"
+        camera.keyframe_insert("location", frame=frame)
+        camera.keyframe_insert("rotation_quaternion", frame=frame)
+
+
+def turn_to_gold(subject: bpy.types.Object, first: int, last: int) -> None:
+    """Adjust a material ever more between two frames, until it is gold everywhere."""
+    changed = subject.drgs.adjustment
+    names = ("metallic_low", "roughness_high", "contrast", "brightness", "tint")
+    for frame, values in (
+        (first, (0.0, 1.0, 0.0, 0.0, (1.0, 1.0, 1.0))),
+        (last, (1.0, 0.2, -1.0, 0.5, (1.0, 0.78, 0.34))),  # albedo 1, tinted
+    ):
+        for name, value in zip(names, values):
+            setattr(changed, name, value)
+            changed.keyframe_insert(name, frame=frame)
 
 
 def stage(zip_path: Path, blend: Path) -> None:
@@ -80,18 +98,10 @@ def stage(zip_path: Path, blend: Path) -> None:
     scene = bpy.context.scene
     cat = demo_scene.add_all(FRAMES, BEAT)["cat"]
     first, last = SHOTS["gold"]
-    metal = cat.drgs.adjustment
-    names = ("metallic_low", "roughness_high", "contrast", "brightness", "tint")
-    for frame, values in (
-        (first + 5, (0.0, 1.0, 0.0, 0.0, (1.0, 1.0, 1.0))),
-        (last - 5, (1.0, 0.2, -1.0, 0.5, (1.0, 0.78, 0.34))),
-    ):
-        for name, value in zip(names, values):
-            setattr(metal, name, value)
-            metal.keyframe_insert(name, frame=frame)
+    turn_to_gold(cat, first + 3, last - 3)
     first, last = SHOTS["night"]
-    demo_scene.add_lamp(demo_scene.LAMP, first + 20)
-    demo_scene.add_day(first + 2, last - 8, NIGHT)
+    demo_scene.add_lamp(demo_scene.LAMP, first + 18)
+    demo_scene.add_day(first, last - 6, NIGHT)
     for name, (lens, places, targets) in CAMERAS.items():
         start, end = SHOTS[name]
         add_camera(Vector(targets[0]), Vector(places[0]), lens)
@@ -103,7 +113,7 @@ def stage(zip_path: Path, blend: Path) -> None:
             camera.keyframe_insert("location", frame=frame)
             camera.keyframe_insert("rotation_euler", frame=frame)
         scene.timeline_markers.new(name, frame=start).camera = camera
-    scene.drgs.samples, scene.drgs.subpixel_samples = 16, 8
+    scene.drgs.samples, scene.drgs.subpixel_samples = 8, 4
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
 
 

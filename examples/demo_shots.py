@@ -3,4 +3,4 @@
 #: Last frames of the turntable: in the captured light; while the camera turns; while another light turns.
 CAPTURED, ROUND, TURN = 16, 56, 80
 #: First and last frame of each shot on the stage.
-SHOTS = {"jelly": (1, 22), "bones": (23, 48), "gold": (49, 72), "night": (73, 112)}
+SHOTS = {"jelly": (1, 22), "bones": (23, 44), "gold": (51, 70), "night": (75, 110)}
