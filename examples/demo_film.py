@@ -152,8 +152,8 @@ def shown(passes: dict[str, np.ndarray], name: str) -> np.ndarray:
 
 def turntable(out: Path) -> Iterator[np.ndarray]:
     """The photograph becomes the robot; its materials are wiped over it; then the light turns."""
-    parts = [("captured", 1), ("Albedo", CAPTURED + 1), ("Roughness", CAPTURED + 13), ("Normal", CAPTURED + 25)]
-    parts.append(("relit", ROUND - 3))
+    parts = [("captured", 1), ("Albedo", CAPTURED + 1), ("Roughness", CAPTURED + 12), ("Normal", CAPTURED + 23)]
+    parts.append(("relit", ROUND - 2))
     *_, photograph = photographs()
     x = np.linspace(0, 1, SIZE[0])[None, :, None]
     for number in range(1, TURN + 1):
