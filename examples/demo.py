@@ -3,9 +3,9 @@
     python3.11 tools/dev.py demo [--out out/demo] [--frames 1-24]      # or make demo, which makes the environments too
     .venv/bin/python examples/demo.py [--out out/demo] [--frames 1-24]
 
-Writes the .blend with its simulation, an EXR per frame, a contact sheet (PNG) and an animated picture (WebP). Steps
-that do not wait for each other run side by side; of a demo before, the scene is taken where nothing changed that it is
-made of. Frames are always rendered again.
+Writes the .blend with its simulation, an EXR per frame, a contact sheet (PNG), an animated picture (WebP), and a strip
+(PNG) of what two photographs became. Steps that do not wait for each other run side by side; of a demo before, the
+scene is taken where nothing changed that it is made of. Frames are always rendered again.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ def steps(out: Path, frames: str) -> list[Step]:
     done, count = 0, _count(frames)
     building = [environments.python_of(environments.ENGINE), ROOT / "tools/extension.py", "--out", extension]
     pattern = out / "frames" / "####.exr"
+    strip = [engine, EXAMPLES / "demo_strip.py", "--out", out / "strip.png"]
     setting = [blender, "-P", EXAMPLES / "demo_scene.py", extension, scene]
     of_scene = (EXAMPLES / "captured", extension, EXAMPLES / "demo_scene.py", EXAMPLES / "blender_scenes.py")
     blenders = () if os.environ.get("DRGS_BLENDER") else (environments.FOR_BLENDER,)
@@ -63,6 +64,7 @@ def steps(out: Path, frames: str) -> list[Step]:
             before=partial(shutil.rmtree, out / "frames", ignore_errors=True),
             measured="rendering",
         ),
+        Step("strip", "Making the strip", strip, 6.0, ("kernels",)),
         Step("sheet", "Making the contact sheet", [engine, __file__, "--out", out, "--sheet"], 2.0, ("frames",)),
     ]
 
@@ -95,20 +97,16 @@ def run(out: Path, frames: str, before: Sequence[Step] = ()) -> None:
     if not before and not os.environ.get("DRGS_BLENDER"):
         first.append(Step(environments.FOR_BLENDER, "", [sys.executable, "-c", ""], 0.1))
     seconds = run_steps([*first, *steps(out, frames)], out / "log.txt", ROOT, settings)
-    print(f"Done in {seconds:.0f} s. Look at {out / 'contact-sheet.png'} and {out / 'animation.webp'}")
+    print(f"Done in {seconds:.0f} s. Look at contact-sheet.png, animation.webp and strip.png in {out}")
 
 
 def publish(frames: list[Path], out: Path, fps: int = 12) -> None:
     """The contact sheet and the animated picture."""
-    import numpy as np
+    from demo_pictures import combined, displayed, to_bytes
     from PIL import Image
 
-    from drgs_blender.core.color import linear_to_srgb
-    from drgs_blender.render.film.frame_files import read_frame
-
     def picture(path: Path) -> Image.Image:
-        linear = np.clip(read_frame(path)[0]["Combined"][..., :3], 0, 1)  # Rec.709 -> 8-bit sRGB
-        return Image.fromarray((linear_to_srgb(linear) * 255 + 0.5).astype(np.uint8))
+        return Image.fromarray(to_bytes(displayed(combined(path)[..., :3])))
 
     with ThreadPoolExecutor() as pool:
         pictures = list(pool.map(picture, frames))

@@ -38,14 +38,13 @@ FRAMES = 24
 SIZE = 640, 360
 #: One of Blender's own: soft light from above, which fills the sun's shadows.
 WORLD = "courtyard.exr"
-#: Degrees above the horizon, azimuth, W/m2 and colour of the sun, and strength and colour of the sky, at noon and at
-#: the end.
-NOON = (56.0, -52.0, 2.9, (1.0, 0.95, 0.88), 0.48, (1.0, 1.0, 1.0))
-EVENING = (11.0, 40.0, 2.2, (1.0, 0.4, 0.14), 0.11, (0.6, 0.75, 1.0))
+#: Degrees above the horizon, azimuth, W/m2 and colour of the sun, and strength and colour of the sky.
+NOON = (54.0, -52.0, 2.9, (1.0, 0.95, 0.88), 0.42, (1.0, 1.0, 1.0))
+EVENING = (11.0, 40.0, 1.5, (1.0, 0.42, 0.16), 0.13, (0.5, 0.68, 1.0))
 #: Frame at which the lamp goes on.
 DUSK = 15
-#: Where the cat stands.
-CAT = Vector((1.5, 0.3, 0.0))
+#: Where the cat and the lamp stand.
+CAT, LAMP = Vector((1.27, 0.2, 0.0)), Vector((0.72, -0.45, 0.0))
 #: Bones of the robot in the space of its asset: parent, head and tail; feet stay where they are.
 BONES: dict[str, tuple[str | None, tuple[float, float, float], tuple[float, float, float]]] = {
     "hips": (None, (0.0, 0.08, -0.36), (0.0, 0.08, -0.2)),
@@ -74,8 +73,10 @@ DANCE = {
 }  # fmt: skip
 
 
-def add_robot(height: float, at: Vector, turn: float) -> bpy.types.Object:
-    """The robot on a skeleton of its own, with automatic weights, dances two beats."""
+def add_robot(
+    height: float, at: Vector, turn: float, frames: int = FRAMES, beat: int = FRAMES // 2
+) -> bpy.types.Object:
+    """The robot on a skeleton of its own, with automatic weights, dances; a beat has so many frames."""
     robot = import_drgs(CAPTURED / "robot.drgs")
     stand(robot, height, at, turn)
     data = bpy.data.armatures.new("Skeleton")
@@ -101,23 +102,23 @@ def add_robot(height: float, at: Vector, turn: float) -> bpy.types.Object:
     for side in "LR":
         follow = rig.pose.bones[f"shin.{side}"].constraints.new("IK")
         follow.target, follow.subtarget, follow.chain_count = rig, f"foot.{side}", 2
-    for frame in range(1, FRAMES + 1):
-        beat = 2 * math.pi * (frame - 1) / (FRAMES / 2)
+    for frame in range(1, frames + 1):
+        phase = 2 * math.pi * (frame - 1) / beat
         for name, turns in DANCE.items():
             bone = rig.pose.bones[name]
-            angles = [math.radians(most * math.sin(beat - 2 * math.pi * lag)) for most, lag in turns]
+            angles = [math.radians(most * math.sin(phase - 2 * math.pi * lag)) for most, lag in turns]
             turned = Euler(angles).to_matrix()
             to_bone = bone.bone.matrix_local.to_3x3()
             bone.rotation_quaternion = (to_bone.inverted() @ turned @ to_bone).to_quaternion()
             bone.keyframe_insert("rotation_quaternion", frame=frame)
         hips = rig.pose.bones["hips"]
-        sway = Vector((0.05 * math.sin(beat), 0.0, -0.035 - 0.035 * math.cos(2 * beat)))
+        sway = Vector((0.05 * math.sin(phase), 0.0, -0.035 - 0.035 * math.cos(2 * phase)))
         hips.location = hips.bone.matrix_local.to_3x3().inverted() @ sway
         hips.keyframe_insert("location", frame=frame)
     return robot
 
 
-def add_cow(height: float, at: Vector, turn: float) -> bpy.types.Object:
+def add_cow(height: float, at: Vector, turn: float, frames: int = FRAMES) -> bpy.types.Object:
     """The cow is jelly, held at its hooves and pushed; particles carry it."""
     cow = import_drgs(CAPTURED / "spot.drgs")
     stand(cow, height, at, turn)
@@ -125,10 +126,10 @@ def add_cow(height: float, at: Vector, turn: float) -> bpy.types.Object:
     cow.vertex_groups.new(name="hooves").add([i for i, z in enumerate(heights) if z < 0.07], 1.0, "REPLACE")
     physics = cow.drgs.physics
     physics.use = True
-    physics.material, physics.youngs_modulus, physics.resolution = "jelly", 1.0e5, 28
-    physics.pin_group, physics.velocity, physics.damping = "hooves", (1.3, 0.0, 0.5), 0.5
+    physics.material, physics.youngs_modulus, physics.resolution = "jelly", 2.0e5, 28
+    physics.pin_group, physics.velocity, physics.damping = "hooves", (1.5, 0.0, 0.5), 0.4
     physics.use_floor, physics.floor = True, 0.0
-    physics.frame_start, physics.frame_end = 1, FRAMES
+    physics.frame_start, physics.frame_end = 1, frames
     select(cow)
     bpy.ops.drgs.bake_physics()
     return cow
@@ -148,8 +149,8 @@ def add_stage() -> None:
     plinth.location = CAT
 
 
-def add_lamp(at: Vector) -> None:
-    """A lamp of Blender's: a stem, and a ball of glass that begins to glow at dusk."""
+def add_lamp(at: Vector, dusk: int = DUSK) -> None:
+    """A lamp of Blender's: a stem, and a ball of glass that begins to glow at the frame `dusk`."""
     stem = [(0.16, 0.0), (0.16, 0.02), (0.02, 0.04), (0.015, 0.62), (0.05, 0.64), (0.0, 0.64)]
     add_mesh(
         "Stem", *turned(stem), add_material("Brass", (0.8, 0.55, 0.25), metallic=1.0, roughness=0.25)
@@ -158,7 +159,7 @@ def add_lamp(at: Vector) -> None:
     shader = glow.node_tree.nodes["Principled BSDF"]
     shader.inputs["Emission Color"].default_value = (1.0, 0.62, 0.3, 1)
     strength = shader.inputs["Emission Strength"]
-    for frame, value in ((DUSK - 3, 0.0), (DUSK + 2, 22.0)):
+    for frame, value in ((dusk - 3, 0.0), (dusk + 2, 14.0)):
         strength.default_value = value
         strength.keyframe_insert("default_value", frame=frame)
     angles = np.linspace(0, math.pi, 25)
@@ -166,8 +167,8 @@ def add_lamp(at: Vector) -> None:
     add_mesh("Bulb", *turned(ball), glow).location = at + Vector((0, 0, 0.75))
 
 
-def add_day() -> None:
-    """The sun and the sky from noon to evening."""
+def add_day(first: int = 1, last: int = FRAMES, evening: tuple = EVENING) -> None:
+    """The sun and the sky, from noon at the frame `first` to evening at `last`."""
     sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
     sun.data.angle = math.radians(2.5)
     bpy.context.collection.objects.link(sun)
@@ -179,10 +180,10 @@ def add_day() -> None:
     image.image = environment(WORLD)
     links.new(image.outputs["Color"], tint.inputs[6])
     links.new(tint.outputs[2], nodes["Background"].inputs["Color"])
-    for frame in range(1, FRAMES + 1):
-        part = (frame - 1) / (FRAMES - 1)
+    for frame in range(first, last + 1):
+        part = (frame - first) / (last - first)
         part = part * part * (3 - 2 * part)
-        height, azimuth, power, colour, sky, sky_colour = (mix(a, b, part) for a, b in zip(NOON, EVENING))
+        height, azimuth, power, colour, sky, sky_colour = (mix(a, b, part) for a, b in zip(NOON, evening))
         sun.rotation_euler = (math.radians(90 - height), 0, math.radians(azimuth))
         sun.data.energy, sun.data.color = power, colour
         tint.inputs[7].default_value = (*sky_colour, 1)
@@ -201,23 +202,36 @@ def mix(a: float | Sequence[float], b: float | Sequence[float], part: float) -> 
     return (1 - part) * a + part * b
 
 
-def main(zip_path: Path, blend: Path) -> None:
-    install(zip_path)
-    scene = bpy.context.scene
-    scene.frame_start, scene.frame_end = 1, FRAMES
-    scene.render.engine = "DRGS"
-    scene.render.resolution_x, scene.render.resolution_y = SIZE
-    bpy.ops.wm.save_as_mainfile(filepath=str(blend))  # caches lie beside it
+def add_all(frames: int = FRAMES, beat: int = FRAMES // 2) -> dict[str, bpy.types.Object]:
+    """Stage and objects; they move for so many frames."""
     add_stage()
-    add_robot(1.5, Vector((-0.05, 0.35, 0.0)), math.radians(8))
+    robot = add_robot(1.5, Vector((-0.05, 0.35, 0.0)), math.radians(8), frames, beat)
     cat = import_drgs(CAPTURED / "cat.drgs")
     stand(cat, 0.95, CAT + Vector((0, 0, 0.3)), math.radians(-25))
+    fern = import_drgs(CAPTURED / "fern.drgs")
+    stand(fern, 0.75, Vector((-1.5, 1.25, 0.0)), math.radians(20))
+    cow = add_cow(0.8, Vector((-1.2, -0.3, 0.0)), math.radians(-40), frames)
+    return {"robot": robot, "cat": cat, "fern": fern, "cow": cow}
+
+
+def begin(zip_path: Path, blend: Path, frames: int = FRAMES) -> None:
+    """An empty scene for the engine, in the file `blend`: caches lie beside it."""
+    install(zip_path)
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end = 1, frames
+    scene.render.engine = "DRGS"
+    scene.render.resolution_x, scene.render.resolution_y = SIZE
+    bpy.ops.wm.save_as_mainfile(filepath=str(blend))
+
+
+def main(zip_path: Path, blend: Path) -> None:
+    begin(zip_path, blend)
+    select(add_all()["cat"])
     bpy.ops.drgs.set_material(preset="GOLD")
-    stand(import_drgs(CAPTURED / "fern.drgs"), 0.75, Vector((-1.75, 1.35, 0.0)), math.radians(20))
-    add_cow(0.8, Vector((-1.4, -0.25, 0.0)), math.radians(-40))
-    add_lamp(Vector((1.02, 1.5, 0.0)))
+    add_lamp(LAMP)
     add_day()
-    add_camera(Vector((-0.05, 0.2, 0.68)), Vector((0.55, -6.5, 1.5)), 55.0)
+    add_camera(Vector((-0.08, 0.2, 0.66)), Vector((0.5, -6.5, 1.45)), 64.0)
+    scene = bpy.context.scene
     scene.drgs.samples, scene.drgs.subpixel_samples = 32, 4
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
 

@@ -25,6 +25,7 @@ BUILD = ROOT / "build" / "docs"
 #: Pages in the order of the navigation; README.md is the start page. Every page of docs/ must be here.
 NAVIGATION = {
     "Start": (
+        "docs/film/README.md",
         "docs/user-guide.md",
         "docs/gallery.md",
         "docs/expectations.md",

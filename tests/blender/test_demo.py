@@ -11,17 +11,32 @@ import numpy as np
 import pytest
 from mathutils import Vector
 
+from drgs_blender.cli.camera_file import read_camera
+from drgs_blender.core.asset.container import read_asset
+from drgs_blender.core.frame import Adjustment
+from drgs_blender.core.material_adjustments import adjusted
+
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+
+def script(name):
+    specification = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="module")
 def demo():
+    before = list(sys.path)
     sys.path.insert(0, str(EXAMPLES))
-    specification = importlib.util.spec_from_file_location("demo_scene", EXAMPLES / "demo_scene.py")
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    yield module
-    sys.path.remove(str(EXAMPLES))
+    yield script("demo_scene")
+    sys.path[:] = before
+
+
+@pytest.fixture(scope="module")
+def film(demo):
+    return script("demo_film_scene")
 
 
 def points(obj, frame):
@@ -66,3 +81,33 @@ def test_day_becomes_evening_and_the_lamp_goes_on(scene, demo, export):
     assert down[0] > 0.8 and 0.1 < down[1] < 0.3, "the sun sinks"
     glow = [max(max(m.emission) for mesh in f.meshes for m in mesh.materials) for f in (noon, evening)]
     assert glow[0] == 0 and glow[1] > 5
+
+
+def test_the_film_begins_at_the_camera_of_the_photograph(scene, film, export):
+    scene.render.resolution_x, scene.render.resolution_y = 640, 360
+    film.go_around("robot")
+    photograph = read_camera(EXAMPLES / "captured" / "robot.json")
+    cameras = {}
+    for frame in (1, film.ROUND // 2, film.ROUND):
+        scene.frame_set(frame)
+        cameras[frame] = export()[0].camera
+    for frame in (1, film.ROUND):
+        np.testing.assert_allclose(cameras[frame].matrix_world, photograph.matrix_world, atol=1e-5)
+    assert cameras[1].fy / 360 == pytest.approx(photograph.fy / 256, rel=1e-5), "as much of it, from top to bottom"
+    away = cameras[film.ROUND // 2].matrix_world[:3, 3] @ photograph.matrix_world[:3, 3]
+    assert away < 0, "half way round it is behind"
+
+
+def test_the_cat_of_the_film_becomes_the_gold_of_the_preset(scene, demo, film, export):
+    film.turn_to_gold(demo.import_drgs(EXAMPLES / "captured" / "cat.drgs"), 3, 9)
+    scene.frame_set(3)
+    (before,) = export()[0].objects
+    assert before.adjustment is None or before.adjustment == Adjustment()
+    scene.frame_set(9)
+    (after,) = export()[0].objects
+    mesh = read_asset(EXAMPLES / "captured" / "cat.drgs").mesh
+    materials = {name: getattr(mesh, name) for name in ("albedo", "roughness", "metallic")}
+    gold = adjusted(materials, after.adjustment)
+    np.testing.assert_allclose(gold["albedo"], np.broadcast_to((1.0, 0.78, 0.34), gold["albedo"].shape), atol=1e-5)
+    np.testing.assert_allclose(gold["metallic"], 1, atol=1e-6)
+    assert gold["roughness"].max() <= 0.2 + 1e-6

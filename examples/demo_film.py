@@ -1,0 +1,249 @@
+"""The film of docs/film: photographs, what was learned from them, and what can be done with that.
+
+    .venv/bin/python examples/demo_film.py [--out out/film] [--publish docs/film]
+
+Blender makes two scenes, `drgs render` and `drgs denoise` their frames, Pillow the titles, and PyAV film.webm. Frames
+that are there already are not rendered again, so that a film that was interrupted is gone on with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+ROOT = Path(__file__).resolve().parent.parent
+EXAMPLES, PICTURES = ROOT / "examples", ROOT / "docs" / "film"
+sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
+
+import environments  # noqa: E402
+from demo_pictures import combined, displayed, over, to_bytes, with_alpha  # noqa: E402
+from demo_shots import CAPTURED, ROUND, SHOTS, TURN  # noqa: E402
+from steps import Step, StepFailed, run_steps  # noqa: E402
+
+from drgs_blender.core.color import linear_to_srgb  # noqa: E402
+from drgs_blender.render.film.frame_files import read_frame  # noqa: E402
+
+FPS, SIZE = 12, (640, 360)
+#: Said of the parts.
+WORDS = {
+    "photographs": "forty photographs of a robot",
+    "captured": "surfels, materials and light, learned from them",
+    "Albedo": "albedo",
+    "Roughness": "roughness",
+    "Normal": "normals",
+    "relit": "another light",
+    "jelly": "a cow of jelly",
+    "bones": "a skeleton of Blender's",
+    "gold": "stone becomes gold",
+    "night": "noon, evening, a lamp",
+    "end": "DR-GS for Blender",
+}
+#: sRGB, as in the strip.
+GROUND, INK = (43, 45, 48), (235, 235, 232)
+#: The photograph from whose camera the turntable begins, among those of docs/film/photographs.webp, eight in a row.
+CHOSEN = 18
+_ALONG, _HOLD, _ZOOM, _DISSOLVE, _END = 16, 6, 14, 6, 30
+
+
+def steps(out: Path) -> list[Step]:
+    """What is rendered, one after another; seconds are those of two processors."""
+    engine = environments.python_of(environments.ENGINE)
+    drgs = [engine, "-m", "drgs_blender.cli.main"]
+    extension = out / "extension.zip"
+    scene = [environments.blender(), "-P", EXAMPLES / "demo_film_scene.py", extension, out]
+    scripts = ("demo_film_scene.py", "demo_shots.py", "demo_scene.py", "blender_scenes.py")
+    of_scene = (EXAMPLES / "captured", *(EXAMPLES / name for name in scripts), extension)
+    build = [engine, ROOT / "tools/extension.py", "--out", extension]
+    turntable = [
+        *(*drgs, "render", out / "turntable.blend", "--frames", f"1-{TURN}", "--out", out / "turntable" / "####.exr"),
+        *("--denoise", "svgf", "--passes", "Combined,Albedo,Roughness,Normal,Coverage"),
+    ]
+    found = [
+        Step("extension", "Building the extension", build, 0.5),
+        Step("scene", "Setting the scenes", scene, 40.0, ("extension",), out / "stage.blend", of_scene),
+        Step("turntable", "Rendering the turntable", turntable, 60.0, ("scene",)),
+    ]
+    for name, (first, last) in SHOTS.items():
+        span, noisy, clean = f"{first}-{last}", out / "noisy" / "####.exr", out / name / "####.exr"
+        render = [*drgs, "render", out / "stage.blend", "--frames", span, "--out", noisy]
+        render += ["--denoise", "none", "--passes", "temporal"]
+        denoise = [*drgs, "denoise", noisy, "--frames", span, "--sequence", span, "--out", clean]
+        denoise += ["--passes", "Combined"]
+        count = last - first + 1
+        found.append(Step(name, f"Rendering {name}", render, 2.5 * count, (found[-1].name,)))
+        found.append(Step(f"{name}, denoised", f"Denoising {name}", denoise, 1.0 * count, (name,)))
+    return found
+
+
+def mix(a: np.ndarray, b: np.ndarray, part: float | np.ndarray) -> np.ndarray:
+    """Between two pictures."""
+    return a + (b - a) * part
+
+
+def ease(part: float) -> float:
+    """From 0 to 1, slow at both ends."""
+    part = min(max(part, 0.0), 1.0)
+    return part * part * (3 - 2 * part)
+
+
+def ground() -> np.ndarray:
+    """(h, w, 3) behind the robot: lighter in the middle."""
+    x, y = (np.linspace(-1, 1, n) for n in SIZE)
+    light = 1.25 - 0.45 * np.hypot(x[None] * 0.9, y[:, None] * 0.9)
+    return np.asarray(GROUND) / 255 * light[..., None]
+
+
+def titled(picture: np.ndarray, words: str, part: float) -> np.ndarray:
+    """The picture with words at the lower left, as visible as `part` says."""
+    sheet = Image.new("L", SIZE)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(20)
+    draw.text((25, SIZE[1] - 25), words, 110, font, anchor="ls", stroke_width=3)  # a shadow, on light grounds
+    dark = np.asarray(sheet, np.float32)[..., None] / 255 * part
+    sheet.paste(0, (0, 0, *SIZE))
+    draw.text((25, SIZE[1] - 25), words, 255, font, anchor="ls")
+    bright = np.asarray(sheet, np.float32)[..., None] / 255 * part
+    return mix(mix(picture, np.zeros(3), dark), np.asarray(INK) / 255, bright)
+
+
+def photographs() -> Iterator[np.ndarray]:
+    """One photograph after another, then the chosen one alone, as large as the turntable shows it."""
+    sheet = Image.open(PICTURES / "photographs.webp").convert("RGB")
+    cell, rows = sheet.width // 8, 5
+    chosen = Image.open(EXAMPLES / "captured" / "robot.png").convert("RGBA")
+    side = SIZE[1] // rows
+    left = (SIZE[0] - 8 * side) // 2
+    behind = ground()
+    for i in range(_ALONG + _HOLD + _ZOOM):
+        count = min(40, 1 + round(40 * ease((i + 1) / _ALONG)))
+        part = ease((i - _ALONG - _HOLD + 1) / _ZOOM)
+        size = side + part * (SIZE[1] - side)
+        at = np.array([left + CHOSEN % 8 * side, CHOSEN // 8 * side], float)
+        at += part * (np.array([(SIZE[0] - SIZE[1]) / 2, 0.0]) - at)
+        picture = Image.fromarray(to_bytes(behind))
+        faint = Image.new("RGB", SIZE, GROUND)
+        for k in range(count):
+            x, y = at + (np.array([k % 8, k // 8]) - [CHOSEN % 8, CHOSEN // 8]) * size
+            box = (k % 8 * cell, k // 8 * cell, (k % 8 + 1) * cell, (k // 8 + 1) * cell)
+            if k != CHOSEN and -size < x < SIZE[0] and -size < y < SIZE[1]:
+                whole = sheet.crop(box).resize((round(size),) * 2, Image.Resampling.BICUBIC)
+                faint.paste(whole, (round(x), round(y)))
+        picture = Image.blend(faint, picture, part)
+        if count > CHOSEN:
+            one = chosen.resize((round(size),) * 2, Image.Resampling.BICUBIC)
+            picture.paste(one, (round(at[0]), round(at[1])), one)
+        yield titled(np.asarray(picture, np.float32) / 255, WORDS["photographs"], ease((i + 1) / 6) * (1 - part))
+
+
+def shown(passes: dict[str, np.ndarray], name: str) -> np.ndarray:
+    """(h, w, 3) of one part of the turntable: light, or a pass."""
+    if name in ("captured", "relit"):
+        curve = linear_to_srgb if name == "captured" else displayed  # as the photograph, as the stage
+        return over(np.clip(with_alpha(passes["Combined"], curve), 0, 1), ground())
+    values = linear_to_srgb(passes[name]) if name == "Albedo" else passes[name]
+    values = 0.5 + 0.5 * values if name == "Normal" else values
+    cover = np.clip(passes["Coverage"], 0, 1)
+    return over(np.concatenate([np.broadcast_to(values, (*cover.shape[:2], 3)), cover], -1), ground())
+
+
+def turntable(out: Path) -> Iterator[np.ndarray]:
+    """The photograph becomes the robot; its materials are wiped over it; then the light turns."""
+    parts = [("captured", 1), ("Albedo", CAPTURED + 1), ("Roughness", CAPTURED + 12), ("Normal", CAPTURED + 23)]
+    parts.append(("relit", ROUND - 2))
+    *_, photograph = photographs()
+    x = np.linspace(0, 1, SIZE[0])[None, :, None]
+    for number in range(1, TURN + 1):
+        passes = read_frame(out / "turntable" / f"{number:04d}.exr")[0]
+        index = max(i for i, (_, first) in enumerate(parts) if first <= number)
+        name, first = parts[index]
+        picture = shown(passes, name)
+        since = number - first
+        if index and since < 8:  # a soft edge runs from the left to the right
+            edge = np.clip(((since + 1) / 8 * 0.6 + 0.2 - x) / 0.02 + 0.5, 0, 1)
+            picture = mix(shown(passes, parts[index - 1][0]), picture, edge)
+        if not index and since < _DISSOLVE:
+            picture = mix(photograph, picture, ease((since + 1) / _DISSOLVE))
+        last = parts[index + 1][1] if index + 1 < len(parts) else TURN + 1
+        yield titled(picture, WORDS[name], min(ease((since + 1) / 4), ease((last - number) / 4)))
+
+
+def stage(out: Path) -> Iterator[np.ndarray]:
+    """The shots, cut."""
+    for name, (first, last) in SHOTS.items():
+        for number in range(first, last + 1):
+            picture = displayed(combined(out / name / f"{number:04d}.exr")[..., :3])
+            yield titled(picture, WORDS[name], min(ease((number - first + 1) / 4), ease((last + 1 - number) / 4)))
+
+
+def end(last: np.ndarray) -> Iterator[np.ndarray]:
+    """The name, over the last picture gone dark."""
+    sheet = Image.new("L", SIZE)
+    draw = ImageDraw.Draw(sheet)
+    draw.text((SIZE[0] / 2, SIZE[1] / 2), WORDS["end"], 255, ImageFont.load_default(40), anchor="mm")
+    words = np.asarray(sheet, np.float32)[..., None] / 255
+    for i in range(_END):
+        dark = last * (1 - ease(i / 10))
+        yield mix(dark, np.asarray(INK) / 255, words * ease((i - 3) / 10) * ease((_END - i) / 6))
+
+
+def film(out: Path) -> list[np.ndarray]:
+    """All pictures of the film, (h, w, 3) 8-bit sRGB."""
+    pictures = [*photographs(), *turntable(out), *stage(out)]
+    return [to_bytes(picture) for picture in (*pictures, *end(pictures[-1]))]
+
+
+def publish(pictures: Sequence[np.ndarray], folder: Path) -> None:
+    """Write film.webm (VP9) and the smaller film.webp, which pages show."""
+    import av
+
+    folder.mkdir(parents=True, exist_ok=True)
+    with av.open(folder / "film.webm", "w") as file:
+        stream = file.add_stream("libvpx-vp9", rate=FPS)
+        stream.width, stream.height = SIZE
+        stream.pix_fmt = "yuv420p"
+        stream.options = {"crf": "24", "b": "0", "row-mt": "1", "cpu-used": "2"}
+        for picture in pictures:
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        file.mux(stream.encode())
+    small = [Image.fromarray(p).resize((480, 270), Image.Resampling.LANCZOS) for p in pictures]
+    small[0].save(
+        folder / "film.webp",
+        save_all=True,
+        append_images=small[1:],
+        duration=round(1000 / FPS),
+        loop=0,
+        quality=62,
+        method=6,
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "film", help="scenes and frames")
+    parser.add_argument("--publish", type=Path, default=PICTURES, help="folder of the film; default docs/film")
+    parser.add_argument("--cut", action="store_true", help="only the film, of the frames that are there")
+    options = parser.parse_args(arguments)
+    out = options.out.resolve()
+    settings = {
+        "BLENDER_USER_RESOURCES": str(out / "blender"),
+        "DRGS_ENGINE": str(environments.python_of(environments.ENGINE)),
+        "DRGS_BLENDER": str(environments.blender()),
+        "PYTHONUNBUFFERED": "1",
+    }
+    try:
+        if not options.cut:
+            run_steps(steps(out), out / "log.txt", ROOT, settings)
+    except StepFailed as failure:
+        print(f"film: {failure}", file=sys.stderr)
+        return 1
+    publish(film(out), options.publish)
+    print(f"{options.publish / 'film.webm'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
