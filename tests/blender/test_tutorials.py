@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import bpy
@@ -63,6 +64,7 @@ def follow(tmp_path) -> Callable[..., Path]:
     return run
 
 
+@cache
 def labels() -> set[str]:
     """Texts in the code of the extension: what it calls panels, buttons, properties and their values among them."""
     paths = [*(ROOT / "addon").rglob("*.py"), *(ROOT / "operators").rglob("*.py")]
