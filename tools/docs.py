@@ -35,7 +35,10 @@ NAVIGATION = {
         "docs/glossary.md",
         "CHANGELOG.md",
     ),
-    "Tutorials": tuple(f"docs/tutorials/{name}.md" for name in ("dance", "relight", "simulate", "farm", "scripting")),
+    "Tutorials": (
+        *("docs/tutorials/dance.md", "docs/tutorials/relight.md", "docs/tutorials/simulate.md"),
+        *("docs/tutorials/farm.md", "docs/tutorials/scripting.md"),
+    ),
     "Guides": (
         *("docs/rendering.md", "docs/simulation.md", "docs/deformation.md", "docs/decoupling.md", "docs/capture.md"),
         *("docs/reconstruct-settings.md", "docs/published-sets.md"),
