@@ -122,8 +122,9 @@ def publish(frames: list[Path], out: Path, fps: int = 12) -> None:
         append_images=pictures[1:],
         duration=1000 // fps,
         loop=0,
-        quality=80,
+        quality=85,
         method=6,
+        kmax=1,  # whole frames: what is kept of the last one shows as blocks in a sky
     )
 
 

@@ -216,8 +216,9 @@ def publish(pictures: Sequence[np.ndarray], folder: Path) -> None:
         append_images=small[1:],
         duration=round(1000 / FPS),
         loop=0,
-        quality=62,
+        quality=72,
         method=6,
+        kmax=1,  # whole frames, as in the demo
     )
 
 
