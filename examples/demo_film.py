@@ -241,6 +241,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except StepFailed as failure:
         print(f"film: {failure}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        return 130
     publish(film(out), options.publish)
     print(f"{options.publish / 'film.webm'}")
     return 0
