@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from bench_matter_pictures import simulated
 from bench_reconstruct import on_mesh, trained
-from bench_thin import bent, fur, surfels_of
+from bench_thin import fur, surfels_of
 from judge import environments, look_at, to_srgb
 from light_ablation import ALONE
 from ours import SESSION, pinhole
@@ -217,22 +217,18 @@ def composed(options: argparse.Namespace) -> list[list[Tile]]:
 
 
 def thin(options: argparse.Namespace) -> list[list[Tile]]:
-    """A captured fern and a ball of fur that is given as surfels, relit and bent."""
+    """A captured fern and a ball of fur that is given as surfels, relit."""
     FOLDER.mkdir(parents=True, exist_ok=True)
     mesh, path = fur(), FOLDER / "fur.drgs"
     write_asset(path, Asset(surfels_of("fur", mesh), Mesh.empty()))
     ball = ObjectState("fur", SESSION.load_asset(path))
-    bowed = replace(ball, proxy=bent(path, mesh)[1])
-    rest, moved = (standing("fern", 0.5, turn=20, bent=how) for how in (None, (50, 0.9)))
     rows = []
-    for name, (still, changed), view, how in (
-        ("fern", (rest, moved), View(1.5, 0.2, above=30.0), {}),
-        ("fur", (ball, bowed), View(1.7), {"rays_see": "surfels"}),
+    for name, state, view, how in (
+        ("fern", standing("fern", 0.5, turn=20), View(1.5, 0.2, above=30.0), {}),
+        ("fur", ball, View(1.7), {"rays_see": "surfels"}),
     ):
         row = []
-        for title, state, light in (
-            ("outdoors", still, "outdoors, bright"), ("sunset", still, "sunset"), ("bent", changed, "sunset"),
-        ):  # fmt: skip
+        for title, light in (("outdoors", "outdoors, bright"), ("sunset", "sunset")):
             made = shown([state], LIGHTS[light], view, options, floor=ground(), **how)
             row.append((f"{name}, {title}", encoded(made["Combined"])))
         rows.append(row)
