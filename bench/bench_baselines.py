@@ -9,7 +9,6 @@ what is left out, is left out of learning and of rendering. Rows are kept; a row
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,13 @@ from other_methods import Baked, Prefiltered, split_sum
 from report import OUT, store_row, table, write_section
 
 from drgs_blender.cli.evaluate import session_renderer
-from drgs_blender.core.asset import Asset, Environment
+from drgs_blender.core.asset import Environment
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.frame import Camera, RenderSettings, Visibility, World
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.compare import Posed, Renderer, compare
 from drgs_blender.evaluate.truth import read_truth
-from drgs_blender.reconstruct.capture.capture import Capture
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling
 from drgs_blender.reconstruct.optim.schedule import Schedule
 from drgs_blender.reconstruct.pipeline import Settings, reconstruct
@@ -78,10 +76,9 @@ METHODS = {
 }
 
 
-def renderer(session: Session, key: str, method: Method, samples: int, denoise: Any = "none") -> Renderer:
+def renderer(session: Session, key: str, method: Method, samples: int) -> Renderer:
     """Renders as `method` does."""
-    settings = RenderSettings(samples, denoise=denoise, **method.rendering)
-    lit = session_renderer(session, key, settings, method.visibility)
+    lit = session_renderer(session, key, RenderSettings(samples, **method.rendering), method.visibility)
     asset = session.asset(key)
     baked = Baked(asset) if method.picture == "baked" else None
     lights: dict[bytes, Prefiltered] = {}
@@ -105,24 +102,19 @@ def renderer(session: Session, key: str, method: Method, samples: int, denoise: 
     return draw
 
 
-def learned(capture: Capture, method: Method, steps: Sequence[int]) -> tuple[Asset, Path]:
-    """What a method learns in so many steps of surfels, and of materials and light; where it is kept."""
-    learning, decoupling = steps
+def row(folder: Path, name: str, options: argparse.Namespace) -> list[str]:
+    """Cells of a method."""
+    method = METHODS[name]
+    learning, decoupling = options.steps
     settings = Settings(schedule=Schedule(iterations=learning), materials=method.learning is not None)
     changes = {"iterations": decoupling, **(method.learning or {})}
     settings = replace(settings, decoupling=Decoupling(normals=True, **changes))
-    asset = reconstruct(capture, settings, folder=FOLDER / capture.name)
+    capture = read_capture(folder)
+    asset = reconstruct(capture, settings, folder=FOLDER / folder.name)
     if asset.environment is None:
         asset.environment = Environment(np.ones((8, 16, 3), np.float32))
-    path = FOLDER / f"{capture.name}.drgs"
+    path = FOLDER / f"{folder.name}.drgs"
     write_asset(path, asset)
-    return asset, path
-
-
-def row(folder: Path, name: str, options: argparse.Namespace) -> list[str]:
-    """Cells of a method."""
-    method, capture = METHODS[name], read_capture(folder)
-    asset, path = learned(capture, method, options.steps)
     session = Session()
     draw = renderer(session, session.load_asset(path), method, options.samples)
     report = compare(asset, capture, read_truth(folder), draw)

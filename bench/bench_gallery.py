@@ -1,10 +1,10 @@
 """Pictures of the gallery: what figures of the paper show, of captured objects.
 
-python bench/bench_gallery.py --part composed lights poses thin [--size 256] [--samples 128]
-python bench/bench_gallery.py --part methods variants --scenes scenes [--steps 3000 1000]
+python bench/bench_gallery.py [--part composed lights poses reflections thin] [--size 256] [--samples 128]
+python bench/bench_gallery.py --part variants --scenes scenes
 
-The first four show examples/captured. The other two learn from photographs, a quarter of an hour in all: scenes are
-those of `drgs evaluate --make-scenes scenes --objects spot --train 40 --test 8`. Writes docs/images/gallery-PART.webp.
+All but variants show examples/captured. Variants are learned from photographs, in minutes: scenes are those of
+`drgs evaluate --make-scenes scenes --objects spot --train 40 --test 8`. Writes docs/images/gallery-PART.webp.
 """
 
 from __future__ import annotations
@@ -16,24 +16,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_baselines import METHODS, learned, renderer
 from bench_matter_pictures import simulated
 from bench_reconstruct import on_mesh, trained
-from bench_thin import bent, fur, surfels_of
+from bench_thin import fur, surfels_of
 from judge import environments, look_at, to_srgb
 from light_ablation import ALONE
 from ours import SESSION, pinhole
 from PIL import Image, ImageDraw, ImageFont
 from report import OUT, ROOT
+from scipy.spatial import cKDTree
 
 from drgs_blender.core.asset import Asset, Mesh
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.frame import Camera, Frame, Light, MeshState, ObjectState, RenderSettings, World
 from drgs_blender.core.materials import Material
-from drgs_blender.engine.session import Session
-from drgs_blender.evaluate.compare import compare
-from drgs_blender.evaluate.truth import read_truth
+from drgs_blender.formats.harmonics import basis
 from drgs_blender.formats.registry import read_environment
+from drgs_blender.geometry.normals import unit
 from drgs_blender.reconstruct.capture.training_views import composed as photograph
 from drgs_blender.reconstruct.held_out import drawn
 from drgs_blender.reconstruct.optim.schedule import Schedule
@@ -53,6 +52,8 @@ LIGHTS = {
 }  # fmt: skip
 #: Pascals of the jelly, and the frame that is shown of its fall.
 MODULUS, FALLEN = 4e4, 13
+#: From which colours are baked.
+DIRECTIONS = 32
 #: Pixels between tiles, and height of a title.
 GAP, TITLE = 6, 20
 
@@ -216,65 +217,84 @@ def composed(options: argparse.Namespace) -> list[list[Tile]]:
 
 
 def thin(options: argparse.Namespace) -> list[list[Tile]]:
-    """A captured fern and a ball of fur that is given as surfels, relit and bent."""
+    """A captured fern and a ball of fur that is given as surfels, relit."""
     FOLDER.mkdir(parents=True, exist_ok=True)
     mesh, path = fur(), FOLDER / "fur.drgs"
     write_asset(path, Asset(surfels_of("fur", mesh), Mesh.empty()))
     ball = ObjectState("fur", SESSION.load_asset(path))
-    bowed = replace(ball, proxy=bent(path, mesh)[1])
-    rest, moved = (standing("fern", 0.5, turn=20, bent=how) for how in (None, (50, 0.9)))
     rows = []
-    for name, (still, changed), view, how in (
-        ("fern", (rest, moved), View(1.5, 0.2, above=30.0), {}),
-        ("fur", (ball, bowed), View(1.7), {"rays_see": "surfels"}),
+    for name, state, view, how in (
+        ("fern", standing("fern", 0.5, turn=20), View(1.5, 0.2, above=30.0), {}),
+        ("fur", ball, View(1.7), {"rays_see": "surfels"}),
     ):
         row = []
-        for title, state, light in (
-            ("outdoors", still, "outdoors, bright"), ("sunset", still, "sunset"), ("bent", changed, "sunset"),
-        ):  # fmt: skip
+        for title, light in (("outdoors", "outdoors, bright"), ("sunset", "sunset")):
             made = shown([state], LIGHTS[light], view, options, floor=ground(), **how)
             row.append((f"{name}, {title}", encoded(made["Combined"])))
         rows.append(row)
     return rows
 
 
-#: Column -> the row of bench_baselines.py.
-SHOWN_METHODS = {
-    "DR-GS": "DR-GS",
-    "as IRGS": "no metallic, the paper's lobe (as IRGS)",
-    "as Ref-Gaussian": "no shadows, no inter-reflection (as split-sum shading: Ref-Gaussian)",
-    "as GSP, PhysGaussian": "colours of the day with harmonics, carried by particles (as GSP, PhysGaussian)",
-}
-#: Row -> the set of the truth; the view that is shown.
-SHOWN_SETS, VIEW = {"photographed light, bent": "posed", "relit": "relit-city", "relit, bent": "posed-city"}, 1
+def photographed(state: ObjectState, light: tuple[str, float], options: argparse.Namespace) -> Path:
+    """The asset of an object at rest with the colours that `DIRECTIONS` see on it, as of a capture without light."""
+    asset = SESSION.asset(state.asset)
+    scale = float(np.cbrt(np.linalg.det(state.matrix_world[:3, :3])))
+    centre = asset.surfels.centre @ state.matrix_world[:3, :3].T + state.matrix_world[:3, 3]
+    unknown = basis(np.zeros(3), 2).size
+    left = np.tile(np.diag([1e-4] + [0.05] * (unknown - 1)), (len(centre), 1, 1))
+    right, seen = np.zeros((len(centre), unknown, 3)), np.zeros(len(centre), bool)
+    world = World(read_environment(environments() / f"{light[0]}.exr").radiance, strength=light[1])
+    how = RenderSettings(options.samples, bounces=3, denoise="svgf", film_transparent=True)
+    for k in range(DIRECTIONS):
+        up, turn = 0.9 - 1.8 * (k + 0.5) / DIRECTIONS, np.pi * (1 + 5**0.5) * k
+        target = np.array([0, 0, 0.5])
+        eye = target + 3.2 * np.array([np.cos(turn) * (1 - up**2) ** 0.5, np.sin(turn) * (1 - up**2) ** 0.5, up])
+        view = {"matrix_world": look_at(eye, target).tolist(), "fov_x": 28.0, "width": 160, "height": 160}
+        camera = pinhole(view)
+        passes = SESSION.render(Frame(1, camera, [state], world, how, ("Combined", "Position")))
+        local = (centre - eye) @ camera.matrix_world[:3, :3]
+        x, y = camera.cx - camera.fx * local[:, 0] / local[:, 2], camera.cy + camera.fy * local[:, 1] / local[:, 2]
+        column, row = (np.clip(pixel.astype(int), 0, 159) for pixel in (x, y))
+        colour, place = passes["Combined"][row, column], passes["Position"][row, column]
+        met = (np.linalg.norm(place - centre, axis=1) < 0.03 * scale) & (colour[:, 3] > 0.98)
+        away = unit(centre[met] - eye) @ state.matrix_world[:3, :3] / scale  # as the object has them
+        values = basis(away, 2)
+        left[met] += values[:, :, None] * values[:, None]
+        right[met] += values[:, :, None] * (to_srgb(colour[met, None, :3]) - 0.5)
+        seen |= met
+    found = np.linalg.solve(left, right)
+    found = found[seen][cKDTree(centre[seen]).query(centre)[1]].astype(np.float32)
+    path = FOLDER / f"{state.name}-photographed.drgs"
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    write_asset(path, replace(asset, surfels=replace(asset.surfels, sh=found)))
+    return path
 
 
-def methods(options: argparse.Namespace) -> list[list[Tile]]:
-    """What other methods leave out, each learned from the same photographs, beside Cycles."""
-    folder = options.scenes / "spot"
-    truth, capture = read_truth(folder), read_capture(folder, 128)
-    assert truth is not None
-    wanted = [item for item in truth.sets if item.name in SHOWN_SETS.values()]
-    sets = [replace(item, views=item.views[VIEW : VIEW + 1], maps=item.maps[VIEW : VIEW + 1]) for item in wanted]
-    few, unseen = replace(truth, sets=sets), replace(capture, views=capture.training)
-    found: dict[str, dict[str, Array]] = {}
-    for title, name in SHOWN_METHODS.items():
-        asset, path = learned(capture, METHODS[name], options.steps)
-        session = Session()
-        draw = renderer(session, session.load_asset(path), METHODS[name], options.samples, "svgf")
-
-        def show(name: str, _: int, ours: Array, true: Array, title: str = title) -> None:
-            found.setdefault("Cycles", {})[name] = true
-            found.setdefault(title, {})[name] = ours
-
-        compare(asset, unseen, few, draw, show=show)
-    return [[(f"{title}: {row}", found[title][name]) for title in found] for row, name in SHOWN_SETS.items()]
+def reflections(options: argparse.Namespace) -> list[list[Tile]]:
+    """Polished metal that is bent and relit, without shadows and inter-reflection, and with colours that are baked."""
+    rest, moved = (standing("spot", 1.0, turn=150, bent=how) for how in (None, (60, 0.2)))
+    view = View(1.35, above=12.0)
+    painted = replace(
+        moved, asset=SESSION.load_asset(photographed(rest, LIGHTS["outdoors, bright"], options)), captured_colours=True
+    )
+    alone = replace(moved, visibility=ALONE)
+    rows = []
+    for title, light in (("city", "outdoors, bright"), ("sunset", "sunset")):
+        row = []
+        for about, state, bounces in (
+            ("at rest", rest, 3), ("bent", moved, 3), ("bent, no shadows, no bounces", alone, 0),
+            ("bent, colours of the day", painted, 3),
+        ):  # fmt: skip
+            made = shown([state], LIGHTS[light], view, options, bounces=bounces)
+            row.append((f"{title}: {about}", encoded(made["Combined"])))
+        rows.append(row)
+    return rows
 
 
 def variants(options: argparse.Namespace) -> list[list[Tile]]:
     """Surfels that are free, and on the mesh with and without what Algorithm 1 lets them learn: a view left out."""
     capture = read_capture(options.scenes / "spot", 200, 8)
-    view, schedule = capture.testing[VIEW], Schedule(iterations=1500, surfels=10000)
+    view, schedule = capture.testing[1], Schedule(iterations=1500, surfels=10000)
     training, _ = trained(capture, schedule, None)
     tiles = [("photograph", photograph(view, capture)), ("P: free", drawn(training.gaussians, view, capture))]
     tiles += [(name, drawn(gaussians, view, capture)) for name, gaussians, _ in on_mesh(training, capture, schedule)]
@@ -282,21 +302,21 @@ def variants(options: argparse.Namespace) -> list[list[Tile]]:
 
 
 PARTS: dict[str, Callable[[argparse.Namespace], list[list[Tile]]]] = {
-    "composed": composed, "lights": lights, "poses": poses, "thin": thin, "methods": methods, "variants": variants,
+    "composed": composed, "lights": lights, "poses": poses, "reflections": reflections, "thin": thin,
+    "variants": variants,
 }  # fmt: skip
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--part", nargs="+", choices=PARTS, default=["composed", "lights", "poses", "thin"])
-    parser.add_argument("--scenes", type=Path, help="folder with spot, for methods and variants")
-    parser.add_argument("--steps", type=int, nargs=2, default=(3000, 1000), help="of surfels, of materials and light")
+    parser.add_argument("--part", nargs="+", choices=PARTS, default=[part for part in PARTS if part != "variants"])
+    parser.add_argument("--scenes", type=Path, help="folder with spot, for variants")
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--samples", type=int, default=128)
     options = parser.parse_args()
     for part in options.part:
-        if part in ("methods", "variants") and options.scenes is None:
-            parser.error(f"--part {part} needs --scenes")
+        if part == "variants" and options.scenes is None:
+            parser.error("--part variants needs --scenes")
         sheet(part, PARTS[part](options))
 
 
