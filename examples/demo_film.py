@@ -47,7 +47,7 @@ WORDS = {
 GROUND, INK = (43, 45, 48), (235, 235, 232)
 #: The photograph from whose camera the turntable begins, among those of docs/film/photographs.webp, eight in a row.
 CHOSEN = 18
-_ALONG, _HOLD, _ZOOM, _DISSOLVE, _END = 16, 6, 14, 6, 30
+_ALONG, _HOLD, _ZOOM, _DISSOLVE, _END = 20, 12, 14, 6, 36
 
 
 def steps(out: Path) -> list[Step]:
