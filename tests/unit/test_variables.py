@@ -10,7 +10,14 @@ ROOT = Path(__file__).resolve().parents[2]
 #: Code of users, and of developers.
 PROGRAM, DEVELOPMENT = ("drgs_blender", "addon", "operators"), ("tests", "tools", "bench", "examples")
 #: Variables by which a test or a benchmark hands a job to the Blender that it starts.
-OF_JOBS = {"DRGS_WINDOW_JOB", "DRGS_WINDOW_ASSET", "DRGS_WINDOW_FILE", "DRGS_SOAK", "DRGS_VIEWPORT_JOB"}
+OF_JOBS = {
+    "DRGS_WINDOW_JOB",
+    "DRGS_WINDOW_ASSET",
+    "DRGS_WINDOW_FILE",
+    "DRGS_SOAK",
+    "DRGS_WINDOW_PICTURES",
+    "DRGS_VIEWPORT_JOB",
+}
 #: Read by other libraries for the program, or set by it for them.
 INDIRECT = {"OMP_WAIT_POLICY", "PATH", "TMPDIR", "TEMP", "TMP"}
 
