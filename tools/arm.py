@@ -31,7 +31,7 @@ import OpenEXR
 ROOT = Path(__file__).resolve().parent.parent
 #: Decibels below which pictures are not the same: sines and powers of the two C libraries differ in their last bits.
 ALIKE = 90.0
-RELIGHT = "import sys; from drgs_blender.cli.entry import main; sys.exit(main(sys.argv[1:]))"
+RELIGHT = "import sys; from drgs_blender.cli.entry import main; sys.exit(main())"
 
 
 def picture(python: str, arguments: Sequence[str], out: Path) -> np.ndarray:

@@ -10,11 +10,7 @@ import bpy
 import numpy as np
 import pytest
 from mathutils import Vector
-
-from drgs_blender.cli.camera_file import read_camera
-from drgs_blender.core.asset.container import read_asset
-from drgs_blender.core.frame import Adjustment
-from drgs_blender.core.material_adjustments import adjusted
+from scenes import part
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
@@ -86,7 +82,7 @@ def test_day_becomes_evening_and_the_lamp_goes_on(scene, demo, export):
 def test_the_film_begins_at_the_camera_of_the_photograph(scene, film, export):
     scene.render.resolution_x, scene.render.resolution_y = 640, 360
     film.go_around("robot")
-    photograph = read_camera(EXAMPLES / "captured" / "robot.json")
+    photograph = part("drgs_blender.cli.camera_file").read_camera(EXAMPLES / "captured" / "robot.json")
     cameras = {}
     for frame in (1, film.ROUND // 2, film.ROUND):
         scene.frame_set(frame)
@@ -102,12 +98,12 @@ def test_the_cat_of_the_film_becomes_the_gold_of_the_preset(scene, demo, film, e
     film.turn_to_gold(demo.import_drgs(EXAMPLES / "captured" / "cat.drgs"), 3, 9)
     scene.frame_set(3)
     (before,) = export()[0].objects
-    assert before.adjustment is None or before.adjustment == Adjustment()
+    assert before.adjustment is None or before.adjustment == part("drgs_blender.core.frame").Adjustment()
     scene.frame_set(9)
     (after,) = export()[0].objects
-    mesh = read_asset(EXAMPLES / "captured" / "cat.drgs").mesh
+    mesh = part("drgs_blender.core.asset.container").read_asset(EXAMPLES / "captured" / "cat.drgs").mesh
     materials = {name: getattr(mesh, name) for name in ("albedo", "roughness", "metallic")}
-    gold = adjusted(materials, after.adjustment)
+    gold = part("drgs_blender.core.material_adjustments").adjusted(materials, after.adjustment)
     np.testing.assert_allclose(gold["albedo"], np.broadcast_to((1.0, 0.78, 0.34), gold["albedo"].shape), atol=1e-5)
     np.testing.assert_allclose(gold["metallic"], 1, atol=1e-6)
     assert gold["roughness"].max() <= 0.2 + 1e-6
