@@ -38,7 +38,9 @@ def parts(svg: ElementTree.Element, tag: str) -> list[ElementTree.Element]:
 
 @pytest.mark.parametrize("section", PLOTS)
 def test_the_page_has_what_is_plotted(section: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for svg in drawn(PAGE, monkeypatch, section):
+    found = drawn(PAGE, monkeypatch, section)
+    assert found
+    for svg in found:
         width, height = (float(svg.get(side)) for side in ("width", "height"))
         assert svg.get("aria-label") and parts(svg, "circle") + parts(svg, "rect")
         for circle in parts(svg, "circle"):
