@@ -127,3 +127,19 @@ def test_passes_in_the_film_are_those_of_the_strip(demos):
     albedo = np.random.default_rng(1).uniform(size=(360, 640, 3)).astype(np.float32)
     shown = demos.film.shown({"Albedo": albedo, "Coverage": cover}, "Albedo")
     np.testing.assert_allclose(shown, linear_to_srgb(albedo), atol=1e-6)
+
+
+def test_the_film_that_is_shown_is_the_one_that_is_cut_now(demos):
+    folder = EXAMPLES.parent / "docs" / "film"
+    film, shots = demos.film, demos.shots
+    cut = sum(1 for _ in film.photographs()) + shots.TURN + film._END
+    cut += sum(last - first + 1 for first, last in shots.SHOTS.values())
+    assert 20 <= cut / film.FPS <= 30
+    seconds = 0.0
+    with Image.open(folder / "film.webp") as shown:
+        for i in range(shown.n_frames):
+            shown.seek(i)
+            shown.load()
+            seconds += shown.info["duration"] / 1000
+    assert seconds == pytest.approx(cut / film.FPS, rel=0.01)
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 4 << 20
