@@ -178,7 +178,7 @@ def test_reconstruction_is_added_to_an_engine_that_is_ready(made):
 def test_an_engine_without_reconstruction_renders_and_says_so(made, monkeypatch):
     """Packages that cannot be had leave a working engine, and their want is told before files are chosen."""
     folder, source = made
-    stamp = folder / environment._STAMP
+    stamp = folder / environment.SET_UP
     before = stamp.read_text()
     entries = json.loads(before)
     entries.pop("reconstruct", None)

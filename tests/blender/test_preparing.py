@@ -161,7 +161,7 @@ def test_the_set_up_counts_them_and_cancelled_there_the_engine_answers(tmp_path,
     theirs = subprocess.run(asked, check=True, capture_output=True, text=True).stdout
     (own,) = folder.glob("lib/python3*/site-packages")
     (own / "theirs.pth").write_text(theirs)
-    (folder / environment._STAMP).write_text(json.dumps({"packages": environment.requirements()}))
+    (folder / environment.SET_UP).write_text(json.dumps({"packages": environment.requirements()}))
     running = setup.EngineSetup(folder, Path("/no/python/is/needed"))
     wait(lambda: running.poll() or COUNTED.fullmatch(running.text), 240)
     assert not running.done, running.error
