@@ -11,7 +11,7 @@ PYTHON is a program that starts Linux' Python for aarch64 with the engine's pack
 where ROOT holds the unpacked packages of a Debian for arm64 (Python and libembree4 4.4), and SITE the wheels for
 aarch64. There is none of embreex: a folder ``embreex`` with an empty ``rtcore.py``, and in ``embreex.libs`` Debian's
 library as ``libembree4-debian.so.4``, take its place. Nothing is fetched. Kernels are compiled by the emulated
-processor: most of an hour, the first time. Exit code 1: the pictures differ.
+processor: half an hour, the first time. Exit code 1: the pictures differ.
 """
 
 from __future__ import annotations
