@@ -123,7 +123,7 @@ def publish(frames: list[Path], out: Path, fps: int = 12) -> None:
         duration=1000 // fps,
         loop=0,
         quality=85,
-        method=6,
+        method=4,
         kmax=1,  # whole frames: what is kept of the last one shows as blocks in a sky
     )
 

@@ -232,7 +232,7 @@ def main(zip_path: Path, blend: Path) -> None:
     add_day()
     add_camera(Vector((-0.08, 0.2, 0.66)), Vector((0.5, -6.5, 1.45)), 64.0)
     scene = bpy.context.scene
-    scene.drgs.samples, scene.drgs.subpixel_samples = 32, 4
+    scene.drgs.samples, scene.drgs.subpixel_samples = 24, 4
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
 
 
