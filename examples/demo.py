@@ -102,7 +102,7 @@ def run(out: Path, frames: str, before: Sequence[Step] = ()) -> None:
 
 def publish(frames: list[Path], out: Path, fps: int = 12) -> None:
     """The contact sheet and the animated picture."""
-    from demo_pictures import combined, displayed, to_bytes
+    from demo_pictures import combined, displayed, save_animation, to_bytes
     from PIL import Image
 
     def picture(path: Path) -> Image.Image:
@@ -116,16 +116,7 @@ def publish(frames: list[Path], out: Path, fps: int = 12) -> None:
     for i, one in enumerate(chosen):
         sheet.paste(one, (i % 4 * width, i // 4 * height))
     sheet.save(out / "contact-sheet.png")
-    pictures[0].save(
-        out / "animation.webp",
-        save_all=True,
-        append_images=pictures[1:],
-        duration=1000 // fps,
-        loop=0,
-        quality=85,
-        method=4,
-        kmax=1,  # whole frames: what is kept of the last one shows as blocks in a sky
-    )
+    save_animation(out / "animation.webp", pictures, fps, quality=85)
 
 
 def main(arguments: Sequence[str] | None = None, before: Sequence[Step] = ()) -> int:

@@ -21,7 +21,16 @@ EXAMPLES, PICTURES = ROOT / "examples", ROOT / "docs" / "film"
 sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 
 import environments  # noqa: E402
-from demo_pictures import combined, displayed, over, to_bytes, with_alpha  # noqa: E402
+from demo_pictures import (  # noqa: E402
+    GROUND,
+    combined,
+    covered,
+    displayed,
+    over,
+    save_animation,
+    to_bytes,
+    with_alpha,
+)
 from demo_shots import CAPTURED, ROUND, SHOTS, TURN  # noqa: E402
 from steps import Step, StepFailed, run_steps  # noqa: E402
 
@@ -43,8 +52,8 @@ WORDS = {
     "night": "noon, evening, a lamp",
     "end": "DR-GS for Blender",
 }
-#: sRGB, as in the strip.
-GROUND, INK = (43, 45, 48), (235, 235, 232)
+#: Of the words, sRGB.
+INK = (235, 235, 232)
 #: The photograph from whose camera the turntable begins, among those of docs/film/photographs.webp, eight in a row.
 CHOSEN = 18
 _ALONG, _HOLD, _ZOOM, _DISSOLVE, _END = 20, 12, 14, 6, 36
@@ -146,8 +155,7 @@ def shown(passes: dict[str, np.ndarray], name: str) -> np.ndarray:
         return over(np.clip(with_alpha(passes["Combined"], curve), 0, 1), ground())
     values = linear_to_srgb(passes[name]) if name == "Albedo" else passes[name]
     values = 0.5 + 0.5 * values if name == "Normal" else values
-    cover = np.clip(passes["Coverage"], 0, 1)
-    return over(np.concatenate([np.broadcast_to(values, (*cover.shape[:2], 3)), cover], -1), ground())
+    return over(covered(values, passes["Coverage"]), ground())
 
 
 def turntable(out: Path) -> Iterator[np.ndarray]:
@@ -210,16 +218,7 @@ def publish(pictures: Sequence[np.ndarray], folder: Path) -> None:
             file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         file.mux(stream.encode())
     small = [Image.fromarray(p).resize((480, 270), Image.Resampling.LANCZOS) for p in pictures]
-    small[0].save(
-        folder / "film.webp",
-        save_all=True,
-        append_images=small[1:],
-        duration=round(1000 / FPS),
-        loop=0,
-        quality=72,
-        method=6,
-        kmax=1,  # whole frames, as in the demo
-    )
+    save_animation(folder / "film.webp", small, FPS, quality=72)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from demo_pictures import over, to_bytes, with_alpha
+from demo_pictures import GROUND, covered, over, to_bytes, with_alpha
 
 from drgs_blender.cli.camera_file import read_camera
 from drgs_blender.core.color import linear_to_srgb
@@ -33,8 +33,8 @@ from drgs_blender.ipc.protocol import Passes
 CAPTURED = Path(__file__).resolve().parent / "captured"
 OBJECTS = ("robot", "spot")
 COLUMNS = ("photograph", "as captured", "albedo", "roughness", "normals", "relit", "bent")
-#: Behind all pictures, and of the words; sRGB.
-GROUND, INK = (43, 45, 48), (225, 225, 222)
+#: Of the words, sRGB.
+INK = (225, 225, 222)
 SETTINGS = RenderSettings(samples=64, subpixel_samples=8, denoise="svgf", film_transparent=True)
 PASSES = ("Combined", "Albedo", "Roughness", "Normal", "Coverage")
 #: By how much the top of an object leans when bent, degrees.
@@ -102,10 +102,9 @@ def columns(name: str, found: Views) -> list[np.ndarray]:
     """(h, w, 4) sRGB pictures with alpha, of the columns in their order, all from one camera."""
     photograph = np.asarray(Image.open(CAPTURED / f"{name}.png").convert("RGBA"), np.float32) / 255
     relit = found.relit
-    cover = np.clip(relit["Coverage"], 0, 1)
 
     def picture(colour: np.ndarray) -> np.ndarray:
-        return np.concatenate([np.broadcast_to(np.clip(colour, 0, 1), (*cover.shape[:2], 3)), cover], axis=-1)
+        return covered(np.clip(colour, 0, 1), relit["Coverage"])
 
     return [
         photograph,

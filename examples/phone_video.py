@@ -18,6 +18,9 @@ import numpy as np
 from mathutils import Vector
 
 EXAMPLES = Path(__file__).resolve().parent
+sys.path.insert(0, str(EXAMPLES))
+from blender_scenes import add_world, environment  # noqa: E402
+
 FRAMES, SIZE, SAMPLES = 36, (320, 240), 12
 #: Metres: the cow, the floor, how far the phone is away.
 HEIGHT, FLOOR, DISTANCE = 0.2, 3.0, 0.62
@@ -65,13 +68,11 @@ def add_cow() -> None:
     add_material("cow", bpy.data.images.load(str(EXAMPLES / "spot" / "spot_texture.png")), 0.4)
 
 
-def add_light(scene: bpy.types.Scene) -> None:
+def add_light() -> None:
     """One of Blender's own skies."""
-    (sky,) = Path(bpy.utils.system_resource("DATAFILES")).glob("studiolights/world/forest.exr")
-    world = scene.world = bpy.data.worlds.new("sky")
-    world.use_nodes = True
+    world = add_world()
     texture = world.node_tree.nodes.new("ShaderNodeTexEnvironment")
-    texture.image = bpy.data.images.load(str(sky))
+    texture.image = environment("forest.exr")
     background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
     world.node_tree.links.new(texture.outputs["Color"], background.inputs["Color"])
 
@@ -97,7 +98,7 @@ def main() -> None:
     scene = bpy.context.scene
     add_floor()
     add_cow()
-    add_light(scene)
+    add_light()
     add_walk(scene)
     scene.frame_start, scene.frame_end = 1, FRAMES
     render = scene.render

@@ -27,10 +27,9 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
+from wine import ALIKE
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Decibels below which pictures are not the same: sines and powers of the two C libraries differ in their last bits.
-ALIKE = 90.0
 RELIGHT = "import sys; from drgs_blender.cli.entry import main; sys.exit(main())"
 
 

@@ -91,16 +91,11 @@ def test_files_of_python_are_named_and_run(page):
             assert f"`{name}`" in text and re.search(rf"(?:blender .*--python|python) {name}", commands)
 
 
-def read(desk: Path, name: str, width: int, height: int) -> np.ndarray:
-    """(height, width, 4) of a picture that a tutorial made, as displayed."""
-    return read_exr(desk / name, width, height)
-
-
 @pytest.mark.slow
 @pytest.mark.programs
 def test_lights_differ_and_albedo_does_not(follow):
     desk = follow("scripting")
-    pictures = [read(desk, f"lights/{name}.png", 240, 320) for name in ("city", "forest", "sunset")]
+    pictures = [read_exr(desk / f"lights/{name}.png", 240, 320) for name in ("city", "forest", "sunset")]
     for picture in pictures:
         assert 0.1 < (picture[..., 3] > 0.5).mean() < 0.9
     assert np.abs(pictures[0] - pictures[2]).mean() > 0.01
@@ -129,11 +124,11 @@ def test_a_chunk_goes_on_and_jobs_are_written(follow):
 @pytest.mark.programs
 def test_matter_falls_and_bodies_push_each_other(follow):
     desk = follow("simulate")
-    jelly, sand, metal = (read(desk, f"{matter}.png", 240, 240) for matter in ("jelly", "sand", "metal"))
+    jelly, sand, metal = (read_exr(desk / f"{matter}.png", 240, 240) for matter in ("jelly", "sand", "metal"))
     assert min(np.abs(a - b).mean() for a, b in ((jelly, sand), (sand, metal), (metal, jelly))) > 0.005
     for name in ("cat", "spot"):
         assert len(list((desk / "drgs_cache" / "bodies" / name).glob("frame_*.drgp"))) == 12
-    first, last = (read(desk, f"bodies/{n:04}.exr", 240, 320) for n in (1, 12))
+    first, last = (read_exr(desk / f"bodies/{n:04}.exr", 240, 320) for n in (1, 12))
     assert np.abs(first - last).mean() > 0.005
     bpy.ops.wm.open_mainfile(filepath=str(desk / "bodies.blend"))
     cat, cow = bpy.data.objects["cat"], bpy.data.objects["spot"]
@@ -151,10 +146,10 @@ def test_matter_falls_and_bodies_push_each_other(follow):
 @pytest.mark.programs
 def test_a_statue_stands_in_a_picture_of_cycles(follow):
     desk = follow("relight")
-    alone = read(desk, "catcher.png", 320, 320)
+    alone = read_exr(desk / "catcher.png", 320, 320)
     shadow = (alone[..., :3].max(axis=2) < 0.02) & (alone[..., 3] > 0.3)
     assert 0.01 < shadow.mean() < 0.5 and (alone[:20, :, 3] == 0).all()
-    laid, thrown = (read(desk, f"plate_{shadows}.png", 320, 320) for shadows in ("catcher", "holdout"))
+    laid, thrown = (read_exr(desk / f"plate_{shadows}.png", 320, 320) for shadows in ("catcher", "holdout"))
     for picture in (laid, thrown):
         assert (picture[..., 3] > 0.99).all() and picture[..., :3].std() > 0.05
     changed = np.abs(laid - thrown)[..., :3].max(axis=2) > 0.1
@@ -172,7 +167,7 @@ def check_dance(desk: Path) -> None:
     moved, height = np.linalg.norm(shapes[1] - shapes[0], axis=1), shapes[0][:, 2]
     feet, size = height < height.min() + 0.1 * np.ptp(height), np.ptp(height)
     assert np.median(moved[feet]) < 0.05 * size < 0.15 * size < moved.max()
-    first, last = (read(desk, f"dance/{n:04}.exr", 240, 240) for n in (3, 9))
+    first, last = (read_exr(desk / f"dance/{n:04}.exr", 240, 240) for n in (3, 9))
     assert np.abs(first - last).mean() > 0.005
 
 
