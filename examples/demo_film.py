@@ -89,6 +89,14 @@ def steps(out: Path) -> list[Step]:
     return found
 
 
+def missing(out: Path) -> list[Path]:
+    """Frames of the film that are not there."""
+    frames = [out / "turntable" / f"{number:04d}.exr" for number in range(1, TURN + 1)]
+    for name, (first, last) in SHOTS.items():
+        frames += [out / name / f"{number:04d}.exr" for number in range(first, last + 1)]
+    return [path for path in frames if not path.is_file()]
+
+
 def mix(a: np.ndarray, b: np.ndarray, part: float | np.ndarray) -> np.ndarray:
     """Between two pictures."""
     return a + (b - a) * part
@@ -242,6 +250,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         return 130
+    if absent := missing(out):
+        print(
+            f"film: {len(absent)} frames are missing in {out}, the first is {absent[0].relative_to(out)}; "
+            "without --cut they are rendered",
+            file=sys.stderr,
+        )
+        return 1
     publish(film(out), options.publish)
     print(f"{options.publish / 'film.webm'}")
     return 0

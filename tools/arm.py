@@ -53,6 +53,11 @@ def main() -> int:
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--samples", type=int, default=16)
     options = parser.parse_args()
+    for path in (options.python, options.asset, options.env):
+        if not path.is_file():
+            parser.error(f"there is no file {path}")
+    if not os.access(options.python, os.X_OK):
+        parser.error(f"{options.python} is no program: make it executable")
     arguments = [str(options.asset.resolve()), "--env", str(options.env.resolve())]
     arguments += ["--size", str(options.size), "--samples", str(options.samples)]
     with tempfile.TemporaryDirectory() as folder:

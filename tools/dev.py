@@ -41,6 +41,8 @@ BLENDER_FLOOR = "4.2.23"
 BLENDER_OTHERS = {"4.5": "4.5.15", "5.2": "5.2.3", "5.3": "5.3.0"}
 #: The newest with long-term support: `make check` runs a part of its suite, that of the others when asked for.
 NEWEST_LTS = "5.2"
+#: GB of disk that the environments of a demo take.
+ROOM = 3.5
 #: Seconds that Blender may take to say what its operators and properties are.
 REFERENCE_SECONDS = 300
 #: Programs of npm that read our files in the tests and write others for us.
@@ -230,13 +232,21 @@ def ensure(
     for step in steps:
         command = [str(interpreter), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *step]
         if subprocess.run(command, cwd=ROOT).returncode:
-            raise Failure(f"pip install {' '.join(step)} failed in {folder.name}; its message is above")
+            raise Failure(
+                f"pip install {' '.join(step)} failed in {folder.name}; its message is above{full_disk(folder)}"
+            )
     trial = subprocess.run([interpreter, "-c", probe], capture_output=True, text=True, timeout=300, cwd=ROOT)
     if trial.returncode:
         raise Failure(import_trouble(folder, trial.stderr))
     stamp.write_text(text, encoding="utf-8")
     print(f"Preparing {folder.name} took {time.monotonic() - started:.0f} s", flush=True)
     return interpreter
+
+
+def full_disk(folder: Path) -> str:
+    """What a disk with hardly any room adds to a message: pip's own may be about a file that it could not read."""
+    free = shutil.disk_usage(folder).free / 1e9
+    return "" if free > ROOM else f". Only {free:.1f} GB of its disk are free: the environments take {ROOM} GB"
 
 
 def ensure_docs() -> Path:

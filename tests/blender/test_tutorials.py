@@ -64,12 +64,32 @@ def follow(tmp_path) -> Callable[..., Path]:
     return run
 
 
+def shown(node: ast.AST) -> list[ast.expr | None]:
+    """What a node of code shows to the user: labels of panels and operators, names of properties and their values."""
+    match node:
+        case ast.Call():
+            return [word.value for word in node.keywords if word.arg in ("name", "text", "label")]
+        case (
+            ast.Assign(targets=[ast.Name(id="bl_label" | "bl_category" | "text")])
+            | ast.AnnAssign(target=ast.Name(id="bl_label" | "bl_category"))
+        ):
+            return [node.value]
+        case ast.Tuple(elts=[_, label, _, *_]):  # a value of an enumeration
+            return [label]
+        case ast.Dict():  # the same, by the value's identifier
+            return [value.elts[0] for value in node.values if isinstance(value, ast.Tuple) and value.elts]
+    return []
+
+
 @cache
 def labels() -> set[str]:
-    """Texts in the code of the extension: what it calls panels, buttons, properties and their values among them."""
+    """Texts that the extension shows as names of panels, buttons, properties and their values."""
     paths = [*(ROOT / "addon").rglob("*.py"), *(ROOT / "operators").rglob("*.py")]
-    nodes = (node for path in paths for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
-    return {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in paths)
+    parts = (
+        part for tree in trees for node in ast.walk(tree) for found in shown(node) if found for part in ast.walk(found)
+    )
+    return {part.value for part in parts if isinstance(part, ast.Constant) and isinstance(part.value, str)}
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -8,6 +8,7 @@ import shutil
 import stat
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -55,6 +56,16 @@ def test_environment_that_fails_is_tried_again(dev, tmp_path, monkeypatch):
     for _ in range(2):
         with pytest.raises(dev.Failure, match="does not work"):
             dev.ensure(tmp_path / ".venv", {}, [["one"]], "import broken")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="uses a shell script as an interpreter")
+@pytest.mark.parametrize("free", [10**8, 10**11])
+def test_a_full_disk_is_named_where_pip_fails(dev, tmp_path, monkeypatch, free):
+    monkeypatch.setattr(dev.venv, "create", lambda folder, with_pip: fake_environment(dev, folder, [], "install"))
+    monkeypatch.setattr(dev.shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
+    with pytest.raises(dev.Failure, match=r"failed in \.venv") as told:
+        dev.ensure(tmp_path / ".venv", {}, [["one"]], "import x")
+    assert ("Only 0.1 GB" in str(told.value)) == (free < 10**9)
 
 
 def fake_environment(dev, folder: Path, calls: list, broken: str = "never") -> None:

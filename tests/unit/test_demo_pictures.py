@@ -122,6 +122,18 @@ def test_the_film_has_words_and_frames_for_every_part_and_begins_at_its_photogra
     assert np.argmin([np.abs(cell - alone).mean() for cell in cells]) == film.CHOSEN
 
 
+def test_frames_that_a_film_misses_are_told(demos, tmp_path, capsys):
+    arguments = ["--cut", "--out", str(tmp_path), "--publish", str(tmp_path / "film")]
+    first, last = list(demos.shots.SHOTS.values())[-1]
+    for path in demos.film.missing(tmp_path)[: -(last - first)]:
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    assert demos.film.main(arguments) == 1
+    told = capsys.readouterr().err
+    assert f"{last - first} frames are missing" in told and f"{first + 1:04d}.exr" in told
+    assert not (tmp_path / "film").exists()
+
+
 def test_passes_in_the_film_are_those_of_the_strip(demos):
     cover = np.ones((360, 640, 1), np.float32)
     albedo = np.random.default_rng(1).uniform(size=(360, 640, 3)).astype(np.float32)
