@@ -181,8 +181,9 @@ def render(
 def denoised(film: Film, frame: Frame, check: Check, backend: RenderBackend = CPU) -> Array | None:
     """(h, w, 4, 3) light of the film without noise, by the denoiser of the frame; None without one."""
     if frame.settings.denoise in QUALITIES:
-        denoiser = frame.settings.denoise
-        return denoise_oidn(film.pixels.components, film.guides(), split_light(frame), check, denoiser)
+        settings = frame.settings
+        light, guides = film.pixels.components, film.guides()
+        return denoise_oidn(light, guides, split_light(frame), check, settings.denoise, settings.threads)
     if frame.settings.denoise == "svgf":
         return backend.denoise(film.pixels.components, film.pixels.variance, film.guides(), split_light(frame), check)
     return None

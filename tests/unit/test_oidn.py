@@ -7,7 +7,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
-from typing import get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -182,11 +182,24 @@ def test_balanced_is_another_network_that_takes_noise_away() -> None:
 
 def test_the_settings_know_every_network_and_the_pipeline_asks_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(QUALITIES) < set(get_args(get_type_hints(RenderSettings)["denoise"]))
-    monkeypatch.setattr(pipeline, "denoise_oidn", lambda *given: given[-1])
+    monkeypatch.setattr(pipeline, "denoise_oidn", lambda *given: given[-2:])
     film = SimpleNamespace(pixels=SimpleNamespace(components=None), guides=lambda: None)
     for name in QUALITIES:
-        frame = SimpleNamespace(settings=RenderSettings(denoise=name), passes=())  # type: ignore[arg-type]
-        assert pipeline.denoised(film, frame, lambda: None) == name  # type: ignore[arg-type, comparison-overlap]
+        frame = SimpleNamespace(settings=RenderSettings(denoise=name, threads=3), passes=())  # type: ignore[arg-type]
+        assert pipeline.denoised(film, frame, lambda: None) == (name, 3)  # type: ignore[arg-type, comparison-overlap]
+
+
+@installed
+def test_it_has_the_threads_of_the_settings_and_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, light, guides = noisy()
+    whole, found, commit = denoise_oidn(light, guides, split=False), [], require().Device.commit
+
+    def committed(device: Any) -> None:
+        commit(device)
+        found.append(device.get_int("numThreads"))
+
+    monkeypatch.setattr(require().Device, "commit", committed)
+    assert (denoise_oidn(light, guides, split=False, threads=1) == whole).all() and found == [1]
 
 
 @installed

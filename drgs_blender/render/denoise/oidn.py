@@ -58,6 +58,7 @@ def denoise_oidn(
     split: bool = True,
     check: Callable[[], None] = lambda: None,
     denoiser: str = "oidn",
+    threads: int = 0,
 ) -> Array:
     """Filter the light of a picture on the CPU.
 
@@ -75,6 +76,8 @@ def denoise_oidn(
         Called between runs; may raise to stop.
     denoiser : str
         A key of `QUALITIES`.
+    threads : int
+        0 is all cores; the result is the same.
 
     Returns
     -------
@@ -109,6 +112,7 @@ def denoise_oidn(
     with ExitStack() as held:  # pyoidn's own `with` of a filter swallows exceptions
         device = pyoidn.Device()
         held.callback(device.release)
+        device.set_int("numThreads", threads)
         device.commit()
         _raise_errors(device)
         network = pyoidn.Filter(device)
