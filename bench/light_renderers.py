@@ -20,6 +20,7 @@ from light_cases import BOUNCES, FOLDER, REFERENCE_AA, Case, Plan, Reference, ch
 from noise import EPSILON, relative_mse, time_ratios
 from report import ROOT, table
 
+from drgs_blender.render.denoise.oidn import QUALITIES as OIDN
 from drgs_blender.render.denoise.oidn import available as oidn_available
 
 #: Part of the pixels left out of the trimmed relative error.
@@ -257,9 +258,9 @@ def against_mitsuba(options: argparse.Namespace) -> str:
 def denoised(options: argparse.Namespace) -> str:
     """Ours with SVGF and OIDN against Cycles with OIDN."""
     plan, samples, spp = Plan.of(options), tuple(options.samples), tuple(options.denoised_spp)
-    filters = ["svgf", *(["oidn"] if oidn_available() else [])]
+    filters = ["svgf", *(OIDN if oidn_available() else [])]
     about = f"{subjects_text(options)} Cycles + OIDN (albedo and normals, accurate prefilter), {_list(spp)} spp."
-    if "oidn" not in filters:
+    if len(filters) == 1:
         about += " Ours + OIDN: not measured, pyoidn is not installed."
     parts = [about]
     for name in filters:

@@ -19,7 +19,7 @@ from ..core.frame import Camera, Frame
 from ..core.passes import BY_NAME, pass_of
 from .backend import CPU, RenderBackend
 from .camera import camera_parameters
-from .denoise.oidn import denoise_oidn, require
+from .denoise.oidn import QUALITIES, denoise_oidn, require
 from .denoise.svgf_temporal import History, NoisyPicture
 from .film.cryptomatte import CryptoFilm
 from .film.film import Film
@@ -180,8 +180,10 @@ def render(
 
 def denoised(film: Film, frame: Frame, check: Check, backend: RenderBackend = CPU) -> Array | None:
     """(h, w, 4, 3) light of the film without noise, by the denoiser of the frame; None without one."""
-    if frame.settings.denoise == "oidn":
-        return denoise_oidn(film.pixels.components, film.guides(), split_light(frame), check)
+    if frame.settings.denoise in QUALITIES:
+        settings = frame.settings
+        light, guides = film.pixels.components, film.guides()
+        return denoise_oidn(light, guides, split_light(frame), check, settings.denoise, settings.threads)
     if frame.settings.denoise == "svgf":
         return backend.denoise(film.pixels.components, film.pixels.variance, film.guides(), split_light(frame), check)
     return None
@@ -353,7 +355,7 @@ def check_frame(frame: Frame) -> None:
         raise UsageError("Camera Sees", f"is {settings.camera_sees!r}", "Choose surfels or mesh")
     if settings.rays_see not in ("mesh", "surfels"):
         raise UsageError("Rays See", f"is {settings.rays_see!r}", "Choose mesh or surfels")
-    if settings.denoise not in ("none", "svgf", "oidn"):
-        raise UsageError("denoiser", f"is {settings.denoise!r}", "Choose none, svgf or oidn")
-    if settings.denoise == "oidn":
+    if settings.denoise not in ("none", "svgf", *QUALITIES):
+        raise UsageError("denoiser", f"is {settings.denoise!r}", "Choose none, svgf, oidn or oidn-balanced")
+    if settings.denoise in QUALITIES:
         require()  # before the work, not after it
