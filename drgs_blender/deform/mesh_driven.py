@@ -23,7 +23,8 @@ from ..core.asset.part import taken, taken_binding
 from ..core.errors import AssetError
 from ..geometry.normals import VertexNormals, rotation_matrices, unit
 from .face_frames import Faces
-from .pose import Posed, PosedMesh, Rest, pose, tangent_frame
+from .pose import Posed, PosedMesh, Rest, tangent_frame
+from .pose_blocks import pose
 from .wide_support import spans
 
 Array = np.ndarray
