@@ -17,6 +17,7 @@ from ..core.errors import AssetError, Cancelled, first_of
 from ..formats.exr import write_exr_picture
 from .brackets import Bracket, Brackets, reference, stops_of, white_of
 from .features import Tell
+from .left_out import Cause, Reason
 from .pictures import Picture, decode
 
 logger = logging.getLogger(__name__)
@@ -47,7 +48,7 @@ class Merged:
     """What became of brackets: pictures in the order of their files, files that are left out and why, lines to say."""
 
     pictures: list[Picture]
-    left_out: dict[str, str] = field(default_factory=dict)
+    left_out: dict[str, Cause] = field(default_factory=dict)
     lines: list[str] = field(default_factory=list)
 
 
@@ -121,7 +122,7 @@ def merge_brackets(pictures: Sequence[Picture], found: Brackets, folder: Path, s
             raise Cancelled
         tell("merging exposures", index / len(found.groups))
         outcomes.append(_outcome(group, folder / f"{group.middle.name}.exr", white_of(group, references)))
-    left_out = {name: f"cannot be read ({why})" for one in outcomes for name, why in one.unread.items()}
+    left_out = {name: Cause(Reason.UNREADABLE, why) for one in outcomes for name, why in one.unread.items()}
     made: dict[int, Picture] = {}
     alone = {id(picture) for picture in found.others}
     dark: list[str] = []
@@ -129,12 +130,12 @@ def merge_brackets(pictures: Sequence[Picture], found: Brackets, folder: Path, s
         names = [picture.path.name for picture in group.pictures if picture.path.name not in left_out]
         if outcome.views:
             unlike = [name for name in names if name not in outcome.used]
-            left_out |= {name: "its bracket shows no one view: the middle exposure is used alone" for name in unlike}
+            left_out |= dict.fromkeys(unlike, Cause(Reason.UNLIKE_BRACKET))
         if _is_darkened(group, outcome, white_of(group, references)):
             dark += outcome.used
         elif outcome.used:
             made[id(group.pictures[0])] = _picture(group, folder, white_of(group, references), outcome)
-    left_out |= {name: "is saturated below white, and shorter exposures are missing" for name in dark}
+    left_out |= dict.fromkeys(dark, Cause(Reason.SATURATED))
     result = [made.get(id(one), one) for one in pictures if id(one) in made or id(one) in alone]
     if not result:
         problem = f"has only pictures that cannot be read: {first_of(list(left_out))}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from ..core.arrays import Array
 from ..core.color import srgb_to_linear
 from ..core.errors import AssetError, first_of
 from ..reconstruct.capture.capture import Capture
+from .left_out import Cause, Reason, lines
 from .pictures import Picture, reduced
 
 logger = logging.getLogger(__name__)
@@ -118,32 +118,29 @@ def _tiles(grey: Array) -> Array:
     return np.ascontiguousarray(tiles.reshape(h, w, _TILE * _TILE), np.float32)
 
 
-def inspect(pictures: Sequence[Picture], looks: Sequence[Look], subject: str) -> tuple[list[Picture], dict[str, str]]:
+def inspect(pictures: Sequence[Picture], looks: Sequence[Look], subject: str) -> tuple[list[Picture], dict[str, Cause]]:
     """Pictures that are fit for use, and why the others are not; warnings name them.
 
     Returns
     -------
     fit : list of Picture
-    left_out : dict of str to str
-        File name -> reason.
+    left_out : dict of str to Cause
+        File name -> cause.
 
     Raises
     ------
     AssetError
         Fewer than `FEWEST` are fit.
     """
-    left_out: dict[str, str] = {}
+    left_out: dict[str, Cause] = {}
     if pictures:
         _same_or_bracketed(pictures, looks, left_out)
     rest = [(p, one) for p, one in zip(pictures, looks, strict=True) if p.path.name not in left_out]
     for i, part in find_blurred([one for _, one in rest]).items():
-        left_out[rest[i][0].path.name] = f"blurred (sharpness {part:.1%} of the others)"
+        left_out[rest[i][0].path.name] = Cause(Reason.BLURRED, f"sharpness {part:.1%} of the others")
     fit = [picture for picture in pictures if picture.path.name not in left_out]
-    reasons = defaultdict(list)
-    for name, reason in left_out.items():
-        reasons[re.split(r" of | \(", reason)[0]].append(name)
-    for reason, names in reasons.items():
-        logger.warning("%s: %d pictures are left out, %s: %s", subject, len(names), reason, first_of(names))
+    for line in lines(left_out):
+        logger.warning("%s: of %d pictures left out: %s", subject, len(pictures), line)
     check_count(fit, subject)
     _tell_cameras(fit, subject)
     _tell_exposures(fit, [one for p, one in rest if p.path.name not in left_out], subject)
@@ -181,7 +178,7 @@ def find_duplicates(looks: Sequence[Look]) -> dict[int, int]:
     return found
 
 
-def _same_or_bracketed(pictures: Sequence[Picture], looks: Sequence[Look], left_out: dict[str, str]) -> None:
+def _same_or_bracketed(pictures: Sequence[Picture], looks: Sequence[Look], left_out: dict[str, Cause]) -> None:
     """The same picture twice, of which the largest is kept; of exposure brackets all but the middle exposure."""
     groups: dict[int, list[int]] = defaultdict(list)
     for copy, first in find_duplicates(looks).items():
@@ -190,7 +187,7 @@ def _same_or_bracketed(pictures: Sequence[Picture], looks: Sequence[Look], left_
     for first, copies in groups.items():
         kept = max([first, *copies], key=lambda i: (pictures[i].size[0], -i))
         for j in {first, *copies} - {kept}:
-            left_out[pictures[j].path.name] = f"the same as another one of them ({pictures[kept].path.name})"
+            left_out[pictures[j].path.name] = Cause(Reason.DUPLICATE, pictures[kept].path.name)
         taken[[first, *copies]] = True
     stack = np.stack([one.signature.ravel() for one in looks])
     shape = stack - stack.mean(axis=1, keepdims=True)
@@ -208,7 +205,7 @@ def _same_or_bracketed(pictures: Sequence[Picture], looks: Sequence[Look], left_
             middle = bracket[len(bracket) // 2]
             for j in bracket:
                 if j != middle:
-                    left_out[pictures[j].path.name] = f"in the exposure bracket of {pictures[middle].path.name}"
+                    left_out[pictures[j].path.name] = Cause(Reason.BRACKET, f"of {pictures[middle].path.name}")
 
 
 def find_blurred(looks: Sequence[Look]) -> dict[int, float]:

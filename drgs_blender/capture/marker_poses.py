@@ -14,6 +14,7 @@ from ..reconstruct.readers.layout import OPENCV_TO_BLENDER, invert
 from ..reconstruct.readers.lens import Lens
 from . import libraries
 from .features import Photo
+from .left_out import Cause, Reason
 from .marker_sheet import MarkerSheet
 from .registration import Registration
 
@@ -64,8 +65,10 @@ def poses_from_markers(
         In the sheet's frame, without points: none are on the object.
     """
     groups: dict[tuple[object, ...], list[tuple[Photo, _Sight]]] = defaultdict(list)
+    seen: dict[str, int] = {}
     for photo in photos:
         markers = {k: c for k, c in found.get(photo.file, {}).items() if k in sheet.corners}
+        seen[photo.file] = len(markers)
         if len(markers) >= FEWEST_MARKERS:
             points = np.concatenate([sheet.corners[k] for k in markers])
             sight = _plane(_Sight(photo.file, points, np.concatenate(list(markers.values()))), max(photo.size))
@@ -78,10 +81,13 @@ def poses_from_markers(
         turned = lenses.get((*kind[1::-1], *kind[2:]))
         photo, sights = group[0][0], [sight for _, sight in group]
         if len(group) < _FOR_FOCAL and turned is None and photo.focal is None:
-            why = f"nothing says its focal length: {len(group)} of its size show the sheet, and EXIF does not have it"
-            result.unsound |= {sight.file: why for sight in sights}
+            why = f"{len(group)} of its size show the sheet, and EXIF does not have it"
+            result.unsound |= {sight.file: Cause(Reason.NO_FOCAL, why) for sight in sights}
         else:
             lenses[kind] = _calibrate(sights, photo, turned if len(group) < _FOR_FOCAL else None, errors, result)
+    for file in seen.keys() - result.matrices.keys():
+        reason = Reason.FEW_MARKERS if seen[file] < FEWEST_MARKERS else Reason.POOR_MARKERS
+        result.unregistered[file] = Cause(reason, f"{seen[file]} seen")
     return result
 
 

@@ -283,12 +283,16 @@ def _stored(picture: Picture) -> Array:
     return upright(pixels, picture.exif.orientation)
 
 
+class EmptyMask(AssetError):
+    """A mask or an alpha that has nothing of the object."""
+
+
 def mask_of_alpha(pixels: Array, subject: str) -> Array | None:
     """(h, w) float32 in 0..1: the alpha of `decode`; None without.
 
     Raises
     ------
-    AssetError
+    EmptyMask
         It is 0 everywhere.
     """
     if pixels.shape[2] < 4:
@@ -296,7 +300,7 @@ def mask_of_alpha(pixels: Array, subject: str) -> Array | None:
     alpha = np.clip(to_unit(pixels[..., 3]), 0, 1)
     if not alpha.max() > 0:
         remedy = "Take the alpha channel out, draw its mask, or give --masks none"
-        raise AssetError(subject, "has an alpha that is 0 everywhere: nothing of it is seen", remedy)
+        raise EmptyMask(subject, "has an alpha that is 0 everywhere: nothing of it is seen", remedy)
     return alpha
 
 

@@ -9,10 +9,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ..core.errors import AssetError, UsageError, first_of
+from ..core.errors import AssetError, UsageError
 from . import bracket_merge, brackets, capture_folder, features, gravity, libraries, marker_poses, pictures, video
 from .features import Photo, Tell
 from .inspection import check_count, inspect
+from .left_out import Cause, Reason, as_report, cause_of, lines, tell_left_out
 from .marker_sheet import MarkerSheet, recognise
 from .masks import stage as mask_stage
 from .masks.still_background import StillBackground, find_still_background, small_copies, write_turned
@@ -74,7 +75,7 @@ class Made:
     folder: Path
     pictures: int
     of: int
-    left_out: dict[str, str]
+    left_out: dict[str, Cause]
     method: str
     error: float
     alignment: Alignment | None = None
@@ -137,7 +138,7 @@ def _make(source: Path, folder: Path, work: Path, film: Path | None, given: list
     capture_folder.keep_work(work, work_key(given, settings))
     if film is not None:
         given = _frames(film, work, settings.frames, _part(tell, 0.0, 0.1), cancelled)
-    unread, bracket_lines = {}, []
+    unread, bracket_lines = dict[str, Cause](), list[str]()
     if bracketed is not None:
         merged = bracket_merge.merge_brackets(
             given, bracketed, work / "brackets", str(source), _part(tell, 0.0, 0.1), cancelled
@@ -162,7 +163,7 @@ def _make(source: Path, folder: Path, work: Path, film: Path | None, given: list
     alignment.apply(found)
     for photo in photos:
         if photo.file not in found.matrices:
-            left_out[by_file[photo.file].path.name] = found.unsound.get(photo.file, "not registered")
+            left_out[by_file[photo.file].path.name] = cause_of(found, photo.file)
     made = Made(folder, len(found.matrices), len(given), left_out, found.method, 0.0, alignment)
     made.error = sum(found.errors.values()) / len(found.errors)
     mode, of_masks = mask_stage.mode_on_ground(settings.masks, ready.masks, alignment.ground_from)
@@ -176,13 +177,16 @@ def _make(source: Path, folder: Path, work: Path, film: Path | None, given: list
             str(source), f"{_STOOD_STILL}, and no masks could be made: the room would become part of the object",
             _STILL_REMEDY,
         )  # fmt: skip
-    made.lines = _lines(made) + bracket_lines + masked.lines
-    _tell_left_out(found, photos, by_file, source)
+    told = _lines(made) + bracket_lines + masked.lines
+    made.lines = told + [f"left out: {line}" for line in lines(left_out)]
+    tell_left_out(found, photos, by_file, source)
+    doubtful = {fit.name: Cause(Reason.DOUBTFUL_MASK, fit.said) for fit in masked.fits if fit.doubtful}
     tell("writing the capture", 0.96)
     more = {
         "digest": digest,
         "method": found.method,
-        "left_out": left_out,
+        "left_out": {name: str(cause) for name, cause in left_out.items()},
+        "reasons": as_report(left_out | doubtful),
         "scale": alignment.scale_from,
         "up": alignment.up_from,
         "ground": alignment.ground_from,
@@ -194,7 +198,7 @@ def _make(source: Path, folder: Path, work: Path, film: Path | None, given: list
         more["masks"] = {
             fit.name: {"outside": round(fit.outside, 4), "missing": round(fit.missing, 4)} for fit in masked.fits
         }
-    said = [f"{source.name}: {made.lines[0]}", *made.lines[1:]]
+    said = [f"{source.name}: {told[0]}", *told[1:], *(f"left out: {line}" for line in lines(left_out, 3))]
     capture_folder.write_capture(folder, by_file, found, said, more, alignment.guessed)
     return made
 
@@ -343,37 +347,6 @@ def _of_sheet(sheet: MarkerSheet) -> Alignment:
 
     said = f"marker sheet ({sheet.name})"
     return Alignment(1.0, np.eye(3), np.zeros(3), said, said, said)
-
-
-def _tell_left_out(found: Registration, photos: list[Photo], by_file: dict[str, Picture], source: Path) -> None:
-    out = {photo.file: by_file[photo.file].path.name for photo in photos if photo.file not in found.matrices}
-    missing = [name for file, name in out.items() if file not in found.unsound]
-    if missing:
-        logger.warning(
-            "%s: %d of %d pictures do not fit the others and are left out: %s",
-            source, len(missing), len(photos), ", ".join(missing),
-        )  # fmt: skip
-    if found.unsound:
-        logger.warning(
-            "%s: %d of %d pictures are left out, their cameras may be wrong: %s. Add pictures between them and the "
-            "others", source, len(found.unsound), len(photos),
-            ", ".join(f"{out[file]} ({why})" for file, why in found.unsound.items()),
-        )  # fmt: skip
-    if found.moved is not None:
-        files = [photo.file for photo in photos if photo.file in found.matrices]
-        moment = files.index(found.moved)
-        last, first = (by_file[file].path.name for file in files[moment - 1 : moment + 1])
-        logger.warning(
-            "%s: the object or a part of it moved between %s and %s: it is there twice. Use the pictures of one place "
-            "alone (%d pictures before it, %d after), or photograph it again", source, last, first, moment,
-            len(files) - moment,
-        )  # fmt: skip
-    for group in found.apart:
-        logger.warning(
-            "%s: %d pictures fit together but share nothing with the others, as of another object: %s. Give them "
-            "a folder of their own, or add pictures between", source, len(group),
-            first_of([by_file[file].path.name for file in group]),
-        )  # fmt: skip
 
 
 def _lines(made: Made) -> list[str]:

@@ -17,8 +17,9 @@ from ..core.errors import AssetError, Cancelled, DeviceError, first_of
 from ..reconstruct.readers.layout import decode_mask
 from .features import Photo, Tell
 from .inspection import Look, look
+from .left_out import Cause, Reason
 from .marker_sheet import detect
-from .pictures import Picture, decode, mask_of_alpha, reduced, shown
+from .pictures import EmptyMask, Picture, decode, mask_of_alpha, reduced, shown
 
 logger = logging.getLogger(__name__)
 
@@ -42,8 +43,8 @@ class Prepared:
     folder : Path
     masks : Path, optional
         Folder of masks as COLMAP names them; None where no picture has one.
-    broken : dict of str to str
-        File name -> why it cannot be read.
+    broken : dict of str to Cause
+        File name -> why it cannot be used.
     """
 
     folder: Path
@@ -52,7 +53,7 @@ class Prepared:
     photos: list[Photo] = field(default_factory=list)
     looks: list[Look] = field(default_factory=list)
     markers: dict[str, dict[int, Array]] = field(default_factory=dict)
-    broken: dict[str, str] = field(default_factory=dict)
+    broken: dict[str, Cause] = field(default_factory=dict)
 
 
 def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bool, tell: Tell,
@@ -87,7 +88,8 @@ def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bo
         try:
             small, mask = _small(picture, folder / file, masks / f"{file}.png", size)
         except AssetError as error:
-            result.broken[picture.path.name] = f"cannot be read ({error.problem})"
+            reason = Reason.EMPTY_MASK if isinstance(error, EmptyMask) else Reason.UNREADABLE
+            result.broken[picture.path.name] = Cause(reason, error.problem)
             logger.warning("%s", error)
             continue
         height, width = small.shape[:2]
@@ -158,7 +160,7 @@ def _small(picture: Picture, copy: Path, mask_copy: Path, size: int) -> tuple[Ar
         mask = mask_of_alpha(pixels, str(picture.path)) if picture.mask is None else decode_mask(picture.mask)
         if picture.mask is not None and mask is not None and not mask.max() > 0.5:
             remedy = "Draw it white on the object, leave the picture out, or give --masks none"
-            raise AssetError(str(picture.mask), "is black all over: nothing of it is the object", remedy)
+            raise EmptyMask(str(picture.mask), "is black all over: nothing of it is the object", remedy)
         if mask is not None:
             drawn = Pillow.fromarray(np.asarray(mask > 0.5).astype(np.uint8) * 255)
             drawn = drawn.resize((colour.shape[1], colour.shape[0]), Pillow.Resampling.NEAREST)

@@ -17,6 +17,7 @@ from ..reconstruct.readers.layout import OPENCV_TO_BLENDER, invert
 from ..reconstruct.readers.lens import Lens
 from . import libraries, moved_object, soundness
 from .features import Photo, Tell, check_room
+from .left_out import Cause, lines, why_unregistered
 
 logger = logging.getLogger(__name__)
 
@@ -51,8 +52,10 @@ class Registration:
         What found them.
     apart : list of list of str
         Files of further models that share nothing with this one.
-    unsound : dict of str to str
+    unsound : dict of str to Cause
         File that was registered and is left out -> why its camera cannot be trusted.
+    unregistered : dict of str to Cause
+        File that was not registered -> why.
     moved : str, optional
         The first file in whose picture a part of the scene stands elsewhere than in those before it.
     """
@@ -65,7 +68,8 @@ class Registration:
     colours: Array
     method: str
     apart: list[list[str]] = field(default_factory=list)
-    unsound: dict[str, str] = field(default_factory=dict)
+    unsound: dict[str, Cause] = field(default_factory=dict)
+    unregistered: dict[str, Cause] = field(default_factory=dict)
     moved: str | None = None
 
 
@@ -120,7 +124,7 @@ def register(database: Path, pictures: Path, work: Path, photos: Sequence[Photo]
     colmap = libraries.load("pycolmap")
     matches = soundness.read_matches(colmap, database)
     best: Any = None
-    method, apart, unsound = "", [], dict[str, str]()
+    method, apart, unsound = "", [], dict[str, Cause]()
     for index, (name, settings, goes_on) in enumerate(_ATTEMPTS):
         if goes_on and best is None:
             continue
@@ -139,7 +143,7 @@ def register(database: Path, pictures: Path, work: Path, photos: Sequence[Photo]
         if models:
             out = left_out[id(models[0])]
             logger.info("%s: %d of %d pictures, %.2f px; left out: %s", name, models[0].num_reg_images(), len(photos),
-                        models[0].compute_mean_reprojection_error(), out)  # fmt: skip
+                        models[0].compute_mean_reprojection_error(), "; ".join(lines(out)) or "none")  # fmt: skip
         if models and (best is None or _rank(models[0]) > _rank(best)):
             best, method = models[0], f"{method} + {name}" if goes_on else name
             unsound = (unsound if goes_on else {}) | out
@@ -151,7 +155,7 @@ def register(database: Path, pictures: Path, work: Path, photos: Sequence[Photo]
         ):
             break
     if best is None:
-        _refuse([], photos, subject)
+        _refuse([], photos, subject, why_unregistered(colmap, database, matches, photos, ()))
     tell("adjusting cameras", 0.95)
     colmap = libraries.load("pycolmap")  # mapping sets its messages back to all
     _refine(colmap, best)
@@ -160,8 +164,9 @@ def register(database: Path, pictures: Path, work: Path, photos: Sequence[Photo]
         _refine(colmap, best)
     found = _read(best, method, apart)
     found.unsound = {name: why for name, why in unsound.items() if name not in found.matrices}
+    found.unregistered = why_unregistered(colmap, database, matches, photos, found.matrices)
     if len(found.matrices) < max(FEWEST, PART * len(photos)):
-        _refuse(list(found.matrices), photos, subject)
+        _refuse(list(found.matrices), photos, subject, found.unregistered | found.unsound)
     found.moved = moved_object.moved_at(colmap, best, database, [photo.file for photo in photos])
     return found
 
@@ -275,10 +280,10 @@ def _read(model: Any, method: str, apart: list[list[str]]) -> Registration:
     return found
 
 
-def _refuse(registered: list[str], photos: Sequence[Photo], subject: str) -> None:
-    """Raise AssetError with the pictures that are not registered."""
-    missing = [photo.given or photo.file for photo in photos if photo.file not in registered]
-    listed = ", ".join(missing[:40]) + (", ..." if len(missing) > 40 else "")
+def _refuse(registered: list[str], photos: Sequence[Photo], subject: str, causes: dict[str, Cause]) -> None:
+    """Raise AssetError with the pictures that are not registered, and why."""
+    missing = {photo.given or photo.file: causes[photo.file] for photo in photos if photo.file not in registered}
+    listed = "; ".join(lines(missing, 40, remedies=False))
     raise AssetError(
         subject,
         f"cannot be calibrated: {len(registered)} of {len(photos)} pictures fit together. Not registered: {listed}",

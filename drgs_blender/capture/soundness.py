@@ -16,6 +16,7 @@ import numpy as np
 
 from ..core.arrays import Array
 from ..core.errors import AssetError
+from .left_out import Cause, Reason
 
 if TYPE_CHECKING:
     from .registration import Registration
@@ -44,7 +45,7 @@ def read_matches(colmap: Any, database: Path) -> list[tuple[int, int, Array]]:
     return found
 
 
-def leave_out_unsound(model: Any, matches: Sequence[tuple[int, int, Array]]) -> dict[str, str]:
+def leave_out_unsound(model: Any, matches: Sequence[tuple[int, int, Array]]) -> dict[str, Cause]:
     """Take the pictures out of a model that are not sound, and those that lean on them, which may be registered again.
 
     Parameters
@@ -56,29 +57,29 @@ def leave_out_unsound(model: Any, matches: Sequence[tuple[int, int, Array]]) -> 
 
     Returns
     -------
-    dict of str to str
+    dict of str to Cause
         File -> why it is out.
     """
-    out: dict[int, str] = {}
+    out: dict[int, Cause] = {}
     leaning: list[int] = []
     agreeing = _agreement(model, matches)
     while agreeing:
         number, part = worst(agreeing)
         if part >= _AGREEING:
             break
-        out[number] = f"{1 - part:.0%} of its matches contradict the other cameras"
+        out[number] = Cause(Reason.CONTRADICTED, f"{1 - part:.0%} of them")
         agreeing = {pair: counts for pair, counts in agreeing.items() if number not in pair}
     kept = set(model.reg_image_ids()) - out.keys()
     tracks = [{element.image_id for element in point.track.elements} & kept for point in model.points3D.values()]
     core = largest_core(tracks)
     for number in kept - core:
-        out[number] = f"fewer than {LEAST_POINTS} points tie it to the other pictures"
+        out[number] = Cause(Reason.LOOSE, f"fewer than {LEAST_POINTS}")
     for number in core:
         points = [point.point3D_id for point in model.image(number).points2D if point.has_point3D()]
         shared = sum(any(one.image_id in out for one in model.point3D(k).track.elements) for k in points)
         if shared > _SHARED * len(points):
             leaning.append(number)
-    out |= dict.fromkeys(leaning, "its points are those of pictures that are left out")
+    out |= dict.fromkeys(leaning, Cause(Reason.LEANING))
     for number in out:
         model.deregister_frame(model.image(number).frame_id)
     return {model.image(number).name: why for number, why in out.items()}

@@ -25,13 +25,16 @@ FRAMES = (10, 400)
 DEFAULT_FRAMES = 90
 #: Pixels of the longer side at which frames are compared, and of the grid of motion.
 _SIZE = 320
+#: Pixels that a picture has moved by when the frames after it are no longer held against it: enough that whole pixels
+#: say how far, few enough that it still looks alike.
+_STEP = 4.0
 #: JPEG quality of the frames that are kept.
 _QUALITY = 97
 
 
 @dataclass(slots=True)
 class Sample:
-    """One decoded frame: its number, how sharp it is, how far the picture moved since the frame before."""
+    """One decoded frame: its number, how sharp it is, by how much the picture moved on from the frames before."""
 
     number: int
     sharpness: float
@@ -55,7 +58,7 @@ def extract_frames(
         `cancelled` said so.
     """
     samples, broken = [], ""
-    before: Array | None = None
+    moved = _Path()
     for number, total, frame, problem in _frames(video):
         broken = problem
         if frame is None:
@@ -63,9 +66,7 @@ def extract_frames(
         if cancelled():
             raise Cancelled
         grey = _small(frame)
-        motion = 0.0 if before is None else shift(before, grey)
-        samples.append(Sample(number, float(laplace(grey).var()), motion))
-        before = grey
+        samples.append(Sample(number, float(laplace(grey).var()), moved.moved_on(grey)))
         tell("looking at frames", 0.6 * number / max(total, number + 1))
     if len(samples) < FRAMES[0]:
         why = f" ({broken})" if broken else ""
@@ -130,6 +131,29 @@ def _upright(frame: Any) -> Array:
     return np.ascontiguousarray(np.rot90(pixels, round(getattr(frame, "rotation", 0) / 90) % 4))
 
 
+class _Path:
+    """How far pictures moved, one after the other, in whole pixels that add up.
+
+    Each is held against the same one before until it has moved by `_STEP` from there: of motion by less than a pixel a
+    frame nothing is rounded away, and noise of a camera that rests adds up to nothing.
+    """
+
+    def __init__(self) -> None:
+        self._from: Array | None = None
+        self._away = 0.0
+
+    def moved_on(self, picture: Array) -> float:
+        """Pixels by which the picture is farther away than any since the one it is held against."""
+        if self._from is None:
+            self._from = picture
+        away = shift(self._from, picture)
+        motion = max(away - self._away, 0.0)
+        self._away += motion
+        if away >= _STEP:
+            self._from, self._away = picture, 0.0
+        return motion
+
+
 def shift(before: Array, after: Array) -> float:
     """By how many pixels a picture moved on the whole, by phase correlation (Kuglin and Hines 1975); up to half of it.
 
@@ -155,7 +179,8 @@ def choose(samples: list[Sample], count: int) -> list[int]:
     if len(samples) <= count:
         return [sample.number for sample in samples]
     motion = np.array([sample.motion for sample in samples])
-    motion = np.minimum(motion, 10 * max(float(np.median(motion)), 0.5))  # cuts and failures of the correlation
+    usual = float(np.median(motion[motion > 0])) if (motion > 0).any() else 0.0
+    motion = np.minimum(motion, 10 * max(usual, 0.5))  # cuts and failures of the correlation
     path = np.cumsum(motion) / max(float(motion.sum()), 1e-9)
     time = np.arange(len(samples)) / (len(samples) - 1)
     window = np.minimum((0.8 * path + 0.2 * time) * count, count - 1e-6).astype(int)

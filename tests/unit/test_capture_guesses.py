@@ -120,7 +120,7 @@ def test_an_alpha_of_nothing_is_named_and_left_out(tmp_path, caplog):
     for k in range(3):
         write_with_alpha(photos / f"{k}.exr", k, MASK * (k != 1))
     ready = prepared(photos, tmp_path)
-    assert list(ready.broken) == ["1.exr"] and "alpha that is 0 everywhere" in ready.broken["1.exr"]
+    assert list(ready.broken) == ["1.exr"] and "alpha that is 0 everywhere" in str(ready.broken["1.exr"])
     assert "1.exr: has an alpha that is 0 everywhere" in caplog.text
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from test_capture_registration import registration, ring, scene
 
-from drgs_blender.capture import pipeline
 from drgs_blender.capture.features import Photo
+from drgs_blender.capture.left_out import tell_left_out
 from drgs_blender.capture.moved_object import find_move
 from drgs_blender.capture.pictures import Picture
 
@@ -66,6 +66,6 @@ def test_who_moved_the_object_is_told_between_which_pictures(caplog, tmp_path):
     photos = [Photo(name, ("one",), None, (800, 600)) for name in cameras]
     by_file = {name: Picture(Path(f"IMG_{name}").with_suffix(".png"), name) for name in cameras}
     found = replace(registration(cameras, scene(table=True)), moved="04.jpg")
-    pipeline._tell_left_out(found, photos, by_file, tmp_path)
+    tell_left_out(found, photos, by_file, tmp_path)
     (line,) = [record.getMessage() for record in caplog.records]
     assert "between IMG_03.png and IMG_04.png" in line and "4 pictures before it, 2 after" in line

@@ -16,6 +16,7 @@ from scipy.ndimage import convolve, uniform_filter
 from drgs_blender.capture import pictures
 from drgs_blender.capture.exif import Metadata, read_exif
 from drgs_blender.capture.inspection import FEWEST, inspect, look, tell_of_views
+from drgs_blender.capture.left_out import Cause, Reason
 from drgs_blender.capture.pictures import Picture, decode, find_pictures, has_pictures, shown, write_picture
 from drgs_blender.capture.preparation import prepare
 from drgs_blender.core.color import linear_to_srgb, srgb_to_linear
@@ -130,7 +131,8 @@ def test_masks_that_say_nothing_are_told_before_the_work(tmp_path, caplog):
     given = find_pictures(tmp_path)
     assert not caplog.messages
     ready = prepare(given, tmp_path / "work", 64, False, lambda *_: None, lambda: False)
-    assert list(ready.broken) == ["0.png"] and "masks/0.png: is black all over" in caplog.messages[0]
+    assert list(ready.broken) == ["0.png"] and ready.broken["0.png"].reason is Reason.EMPTY_MASK
+    assert "masks/0.png: is black all over" in caplog.messages[0]
     assert "3 of 3 masks are white along the edges" in caplog.messages[1] and len(caplog.messages) == 2
     caplog.clear()
     for k in range(4):
@@ -190,8 +192,8 @@ def test_blurred_pictures_and_duplicates_are_left_out(caplog):
     images[7] = images[2].copy()
     fit, left_out = inspect(*looks(images), "photos")
     assert set(left_out) == {"3.jpg", "7.jpg"} and len(fit) == 8
-    assert "blurred" in left_out["3.jpg"] and "2.jpg" in left_out["7.jpg"]
-    assert "1 pictures are left out, blurred: 3.jpg" in caplog.text
+    assert left_out["3.jpg"].reason is Reason.BLURRED and left_out["7.jpg"] == Cause(Reason.DUPLICATE, "2.jpg")
+    assert "of 10 pictures left out: 1 blurred: 3.jpg (sharpness" in caplog.text
     assert "3.jpg" in caplog.text and "7.jpg" in caplog.text
 
 

@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFilter
 
 from drgs_blender.capture import capture_folder, features, libraries, pipeline, soundness
 from drgs_blender.capture.features import Photo, pairs
+from drgs_blender.capture.left_out import Cause, Reason, tell_left_out
 from drgs_blender.capture.pictures import Picture
 from drgs_blender.capture.pipeline import Settings, make_capture
 from drgs_blender.capture.preparation import Prepared
@@ -186,7 +187,7 @@ def test_cameras_are_found_from_matches(colmap, tmp_path):
 def test_too_few_matched_pictures_are_refused_with_their_names(colmap, tmp_path):
     _, photos = synthetic(colmap, tmp_path / "database.db", 6)
     strangers = [replace(photos[0], file=f"other_{k}.jpg", given=f"OTHER_{k}.PNG") for k in range(9)]
-    with pytest.raises(AssetError, match=r"6 of 15 pictures fit together. Not registered: OTHER_0.PNG"):
+    with pytest.raises(AssetError, match=r"6 of 15 pictures fit together. Not registered: .* OTHER_0.PNG"):
         register(tmp_path / "database.db", tmp_path, tmp_path / "models", photos + strangers, "photos", tell, never)
 
 
@@ -220,7 +221,7 @@ def test_a_camera_that_matches_contradict_is_left_out_alone(colmap, tmp_path):
         if number in {element.image_id for element in point.track.elements}:
             model.delete_observation(number, next(e.point2D_idx for e in point.track.elements if e.image_id == number))
     out = soundness.leave_out_unsound(model, matches)
-    assert list(out) == [wrong] and "contradict" in out[wrong]
+    assert list(out) == [wrong] and out[wrong].reason is Reason.CONTRADICTED
     assert wrong not in names(model) and model.num_reg_images() == 8
 
 
@@ -240,7 +241,7 @@ def test_pictures_that_few_points_tie_to_the_others_are_left_out(colmap, tmp_pat
     assert left == 0
     out = soundness.leave_out_unsound(model, [])
     assert model.num_reg_images() == kept and len(out) == 9 - kept
-    assert all(f"fewer than {soundness.LEAST_POINTS} points" in why for why in out.values())
+    assert {str(why) for why in out.values()} <= {str(Cause(Reason.LOOSE, f"fewer than {soundness.LEAST_POINTS}"))}
 
 
 @pytest.mark.parametrize(("found", "affine", "method"), [
@@ -275,12 +276,16 @@ def test_left_out_cameras_are_named_with_their_reason(caplog, tmp_path):
     photos = [Photo(name, ("one",), None, (800, 600)) for name in cameras]
     by_file = {name: Picture(tmp_path / f"IMG_{name}", name) for name in cameras}
     kept = dict(list(cameras.items())[2:])
-    found = replace(registration(kept, scene(table=True)), unsound={"01.jpg": "90% of its matches contradict"})
+    found = replace(
+        registration(kept, scene(table=True)), unsound={"01.jpg": Cause(Reason.CONTRADICTED, "90% of them")}
+    )
+    found.unregistered = {"00.jpg": Cause(Reason.NO_POSE, "61 matches with IMG_04.jpg")}
     found.apart = [["00.jpg"]]
-    pipeline._tell_left_out(found, photos, by_file, tmp_path)
+    tell_left_out(found, photos, by_file, tmp_path)
     strange, unsound, apart = [record.getMessage() for record in caplog.records]
-    assert "1 of 6 pictures do not fit the others and are left out: IMG_00.jpg" in strange and "IMG_01" not in strange
-    assert "IMG_01.jpg (90% of its matches contradict)" in unsound and "IMG_00" not in unsound
+    assert "of 6 pictures left out: 1 matched, but no place" in strange and "IMG_01" not in strange
+    assert "IMG_00.jpg (61 matches with IMG_04.jpg). Leave object" in strange
+    assert "IMG_01.jpg (90% of them). Where sides look alike" in unsound and "IMG_00" not in unsound
     assert "share nothing with the others, as of another object: IMG_00.jpg." in apart
 
 
@@ -344,7 +349,7 @@ def test_few_pictures_held_otherwise_have_the_focal_length_of_the_rest_or_none(c
             np.testing.assert_allclose(result.matrices[name], cameras[name], atol=5e-3)
     else:
         assert set(result.unsound) == few and len(result.matrices) == 12
-        assert "nothing says its focal length: 2 of its size" in result.unsound["04.jpg"]
+        assert "nothing says its focal length (2 of its size" in str(result.unsound["04.jpg"])
 
 
 def test_pictures_of_a_lens_that_fit_worse_than_those_of_the_others_are_left_out(cv2):
@@ -358,7 +363,8 @@ def test_pictures_of_a_lens_that_fit_worse_than_those_of_the_others_are_left_out
         found[name] = {n: seen(c, matrix, LENS) + b for (n, c), b in zip(sheet.corners.items(), bent, strict=True)}
         photos.append(Photo(name, (800, 600, f"M{k in (4, 9)}"), LENS.fx / 800, (800, 600)))
     result = poses_from_markers(sheet, found, photos)
-    assert set(cameras) - set(result.matrices) == {"04.jpg", "09.jpg"}
+    assert set(cameras) - set(result.matrices) == result.unregistered.keys() == {"04.jpg", "09.jpg"}
+    assert {cause.reason for cause in result.unregistered.values()} == {Reason.POOR_MARKERS}
 
 
 @pytest.mark.parametrize("paper", ["a4", "letter", "a3"])
@@ -401,6 +407,27 @@ def photographs_of_a_sheet(cv2, folder, count: int) -> dict[str, np.ndarray]:
         picture = cv2.warpPerspective(page, turn, (800, 600), flags=cv2.INTER_AREA, borderValue=90)
         Image.fromarray(picture).convert("RGB").save(folder / name, quality=95)
     return cameras
+
+
+def test_the_report_says_why_each_picture_is_left_out(cv2, tmp_path):
+    photos, out = tmp_path / "photos", tmp_path / "capture"
+    photographs_of_a_sheet(cv2, photos, 9)
+    with Image.open(photos / "03.jpg") as sharp:
+        sharp.save(photos / "03 again.jpg", quality=95)
+    with Image.open(photos / "05.jpg") as sharp:
+        sharp.filter(ImageFilter.GaussianBlur(12)).save(photos / "05.jpg")
+    noise = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)  # no marker is seen
+    Image.fromarray(noise).resize((800, 600), Image.Resampling.NEAREST).save(photos / "07.jpg", quality=95)
+    made = make_capture(photos, out, Settings(), tell, never)
+    report = json.loads((out / capture_folder.REPORT).read_text())
+    why = {group["reason"]: group for group in report["reasons"]}
+    assert {key: list(group["pictures"]) for key, group in why.items()} == {
+        "duplicate": ["03.jpg"], "blurred": ["05.jpg"], "too few markers": ["07.jpg"],
+    }  # fmt: skip
+    assert made.pictures == 7 and report["left_out"].keys() == made.left_out.keys() == {"03.jpg", "05.jpg", "07.jpg"}
+    assert why["too few markers"]["pictures"] == {"07.jpg": "0 seen"} and why["blurred"]["left_out"]
+    told = [line for line in made.lines if line.startswith("left out: ")]
+    assert len(told) == 3 and any("1 blurred: 05.jpg" in line and "Take them again, sharp" in line for line in told)
 
 
 def test_photographs_of_a_sheet_become_a_capture_that_reconstruct_reads(cv2, tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from drgs_blender.capture.video import Sample, _upright, choose, extract_frames
+from drgs_blender.capture.video import Sample, _Path, _upright, choose, extract_frames
 from drgs_blender.core.errors import AssetError
 
 
@@ -50,6 +50,47 @@ def film(tmp_path_factory):
         for packet in stream.encode():
             container.mux(packet)
     return path
+
+
+def encoded(path, pictures) -> None:
+    """A video of (h, w, 3) uint8 pictures, of the quality of a phone's."""
+    av = pytest.importorskip("av", reason="video needs PyAV")
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=30)
+        stream.height, stream.width, stream.pix_fmt, stream.bit_rate = *pictures[0].shape[:2], "yuv420p", 2_000_000
+        for picture in pictures:
+            for packet in stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+
+
+@pytest.mark.parametrize("slow", [0.125, 0.25])
+def test_slow_parts_of_a_video_keep_their_frames(tmp_path, slow):
+    """By less than half a pixel a frame, which whole pixels between neighbours never show, then by two."""
+    random = np.random.default_rng(0)
+    wide = Image.fromarray(random.integers(0, 255, (90, 260, 3), np.uint8)).resize(
+        (2080, 720), Image.Resampling.BICUBIC
+    )
+    at = np.cumsum(np.r_[np.full(160, slow), np.full(20, 2.0)])
+    sensor = random.normal(0, 3, (4, 80, 112, 3))
+    pictures = []
+    for k, x in enumerate(at):
+        left = round(8 * x)
+        small = wide.crop((left, 0, left + 8 * 112, 8 * 80)).resize((112, 80), Image.Resampling.BOX)
+        pictures.append(np.clip(np.asarray(small) + sensor[k % 4], 0, 255).astype(np.uint8))
+    encoded(tmp_path / "slow.mp4", pictures)
+    paths = extract_frames(tmp_path / "slow.mp4", tmp_path / "frames", 30, tell, lambda: False)
+    numbers = [int(path.stem.split("_")[1]) for path in paths]
+    share = 0.8 * at[159] / at[-1] + 0.2 * 160 / 180  # of the path, and of the time
+    assert sum(number < 160 for number in numbers) == pytest.approx(30 * share, abs=3)
+
+
+def test_a_camera_that_rests_does_not_move_by_its_noise():
+    random = np.random.default_rng(0)
+    still = random.random((60, 80)).astype(np.float32)
+    path = _Path()
+    assert sum(path.moved_on(still + random.normal(0, 0.03, still.shape).astype(np.float32)) for _ in range(50)) == 0
 
 
 def test_sharp_frames_of_a_video_are_written(film, tmp_path):

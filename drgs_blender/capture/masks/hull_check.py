@@ -44,10 +44,13 @@ class Fit:
         """Whether it cuts the object."""
         return max(self.outside, self.missing) > WRONG
 
+    @property
+    def said(self) -> str:
+        """Both figures in words."""
+        return f"{self.outside:.0%} of it outside the others' hull, {self.missing:.0%} of the hull missing"
+
     def __str__(self) -> str:
-        return (
-            f"{self.name} ({self.outside:.0%} of it outside the others' hull, {self.missing:.0%} of the hull missing)"
-        )
+        return f"{self.name} ({self.said})"
 
 
 def check_masks(cv2: Any, views: Sequence[MaskView], masks: Sequence[Array], hull: Hull) -> list[Fit]:
