@@ -430,6 +430,8 @@ def test_what_comes_into_view_is_traced() -> None:
     box = wall(box=True).object != 0
     assert uncovered[box].all()
     np.testing.assert_array_equal(uncovered[~box], chess[~box])
+    other = wall()._replace(object=np.where(box, 1.0, 0.0).astype(np.float32))  # on the wall itself
+    np.testing.assert_array_equal(traced(wall(), other), chess | box)
 
 
 def test_surfaces_in_two_layers_and_catchers_are_traced() -> None:
