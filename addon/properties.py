@@ -40,7 +40,7 @@ class DrgsSceneSettings(LevelOfDetail, bpy.types.PropertyGroup):
 
     samples: IntProperty(
         name="Samples",
-        description="Light samples per pixel. Each surface divides them by its material: to lights, and along reflections",
+        description="Light samples per pixel. Each surface divides them by its material: to lights, along reflections",
         min=1,
         soft_max=1024,
         max=65536,

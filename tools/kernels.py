@@ -178,6 +178,10 @@ def engine(folder: Path, what: str) -> None:
                 seen = replace(frame, settings=replace(settings, denoise=denoise))
                 client.view("view", seen)
                 client.view("view", seen, go_on=True)
+            turned = matrix.copy()
+            turned[0, 3] = 0.1
+            for place in (matrix, turned):
+                client.view("view", replace(seen, camera=replace(camera, matrix_world=place), history="view"))
 
 
 def reconstruct(variant: str) -> None:

@@ -25,8 +25,9 @@ log = logging.getLogger("drgs")
 
 #: Side of the pixels beyond which a picture is refined before it is blurred.
 _SHARP_UNTIL = 4
-#: Seconds after a move until all surfels are drawn, where a picture has fewer.
-REST_SECONDS = 0.15
+#: Seconds after a move until all surfels are drawn, where a picture has fewer; until anything is refined: what is begun
+#: between two moves of the mouse is never seen, and to end it half way delays the next picture.
+REST_SECONDS, PAUSE_SECONDS = 0.15, 0.04
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +175,7 @@ class Worker:
         while True:
             with self._changed:
                 while (view := self._next()) is None and not self._ending:
-                    self._changed.wait(None if self._held or not self._unrested() else REST_SECONDS / 4)
+                    self._changed.wait(None if self._held or not self._unrested() else PAUSE_SECONDS / 4)
                 if self._ending or view is None:
                     return
                 request, first, submitted = view.request, not view.begun, view.submitted
@@ -235,12 +236,16 @@ class Worker:
         return min(growing, key=lambda view: view.fraction, default=None)
 
     def _unrested(self) -> list[_View]:
-        """Views that have just moved, and show fewer surfels than there are; called with the lock held.
+        """Views that have just moved, longer ago where they show fewer surfels than there are; with the lock held.
 
-        All of them would not be drawn before the next move, and to end half way takes a while, too.
+        What they show next would not be drawn before the next move, and to end half way takes a while, too.
         """
-        latest = time.perf_counter() - REST_SECONDS
-        return [v for v in self._views.values() if v.begun and v.many and v.fraction == 0.0 and v.moved > latest]
+        now = time.perf_counter()
+
+        def rest(view: _View) -> float:
+            return REST_SECONDS if view.many and view.fraction == 0.0 else PAUSE_SECONDS
+
+        return [v for v in self._views.values() if v.begun and _unfinished(v) and v.moved > now - rest(v)]
 
     def _stop_begin(self, view: _View) -> Callable[[], bool]:
         return lambda: self._ending or self._held > 0 or self._views.get(view.name) is not view

@@ -86,7 +86,10 @@ class Histories:
             old.past.parameters,
             prepared.unmeshed if still else old.past.surfels,
         )
-        return Sequence(History(old.history.signal, scene_state, still), old.past, fit, situation, old.pictures)
+        turned = not still and len(situation) == len(old.situation)
+        turned = turned and all(a is b for a, b in zip(situation[1:], old.situation[1:]))
+        history = History(old.history.signal, scene_state, still, turned, old.pictures)
+        return Sequence(history, old.past, fit, situation, old.pictures)
 
     def store(self, frame: Frame, sequence: Sequence, prepared: PreparedScene) -> None:
         """Remember `sequence` after its picture `frame` was made."""

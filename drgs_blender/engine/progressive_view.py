@@ -20,9 +20,11 @@ IsCancelled = Callable[[], bool]
 #: Makes a whole picture of a frame, and reports progress.
 Draw = Callable[[Frame, PreparedScene, Progress], Passes]
 
-#: Seconds that the pixels of a first picture may take, and as many surfels as they ask for: for 24 pictures a second
-#: with the way to the screen.
-FIRST_SECONDS = 0.025
+#: Seconds that the pixels of a first picture may take, and as many surfels as they ask for: longer than that go to what
+#: does not depend on them and to the way to the screen, where Blender may draw its window by the same processors.
+FIRST_SECONDS = 0.0125
+#: Factor on them within which the size of pixels stays, and numbers of pixels of which it is known.
+_SLACK, _MOST_SIZES = 1.25, 8
 #: Seconds between the pictures that follow.
 STEP_SECONDS = 0.2
 #: Sides of a coarse pixel.
@@ -34,14 +36,31 @@ class Pace:
 
     def __init__(self) -> None:
         self._seconds = 5e-7
+        self._sizes: dict[int, int] = {}
         # Sums over the pictures, older ones counting less: one, pixels, seconds, pixels^2, pixels * seconds.
         self._sums = np.zeros(5)
         for pixels in (0, 60_000):
             self._add(pixels, 0.02 + pixels * self._seconds)
 
     def size(self, pixels: int) -> int:
-        """Side of the coarse pixels with which a picture of `pixels` pixels takes `FIRST_SECONDS` at most."""
-        return next((n for n in SIZES if pixels / n**2 * self._seconds <= FIRST_SECONDS), SIZES[-1])
+        """Side of the coarse pixels with which a picture of `pixels` pixels takes `FIRST_SECONDS` at most.
+
+        It stays until another one clearly fits better, since a history of pictures ends where their size changes.
+        """
+
+        def seconds(n: int) -> float:
+            return pixels / n**2 * self._seconds
+
+        latest = self._sizes.pop(pixels, None)
+        if latest is not None:
+            finer = max((n for n in SIZES if n < latest), default=0)
+            if seconds(latest) <= FIRST_SECONDS * _SLACK and (not finer or seconds(finer) * _SLACK > FIRST_SECONDS):
+                self._sizes[pixels] = latest
+                return latest
+        self._sizes[pixels] = next((n for n in SIZES if seconds(n) <= FIRST_SECONDS), SIZES[-1])
+        while len(self._sizes) > _MOST_SIZES:
+            del self._sizes[next(iter(self._sizes))]
+        return self._sizes[pixels]
 
     def note(self, pixels: int, seconds: float) -> None:
         """Learn from a picture; one that was slow because kernels were loaded counts little."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,9 +23,10 @@ def reuse_equal(value: T, known: Any) -> T:
     if isinstance(value, np.ndarray):
         made = known if isinstance(known, np.ndarray) and same_bits(value, known) else keep(value)
         return made
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+    kind: Any = type(value)
+    names = _field_names(kind)
+    if names is not None:
         before = known if type(known) is type(value) else None
-        names = [f.name for f in dataclasses.fields(value)]
         made = {name: reuse_equal(getattr(value, name), getattr(before, name, None)) for name in names}
         if before is not None and all(made[name] is getattr(before, name) for name in names):
             return before
@@ -36,3 +38,9 @@ def reuse_equal(value: T, known: Any) -> T:
             return known
         return type(value)(made)
     return known if type(known) is type(value) and known == value else value
+
+
+@cache
+def _field_names(kind: type) -> tuple[str, ...] | None:
+    """Names of the fields of a dataclass, looked up once, since viewports ask for every picture; None for others."""
+    return tuple(f.name for f in dataclasses.fields(kind)) if dataclasses.is_dataclass(kind) else None

@@ -122,10 +122,11 @@ class RenderBackend:
         return denoise(components, variance, guides, split, check)
 
     def denoise_next(
-        self, picture: NoisyPicture, history: Signal | None, split: bool, still: bool, check: Callable[[], None]
-    ) -> tuple[Array, Signal]:
+        self, picture: NoisyPicture, history: Signal | None, split: bool, still: bool, check: Callable[[], None],
+        turned: bool = False,
+    ) -> tuple[Array, Signal]:  # fmt: skip
         """`denoise.svgf_temporal.denoise_next`."""
-        return denoise_next(picture, history, split, still, check)
+        return denoise_next(picture, history, split, still, check, turned)
 
 
 CPU = RenderBackend()

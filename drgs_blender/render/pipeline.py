@@ -19,6 +19,8 @@ from ..core.frame import Camera, Frame
 from ..core.passes import BY_NAME, pass_of
 from .backend import CPU, RenderBackend
 from .camera import camera_parameters
+from .denoise.demodulation import PAD
+from .denoise.kept_light import to_trace
 from .denoise.oidn import QUALITIES, denoise_oidn, require
 from .denoise.svgf_temporal import History, NoisyPicture
 from .film.cryptomatte import CryptoFilm
@@ -49,6 +51,8 @@ Array = np.ndarray
 Progress = Callable[[float, str], None]
 Check = Callable[[], None]
 
+#: Passes that can be made of pixels without light of their own.
+KEPT_PASSES = frozenset({"Combined", "Depth"})
 #: Memory a strip may take, and what a sub-pixel sample takes of it at most (samples, points, light).
 STRIP_BYTES, SAMPLE_BYTES = 64 << 20, 326
 #: Seconds a batch of points should take, how many samples (points times theirs) the first has, fewest of any.
@@ -125,6 +129,18 @@ def render(
         for then in (prepared.previous, prepared.following, past)
     ]
     end = 1.0 if settings.denoise == "none" else 0.9
+    kept = None
+    if history is not None and history.signal is not None and history.turned and keeps_light(frame, backend):
+        kept = history.signal.to_cpu()
+
+    def needed(buffer: GBuffer) -> Array | None:
+        """Which points to trace, None for all; the others keep the light of the picture before."""
+        if kept is None or past is None or history is None:
+            return None
+        if kept.light.shape[::2] != (bottom - top, right - left + 2 * PAD):
+            return None
+        cameras, corner = (parameters, past.parameters), (left, top, camera.width)
+        return to_trace(buffer, numbers.name, kept, cameras, history.pictures, corner)
 
     def draw_strips() -> None:
         """Fill the films; what this takes, the splats above all, is given back before the light is denoised."""
@@ -138,7 +154,7 @@ def render(
             with interruptible(check):
                 buffer = visible.rows(y0, y1)
             check()
-            radiance = batches.light(buffer)
+            radiance = batches.light(buffer, needed(buffer))
             film.add(buffer, radiance, numbers, prepared.seen)
             for matte in mattes:
                 matte.add(buffer)
@@ -160,7 +176,9 @@ def render(
         components = denoised(film, frame, check, backend)
     else:
         picture = NoisyPicture(seen.components, seen.variance, film.guides(), motions[2])
-        components, signal = backend.denoise_next(picture, history.signal, split_light(frame), history.still, check)
+        components, signal = backend.denoise_next(
+            picture, history.signal, split_light(frame), history.still, check, history.turned
+        )
     report(1.0, "Done")
     if history is not None:
         history.signal = signal
@@ -192,6 +210,13 @@ def denoised(film: Film, frame: Frame, check: Check, backend: RenderBackend = CP
 def split_light(frame: Frame) -> bool:
     """Whether direct and indirect light are wanted apart."""
     return any(name in frame.passes for name in LIGHT_PASSES)
+
+
+def keeps_light(frame: Frame, backend: RenderBackend = CPU) -> bool:
+    """Whether pixels may keep the light of the last picture, where that is all that is asked for."""
+    settings = frame.settings
+    alone = settings.subpixel_count == 1 and settings.noise_threshold == 0.0 and backend.launcher is None
+    return alone and KEPT_PASSES.issuperset(frame.passes)
 
 
 class VisibleSurfaces:
@@ -296,8 +321,13 @@ class Batches:
         self._parts = part_count(frame.settings)
         self._size = max(FEWEST_POINTS, FIRST_SAMPLES * self._parts // max(1, frame.settings.sample_count))
 
-    def light(self, buffer: GBuffer) -> Radiance:
-        """Light of all points of `buffer`."""
+    def light(self, buffer: GBuffer, chosen: Array | None = None) -> Radiance:
+        """Light of all points of `buffer`, or of those `chosen` (n,) of them; that of the others is NaN."""
+        if chosen is not None:
+            rows = np.flatnonzero(chosen)
+            found = _spread(self.trace(buffer.points[rows], (0, 1)), rows, buffer.points)
+            found.components[~chosen] = np.nan
+            return found
         if self._parts == 1:
             return self.trace(buffer.points, (0, 1))
         threshold = self._frame.settings.noise_threshold

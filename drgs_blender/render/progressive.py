@@ -55,6 +55,10 @@ def parts_of(settings: RenderSettings) -> list[tuple[int, tuple[int, int]]]:
     return [(sample, (i, n)) for i in range(n) for sample in range(settings.subpixel_count)]
 
 
+#: Width of the pixel filter of coarse pictures: with one sample a pixel, edges drawn from a wide one are ragged.
+CENTRE = 0.02
+
+
 def coarse(frame: Frame, size: int) -> Frame:
     """The frame with pixels of `size` by `size`, one sample each of every strategy, for a first picture.
 
@@ -77,7 +81,14 @@ def coarse(frame: Frame, size: int) -> Frame:
     )
     samples, by_strategy = min(3, frame.settings.samples), frame.settings.strategy_samples
     few = by_strategy and (min(1, by_strategy[0]), min(1, by_strategy[1]), min(1, by_strategy[2]))
-    settings = replace(frame.settings, samples=samples, strategy_samples=few, subpixel_samples=1, noise_threshold=0.0)
+    settings = replace(
+        frame.settings,
+        samples=samples,
+        strategy_samples=few,
+        subpixel_samples=1,
+        noise_threshold=0.0,
+        filter_width=CENTRE,
+    )
     if settings.denoise != "none" or frame.history:
         settings.denoise = "svgf"
     return replace(frame, camera=view, settings=settings, previous=None, next=None)
@@ -192,7 +203,8 @@ class Progressive:
             self._draw(batches, check)
             if time.perf_counter() - began >= seconds:
                 break
-        return self._develop(prepared, check)
+        with interruptible(check):
+            return self._develop(prepared, check)
 
     def _draw(self, batches: Batches, check: Callable[[], None]) -> None:
         sample, part = self._parts[self._next]
@@ -206,7 +218,9 @@ class Progressive:
             check()
             assert strip.light is not None
             chosen = strip.light.going[points.sample[strip.light.going] == sample]
-            found.append((strip, points, chosen, batches.trace(points[chosen], part)))
+            with interruptible(check):
+                radiance = batches.trace(points[chosen], part)
+            found.append((strip, points, chosen, radiance))
         for strip, points, chosen, radiance in found:
             strip.add(chosen, radiance)
             if last:
@@ -235,8 +249,7 @@ class Progressive:
         surfaces = SurfaceFilm(prepared.scene, self.frame, self._parameters, put_lobe_colours)
         groups = LightGroupFilm(prepared.scene, lights, self.frame, self._parameters)
         for strip in self._strips:
-            with interruptible(check):
-                buffer = self._samples(strip)
+            buffer = self._samples(strip)
             check()
             exact = self._adaptive and self.fraction == 1.0
             radiance = strip.radiance(buffer.points, exact)

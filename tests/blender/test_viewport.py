@@ -470,6 +470,21 @@ def test_newest_request_wins_and_first_pictures_are_shown_meanwhile(scene, ball,
     wait(lambda: done(worker, "a", last))
 
 
+def test_nothing_is_refined_between_two_moves(scene, ball, worker, monkeypatch):
+    """The engine would be at work on what is never seen when the next move comes."""
+    module = part("addon.viewport.worker")
+    monkeypatch.setattr(module, "PAUSE_SECONDS", 1e6)  # it goes on moving
+    for shift in (0.0, 0.1):
+        worker.submit("a", what := request(scene, shift))
+        wait(lambda what=what: worker.picture("a") is not None and worker.picture("a").request is what)
+        assert worker._next() is None
+        assert worker.picture("a").fraction == 0.0
+    monkeypatch.setattr(module, "PAUSE_SECONDS", 0.0)
+    with worker._changed:
+        worker._changed.notify()
+    wait(lambda: done(worker, "a", what))
+
+
 def test_final_render_has_the_engine_to_itself(scene, ball, worker):
     worker.submit("a", what := request(scene, samples=4096, size=(400, 300)))
     wait(lambda: worker.picture("a") is not None)

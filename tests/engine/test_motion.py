@@ -12,6 +12,7 @@ from drgs_blender.core.errors import Cancelled, UsageError
 from drgs_blender.core.frame import MotionStep, Pose
 from drgs_blender.render.camera import camera_parameters
 from drgs_blender.render.film.motion_vectors import project
+from drgs_blender.render.pipeline import Batches
 
 PASSES = ("Combined", "Vector", "Previous Position", "Position", "Coverage", "IndexOB", "Depth")
 
@@ -222,3 +223,74 @@ def test_a_cancelled_picture_leaves_the_history_as_it_was(session, make_frame):
         session.render(still_frame(make_frame, 1, size=(96, 72)), cancelled=lambda: next(calls) > 12)
     again = session.render(still_frame(make_frame, 1))
     assert again.statistics["history"] == 1
+
+
+# --- light that is kept while the view turns ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """How many points each picture traced."""
+    counts = []
+    real = Batches.trace
+
+    def trace(self, points, part):
+        counts.append(len(points))
+        return real(self, points, part)
+
+    monkeypatch.setattr(Batches, "trace", trace)
+    return counts
+
+
+def turned_frame(make_frame, number):
+    """The view gone on by some pixels with every picture; one sample a pixel."""
+    frame = still_frame(make_frame, number, subpixel_samples=1)
+    frame.camera.matrix_world[0, 3] = 0.02 * number
+    return frame
+
+
+def test_a_view_that_turns_traces_half_and_stays_as_good(session, make_frame, counted):
+    error = {"view": 0.0, "": 0.0}
+    for number in range(8):
+        frame = turned_frame(make_frame, number)
+        counted.clear()
+        picture = session.render(frame)
+        traced, every = sum(counted), np.count_nonzero(picture["Combined"][..., 3])
+        assert traced > 0.9 * every if number == 0 else 0.4 * every < traced < 0.7 * every
+        assert np.isfinite(picture["Combined"]).all()
+        if number >= 4:
+            clean = session.render(replace(frame, settings=make_frame(samples=128).settings, history=""))
+            error["view"] += noise(picture, clean)
+            error[""] += noise(session.render(replace(frame, history="")), clean)
+    assert error["view"] < 0.9 * error[""]
+
+
+def test_nothing_is_kept_where_more_than_the_camera_changes(session, make_frame, counted):
+    """An object that moves, a light, and a picture with passes that kept light cannot make."""
+
+    def part(number, change):
+        frame = turned_frame(make_frame, number)
+        change(frame)
+        counted.clear()
+        picture = session.render(frame)
+        return sum(counted) / np.count_nonzero(picture["Combined"][..., 3])
+
+    def move(frame):
+        frame.objects[0].vertices[:, 0] += np.float32(0.01)
+
+    def brighten(frame):
+        move(frame)
+        frame.world.strength *= 2.0
+
+    def ask(frame):
+        brighten(frame)
+        frame.passes = ("Combined", "Variance")
+
+    for number in range(2):
+        part(number, lambda frame: None)
+    assert part(2, lambda frame: None) < 0.7
+    assert part(3, move) > 0.9
+    assert part(4, move) < 0.7
+    assert part(5, brighten) > 0.9
+    assert part(6, brighten) < 0.7
+    assert part(7, ask) > 0.9

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -223,6 +224,20 @@ def test_pace_tells_the_fixed_part_from_that_of_a_pixel(fixed, each):
     assert finer > 0.5 * FIRST_SECONDS
 
 
+def test_pace_does_not_swing_between_two_sizes():
+    """A history of pictures ends with their size: noise of the measured times must not change it."""
+    pace, window, random = Pace(), 640 * 480, np.random.default_rng(5)
+    for edge in (3, 4):
+        each = FIRST_SECONDS / (window / edge**2)  # just between two sizes
+        found = []
+        for _ in range(300):
+            found.append(pace.size(window))
+            pixels = window // found[-1] ** 2
+            pace.note(pixels, (0.01 + each * pixels) * random.uniform(0.95, 1.05))
+        late = found[150:]
+        assert sum(a != b for a, b in pairwise(late)) <= 6
+
+
 # --- through the process -------------------------------------------------------------------------------------------
 
 
@@ -283,10 +298,10 @@ def test_newer_frame_interrupts_within_tens_of_milliseconds(client, make_frame):
 
 def test_cancelled_step_leaves_the_view_as_it_was(session, make_frame, monkeypatch):
     monkeypatch.setattr("drgs_blender.engine.progressive_view.STEP_SECONDS", 0.0)
-    frame = make_frame(0.2, samples=16)
+    frame = make_frame(0.2, samples=16, threads=1)  # it is always asked as often
     session.view("A", frame)
     before = session.refine("A").statistics["view.fraction"]
-    for asked in range(1, 30):
+    for asked in range(1, 400):
         left = iter([False] * asked)
         with pytest.raises(Cancelled):
             session.refine("A", cancelled=lambda left=left: next(left, True))

@@ -8,12 +8,16 @@ import pytest
 from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.frame import Camera, RenderSettings
 from drgs_blender.render.camera import camera_parameters, camera_ray
-from drgs_blender.render.denoise.demodulation import LIGHT, PAD, Signal
+from drgs_blender.render.denoise.demodulation import LIGHT, PAD, SOURCE, Signal
+from drgs_blender.render.denoise.kept_light import to_trace
 from drgs_blender.render.denoise.svgf_spatial import prepare
 from drgs_blender.render.denoise.svgf_temporal import NoisyPicture, denoise_next
 from drgs_blender.render.denoise.svgf_window import window
 from drgs_blender.render.film.guides import Guides
 from drgs_blender.render.film.motion_vectors import Motion, MotionFilm, SceneState, previous_positions, project
+from drgs_blender.render.film.motion_vectors import motion as motion_of
+from drgs_blender.render.gbuffer.gbuffer import GBuffer, compact
+from drgs_blender.render.shading_points import CATCHER
 
 H, W = 48, 64
 PITCH = 1e-3  # metres a pixel
@@ -383,3 +387,85 @@ def test_light_passes_stay_a_sum_and_gather_alike() -> None:
             out[split], history[split] = denoise_next(s, history[split], split)
     assert np.allclose(out[True][:, :, 0] + out[True][:, :, 1], out[False][:, :, 0], rtol=1e-4)
     assert np.allclose(out[True][:, :, 1], 0.25 * out[True][:, :, 0], rtol=1e-4)
+
+
+# --- light that is kept ---------------------------------------------------------------------------------------------
+
+
+def seen_by(guides: Guides) -> GBuffer:
+    """The guides' surfaces as a picture with one sample a pixel."""
+    buffer = compact(np.ones((H, W, 1), np.float32), parameters(), 0, 0)
+    buffer.position[:], buffer.points.normal[:] = guides.position.reshape(-1, 3), guides.normal.reshape(-1, 3)
+    buffer.object_index[:] = guides.object.reshape(-1)
+    return buffer
+
+
+def traced(guides: Guides, before: Guides, turn: int = 0, pixels: float = 0.0) -> np.ndarray:
+    """(H, W) bool: pixels that get light of their own, the view having gone `pixels` to the left since `before`."""
+    matrix = camera().matrix_world.copy()
+    matrix[0, 3] = pixels * PITCH  # where it was
+    cameras = parameters(), parameters(matrix_world=matrix)
+    numbers = np.arange(2, dtype=np.int32)
+    return to_trace(seen_by(guides), numbers, signal_of(before), cameras, turn, (0, 0, W)).reshape(H, W)
+
+
+def signal_of(guides: Guides) -> Signal:
+    noisy = picture(guides, 0.5, 0.1, 1)
+    return prepare(noisy.components, noisy.variance, noisy.guides)
+
+
+def test_every_second_pixel_keeps_its_light_and_the_others_the_next_time() -> None:
+    chess = np.indices((H, W)).sum(axis=0) % 2 == 0
+    np.testing.assert_array_equal(traced(wall(), wall()), chess)
+    np.testing.assert_array_equal(traced(wall(), wall(), turn=7), ~chess)
+
+
+def test_what_comes_into_view_is_traced() -> None:
+    """At the border of the picture, and behind what stood before it."""
+    chess = np.indices((H, W)).sum(axis=0) % 2 == 0
+    found = traced(wall(), wall(), pixels=6.0)
+    assert found[:, :6].all()
+    np.testing.assert_array_equal(found[:, 6:], chess[:, 6:])
+    uncovered = traced(wall(), wall(box=True))
+    box = wall(box=True).object != 0
+    assert uncovered[box].all()
+    np.testing.assert_array_equal(uncovered[~box], chess[~box])
+    other = wall()._replace(object=np.where(box, 1.0, 0.0).astype(np.float32))  # on the wall itself
+    np.testing.assert_array_equal(traced(wall(), other), chess | box)
+
+
+def test_surfaces_in_two_layers_and_catchers_are_traced() -> None:
+    buffer = seen_by(wall())
+    buffer.points.flags[1] = CATCHER
+    buffer.points.pixel[4] = 3  # two points of one pixel
+    cameras = parameters(), parameters()
+    found = to_trace(buffer, np.zeros(1, np.int32), signal_of(wall()), cameras, 0, (0, 0, W))
+    assert found[[1, 3, 4]].all()
+    assert not found[5]
+
+
+def test_pixels_without_light_of_their_own_find_their_past() -> None:
+    """Whoever is not traced is found again by the filter, wherever the view goes."""
+    for pixels in (0.3, 0.5, 2.49, 2.51):
+        before, now = wall(), wall()
+        chosen = traced(now, before, pixels=pixels)
+        matrix = camera().matrix_world.copy()
+        matrix[0, 3] = pixels * PITCH
+        motion = motion_of(
+            now.position, now.position.copy(), now.coverage, parameters(), parameters(matrix_world=matrix)
+        )
+        noisy = picture(now, 0.5, 0.0, 2, motion)
+        noisy.components[~chosen] = np.nan
+        out, signal = denoise_next(noisy, signal_of(before), turned=True)
+        assert np.isfinite(out).all()
+        known = signal.guide[:, SOURCE, PAD:-PAD]
+        assert (known == now.object).all(), pixels
+        assert abs(out[:, :, 0].sum() / picture(now, 0.5, 0.0, 2).components[:, :, 0].sum() - 1.0) < 0.03
+
+
+def test_fewer_taps_keep_a_constant_and_edges() -> None:
+    guides = wall(box=True)
+    value = np.where(guides.object != 0, 3.0, 0.5)
+    before = denoise_next(picture(guides, value, 0.0, 1), None)[1]
+    out, _ = denoise_next(picture(guides, value, 0.0, 2, still(guides)), before, turned=True)
+    np.testing.assert_allclose(out, picture(guides, value, 0.0, 2).components, rtol=1e-4, atol=1e-6)

@@ -54,6 +54,8 @@ SIGMA_LUMINANCE, SIGMA_DECAY = 2.4, 0.8
 #: Distances from the tangent plane that count, in pixel widths per pixel of distance on the screen.
 SIGMA_PLANE = 1.0
 SIGMA_ROUGHNESS = 0.1
+#: B-splines: of the paper, and the next narrower one.
+TAPS, FEW_TAPS = np.array([1, 4, 6, 4, 1], np.float32) / 16, np.array([1, 2, 1], np.float32) / 4
 NORMAL_POWER, ROUGH_NORMAL_POWER = 128.0, 32.0
 FIREFLY = 3.0
 
@@ -104,8 +106,14 @@ def _clamped(signal: Signal) -> Signal:
     return Signal(signal.guide, clamped, signal.spans)
 
 
-def smooth(signal: Signal, check: Callable[[], None] = lambda: None, spare: Array | None = None) -> Signal:
-    """All levels of the a-trous filter.
+def smooth(
+    signal: Signal,
+    check: Callable[[], None] = lambda: None,
+    spare: Array | None = None,
+    levels: int = LEVELS,
+    taps: Array = TAPS,
+) -> Signal:
+    """The levels of the a-trous filter.
 
     Parameters
     ----------
@@ -114,13 +122,17 @@ def smooth(signal: Signal, check: Callable[[], None] = lambda: None, spare: Arra
         As of `denoise`.
     spare : array, optional
         Light of another signal with the same guide. It and that of `signal` are then overwritten; else neither is.
+    levels : int
+        `LEVELS` at most.
+    taps : array
+        `TAPS` or `FEW_TAPS`, of each level along each axis.
     """
     light = signal.light
     out, other = (np.zeros_like(light), np.zeros_like(light)) if spare is None else (spare, light)
-    for level in range(LEVELS):
+    for level in range(levels):
         check()
         over_range(_weigh, len(light), sigma_of(level), signal.guide, signal.spans, light, fewest=ROWS)
-        over_range(_a_trous, len(light), 1 << level, signal.guide, signal.spans, light, out, fewest=ROWS)
+        over_range(_a_trous, len(light), 1 << level, taps, signal.guide, signal.spans, light, out, fewest=ROWS)
         light, out, other = out, other, out
     return Signal(signal.guide, light, signal.spans)
 
@@ -242,10 +254,10 @@ def _weigh(y0, y1, sigma, guide, spans, light):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _a_trous(y0, y1, step, guide, spans, light, out):  # type: ignore[no-untyped-def]
-    """One level: 5 x 5 B-spline taps `step` pixels apart."""
+def _a_trous(y0, y1, step, taps, guide, spans, light, out):  # type: ignore[no-untyped-def]
+    """One level: B-spline `taps`, 5 or 3 along each axis, `step` pixels apart."""
     h, planes = light.shape[:2]
-    taps = (np.float32(0.0625), np.float32(0.25), np.float32(0.375), np.float32(0.25), np.float32(0.0625))
+    radius = len(taps) // 2
     zero, one = np.float32(0.0), np.float32(1.0)
     diffuse_power = np.float32(ROUGH_NORMAL_POWER)
     power_slope = np.float32(ROUGH_NORMAL_POWER - NORMAL_POWER)
@@ -271,21 +283,23 @@ def _a_trous(y0, y1, step, guide, spans, light, out):  # type: ignore[no-untyped
             for k in range(2 + planes):
                 for i in range(n):
                     sums[k, i] = zero
-            for dy in range(5):
-                yy = y + (dy - 2) * step
+            for dy in range(len(taps)):
+                yy = y + (dy - radius) * step
                 if yy < 0 or yy >= h or spans[yy, 0] >= spans[yy, 1]:
                     continue
-                start, reach = x0 - 2 * step, n + 4 * step
+                start, reach = x0 - radius * step, n + 2 * radius * step
                 for k in range(SURFACE):
                     for i in range(reach):
                         near[k, i] = guide[yy, k, start + i]
                 for k in range(planes):
                     for i in range(reach):
                         near[SURFACE + k, i] = light[yy, k, start + i]
-                for dx in range(5):
+                for dx in range(len(taps)):
                     kernel = taps[dy] * taps[dx]
                     off = np.uint64(dx * step)
-                    far = one / (np.float32(SIGMA_PLANE) * np.float32(max(1, step * max(abs(dy - 2), abs(dx - 2)))))
+                    far = one / (
+                        np.float32(SIGMA_PLANE) * np.float32(max(1, step * max(abs(dy - radius), abs(dx - radius))))
+                    )
                     for i in range(np.uint64(n)):
                         j = i + off
                         nx, ny, nz = own[NORMAL, i], own[NORMAL + 1, i], own[NORMAL + 2, i]

@@ -25,6 +25,7 @@ from ...compute.threads import ROWS, over_range
 from ..film.motion_vectors import Motion, SceneState
 from ..sampling import ONE, ZERO, F
 from .demodulation import (
+    LEVELS,
     LIGHT,
     LUMINANCE,
     NORMAL,
@@ -39,13 +40,15 @@ from .demodulation import (
     Signal,
     modulate,
 )
-from .svgf_spatial import prepare, smooth
+from .svgf_spatial import FEW_TAPS, TAPS, prepare, smooth
 
 Array = np.ndarray
 
 #: Least weight of the present where anything moves, diffuse and glossy, since small changes hide in the noise. Glossy
 #: reflections do not even move with the surface.
 LEAST_GAIN = (0.2, 0.6)
+#: Levels of the spatial filter where only the camera moves: the past has averaged enough.
+TURNED_LEVELS = 3
 #: Distance from the tangent plane, in pixel widths, up to which a pixel of another frame shows the same surface.
 SAME_PLANE = 2.0
 #: Cosine of the angle by which its normal may differ; surfaces turn between frames.
@@ -81,11 +84,17 @@ class History:
         The scene as it was in that picture.
     still : bool
         Nothing has changed since then, save the noise.
+    turned : bool
+        Nothing but the camera, and the noise.
+    pictures : int
+        How many have gone into it.
     """
 
     signal: Signal | None = None
     scene_state: SceneState | None = None
     still: bool = False
+    turned: bool = False
+    pictures: int = 0
 
 
 def denoise_next(
@@ -94,6 +103,7 @@ def denoise_next(
     split: bool = True,
     still: bool = False,
     check: Callable[[], None] = lambda: None,
+    turned: bool = False,
 ) -> tuple[Array, Signal]:
     """Denoise a picture with the help of those before it.
 
@@ -109,6 +119,8 @@ def denoise_next(
         See `svgf_spatial.denoise`; a history made with another `split` or size is not used.
     check : callable
         See `svgf_spatial.denoise`.
+    turned : bool
+        Nothing in the scene has changed since then but the camera: fewer levels of the spatial filter are enough.
 
     Returns
     -------
@@ -118,9 +130,12 @@ def denoise_next(
     signal = prepare(picture.components, picture.variance, picture.guides, split)
     check()
     past = None if history is None else history.to_cpu()
+    levels, taps = LEVELS, TAPS
     if past is not None and picture.motion is not None and past.light.shape == signal.light.shape:
         signal = accumulate(past, signal, picture.motion, still)
-    return modulate(smooth(signal, check), picture.guides), signal
+        if turned:
+            levels, taps = TURNED_LEVELS, FEW_TAPS
+    return modulate(smooth(signal, check, levels=levels, taps=taps), picture.guides), signal
 
 
 def least_gain(still: bool) -> Array:

@@ -41,6 +41,7 @@ Array = np.ndarray
 EMPTY_DEPTH = 1e10
 #: Samples of one pixel within this many pixel widths of depth are of one surface (a slope of 83 degrees).
 SAME_SURFACE = 8.0
+_NUMBERS = {"IndexOB": "pass_index", "Object": "name"}
 #: Coverage that is only the rounding of a sum.
 _ROUNDING = np.float32(1e-4)
 
@@ -225,9 +226,8 @@ class Film:
             "Roughness": seen.roughness,
             "Metallic": seen.metallic,
             "Coverage": seen.coverage,
-            "IndexOB": self._number("pass_index"),
-            "Object": self._number("name"),
         }
+        scalars |= {name: self._number(kind) for name, kind in _NUMBERS.items() if name in names}
         made |= {name: values[..., None] for name, values in scalars.items()}
         if "Combined" in names:
             made["Combined"] = self._beauty(light, made["Env"], shadow)
@@ -242,6 +242,8 @@ class Film:
 
     def _shadow(self) -> Array:
         """(h, w) float32 in [0, 1]: how dense the shadows on catchers are."""
+        if not self.pixels.catcher.any():
+            return np.zeros_like(self.pixels.coverage)
         _, light, unshadowed = np.moveaxis(self.pixels.catcher, 2, 0)
         return np.where(unshadowed > 0, np.clip(1 - light / np.where(unshadowed > 0, unshadowed, 1), 0, 1), 0)
 

@@ -112,10 +112,12 @@ class WarpRenderBackend(RenderBackend):
         )
 
     def denoise_next(
-        self, picture: NoisyPicture, history: Signal | None, split: bool, still: bool, check: Callable[[], None]
-    ) -> tuple[Array, Signal]:
+        self, picture: NoisyPicture, history: Signal | None, split: bool, still: bool, check: Callable[[], None],
+        turned: bool = False,
+    ) -> tuple[Array, Signal]:  # fmt: skip
+        # A card does all levels whatever moves: they take it little time.
         on_cpu, given = super().denoise_next, (picture, history, split, still, check)
-        return self.with_fallback(lambda: denoise(self.launcher, *given), lambda: on_cpu(*given))
+        return self.with_fallback(lambda: denoise(self.launcher, *given), lambda: on_cpu(*given, turned))
 
     def with_fallback(self, on_device: Callable[[], T], on_cpu: Callable[[], T]) -> T:
         """The result of `on_device`, or that of `on_cpu` once the device has failed."""
