@@ -518,3 +518,35 @@ def test_a_camera_that_looks_away_sees_nothing_of_the_hull():
     hull = Hull(cv2, views, masks, ObjectBox(MIDDLE - 0.2, MIDDLE + 0.2, np.zeros((0, 3))))
     found = check_masks(cv2, views, masks, hull)
     assert found[3].outside == 1.0 and found[3].wrong
+
+
+def beside(view: MaskView, true: np.ndarray) -> np.ndarray:
+    """The ground around the foot of the ball, as far as it is seen."""
+    away = np.linalg.norm(np.nan_to_num(view.on_ground(), nan=9.0) - MIDDLE[:2], axis=-1)
+    return (away < 1.2 * RADIUS) & ~true
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_ground_that_a_mask_took_for_the_foot_of_the_object_is_told_by_neighbouring_photographs(cv2, plain):
+    """Of a plain ground nothing tells it, and the mask stays."""
+    from drgs_blender.capture.masks.ground_contact import shows_ground
+
+    views, true = scene(16)
+    noise = np.random.default_rng(0)
+    for view in views:
+        pixels = np.where(plain, 150, view.pixels) + noise.normal(0, 3, view.pixels.shape)
+        view.pixels[:] = np.clip(pixels, 0, 255)
+    box = ObjectBox(MIDDLE - 1.3 * RADIUS, MIDDLE + 1.3 * RADIUS, np.zeros((0, 3)))
+    told, taken, wrong, kept = 0, 0, 0, 0
+    for k, (view, mask) in enumerate(zip(views, true, strict=True)):
+        extra = beside(view, mask)
+        low = np.full(view.shape, 0.01, np.float32)  # all of it may be ground, the ball too
+        found = shows_ground(cv2, views, k, mask | extra, low, box) > 0.5
+        assert not found[~(mask | extra)].any()
+        told, taken = told + (found & extra).sum(), taken + extra.sum()
+        wrong, kept = wrong + (found & mask).sum(), kept + mask.sum()
+        assert not shows_ground(cv2, [view], 0, mask | extra, low, box).any()
+        high = shows_ground(cv2, views, k, mask | extra, 10 * low, box)
+        assert not high.any()  # what is learned high above it is no ground
+    assert taken > 500 and wrong < 0.03 * kept
+    assert told < 0.03 * taken if plain else told > 0.5 * taken

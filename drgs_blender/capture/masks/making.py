@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,13 @@ from ...compute.prepare import PHASE, prepare_kernels
 from ...core.arrays import Array
 from ...reconstruct.model.gaussians import Gaussians
 from ..features import Tell
+from .ground_contact import shows_ground
 from .hull import Hull
 from .hull_check import Fit
 from .learned_scene import Effort, learn_scene
 from .mask_view import MaskView
 from .object_box import ObjectBox, find_box
-from .object_surfels import Cut, box_around, cut_object, share_of_object
+from .object_surfels import Cut, box_around, cut_object, height_of_object, share_of_object
 from .settling import REMEDY, settle
 
 logger = logging.getLogger(__name__)
@@ -54,6 +55,8 @@ class Found:
         Of the masks.
     scene, cut, box : Gaussians, Cut, ObjectBox
         What is learned, what of it is the object, and where that is.
+    photographed : list of MaskView
+        The parts in the size at which they were photographed, at most that of masks.
     """
 
     windows: dict[int, tuple[int, int, int, int]]
@@ -63,6 +66,7 @@ class Found:
     scene: Gaussians
     cut: Cut
     box: ObjectBox
+    photographed: list[MaskView] = field(default_factory=list)
 
     def whole(self, view: int, shape: tuple[int, int], size: tuple[int, int]) -> Array:
         """(h, w) uint8: the mask of a whole picture of `size` (w, h), whose view has the `shape` (h, w)."""
@@ -75,7 +79,10 @@ class Found:
         window, shape = self.box.window(view), view.shape
         if window is None:
             return np.zeros(shape, np.uint8)
-        return _drawn(_mask_of(cv2, view.cropped(window, PART), self.scene, self.cut), window, shape, shape[::-1])
+        mask = _mask_of(cv2, view.cropped(window, PART), self.scene, self.cut)
+        views = [_as_photographed(view, window), *self.photographed]
+        mask = _without_ground(cv2, views, 0, mask, self.scene, self.cut, self.box)
+        return _drawn(mask, window, shape, shape[::-1])
 
 
 def _drawn(mask: Array, window: tuple[int, int, int, int], shape: tuple[int, int], size: tuple[int, int]) -> Array:
@@ -93,6 +100,24 @@ def _mask_of(cv2: Any, part: MaskView, scene: Gaussians, cut: Cut) -> Array:
     """(h, w) bool: the pixels of a part of a photograph of which the object covers more than half."""
     camera = part.pinhole(PART)
     return without_specks(part.distorted(cv2, camera, share_of_object(scene, cut, camera)) > 0.5)
+
+
+def _as_photographed(view: MaskView, window: tuple[int, int, int, int]) -> MaskView:
+    left, top, right, bottom = window
+    return view.cropped(window, min(PART, max(right - left, bottom - top)))
+
+
+def _without_ground(cv2: Any, views: Sequence[MaskView], which: int, mask: Array, scene: Gaussians, cut: Cut,
+                    box: ObjectBox) -> Array:  # fmt: skip
+    """The mask of one of the views, of any size, without what `shows_ground` of its foot."""
+    view = views[which]
+    camera = view.pinhole(max(view.shape))
+    height = view.distorted(cv2, camera, height_of_object(scene, cut, camera))
+    inside = cv2.resize(mask.astype(np.float32), view.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5
+    ground = shows_ground(cv2, views, which, inside, height, box)
+    if not ground.any():
+        return mask
+    return without_specks(mask & (cv2.resize(ground, mask.shape[::-1], interpolation=cv2.INTER_LINEAR) <= 0.5))
 
 
 class NoMasks(Exception):
@@ -180,9 +205,11 @@ def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
             raise NoMasks("no object is found on the ground")
         box, object_surfels = box_around(scene, cut, box.points), scene.select(np.flatnonzero(cut.surfels))
     masks = [_mask_of(cv2, part, scene, cut) for part in parts]
+    shown = [_as_photographed(views[k], window) for k, window in windows.items()]
+    masks = [_without_ground(cv2, shown, k, mask, scene, cut, box) for k, mask in enumerate(masks)]
     if not any(mask.any() for mask in masks):
         raise NoMasks("what is learned of the object covers half of no pixel")
-    return Found(windows, parts, masks, Hull(cv2, parts, masks, box), scene, cut, box)
+    return Found(windows, parts, masks, Hull(cv2, parts, masks, box), scene, cut, box, shown)
 
 
 def without_specks(mask: Array) -> Array:

@@ -140,9 +140,26 @@ def share_of_object(scene: Gaussians, cut: Cut, camera: Camera) -> Array:
     cut : Cut
     camera : Camera
     """
+    return _seen(scene, torch.from_numpy(cut.surfels.astype(np.float32))[:, None], camera)[..., 0].copy()
+
+
+def height_of_object(scene: Gaussians, cut: Cut, camera: Camera) -> Array:
+    """(h, w) float32: the mean height above z = 0 of what `share_of_object` counts; 0 where that is nothing.
+
+    Parameters
+    ----------
+    scene : Gaussians
+    cut : Cut
+    camera : Camera
+    """
+    label_of = torch.from_numpy(cut.surfels.astype(np.float32))
+    seen = _seen(scene, torch.stack([label_of, label_of * scene.centres().detach()[:, 2]], dim=1), camera)
+    return seen[..., 1] / np.maximum(seen[..., 0], 1e-6)
+
+
+def _seen(scene: Gaussians, features: torch.Tensor, camera: Camera) -> Array:
+    """(h, w, k) float32: features (n, k) of surfels as a camera sees them."""
     eye = np.asarray(camera.matrix_world)[:3, 3]
     with torch.no_grad():
         u, v, opacity, _ = scene.backend.attributes(scene.parameters, scene.centres(), eye, 0, False)
-        label_of = torch.from_numpy(cut.surfels.astype(np.float32))[:, None]
-        maps = scene.backend.rasterise(scene.centres(), u, v, opacity, label_of, camera)
-    return maps.features.numpy()[..., 0].copy()
+        return np.asarray(scene.backend.rasterise(scene.centres(), u, v, opacity, features, camera).features.numpy())
