@@ -25,9 +25,11 @@ log = logging.getLogger("drgs")
 
 #: Side of the pixels beyond which a picture is refined before it is blurred.
 _SHARP_UNTIL = 4
-#: Seconds after a move until all surfels are drawn, where a picture has fewer; until anything is refined: what is begun
-#: between two moves of the mouse is never seen, and to end it half way delays the next picture.
-REST_SECONDS, PAUSE_SECONDS = 0.15, 0.04
+#: Seconds after a move until all surfels are drawn, where a picture has fewer.
+REST_SECONDS = 0.15
+#: Moves that follow each other within these seconds are taken for one that goes on. Nothing is refined then for twice
+#: the time between the last two: it would not be seen, takes processors from Blender, and delays the next picture.
+PAUSE_SECONDS = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,7 @@ class _View:
     request: Request
     submitted: float
     moved: float  # when the latest request came
+    interval: float = 0.0  # seconds between the last two
     begun: bool = False
     fraction: float = 0.0
     picture: Picture | None = None
@@ -101,7 +104,8 @@ class Worker:
                 view = self._views[name] = _View(name, request, time.perf_counter(), 0.0)
             elif view.begun:
                 view.submitted = time.perf_counter()
-            view.moved = time.perf_counter()
+            now = time.perf_counter()
+            view.moved, view.interval = now, now - view.moved
             view.request, view.begun, view.fraction, view.error = request, False, 0.0, ""
             view.pixel, view.mean = 0.0, None
             if self._thread is None:
@@ -175,7 +179,7 @@ class Worker:
         while True:
             with self._changed:
                 while (view := self._next()) is None and not self._ending:
-                    self._changed.wait(None if self._held or not self._unrested() else PAUSE_SECONDS / 4)
+                    self._changed.wait(None if self._held or not self._unrested() else PAUSE_SECONDS / 8)
                 if self._ending or view is None:
                     return
                 request, first, submitted = view.request, not view.begun, view.submitted
@@ -243,7 +247,8 @@ class Worker:
         now = time.perf_counter()
 
         def rest(view: _View) -> float:
-            return REST_SECONDS if view.many and view.fraction == 0.0 else PAUSE_SECONDS
+            pause = 2.0 * view.interval if view.interval < PAUSE_SECONDS else 0.0
+            return max(REST_SECONDS, pause) if view.many and view.fraction == 0.0 else pause
 
         return [v for v in self._views.values() if v.begun and _unfinished(v) and v.moved > now - rest(v)]
 
