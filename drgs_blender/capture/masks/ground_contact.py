@@ -25,8 +25,9 @@ _ABOVE = (0.02, 0.03, 0.04, 0.055, 0.07, 0.09, 0.12, 0.16)
 _NEAR, _BEST = 6, 3
 #: Pixels of a side over which differences are averaged, and by which photographs are blurred before.
 _WINDOW, _BLUR = 5, 0.7
-#: Difference at the ground, of 255, up to which photographs agree; part of the least one above it that it may be.
-_AGREE, _CLEARLY = 8.0, 0.95
+#: Difference at the ground, of 255, up to which photographs agree; part of the least one above it that it may be then,
+#: and where they agree less, as by noise.
+_AGREE, _BETTER, _CLEARLY = 8.0, 0.95, 0.75
 
 
 def shows_ground(cv2: Any, views: Sequence[MaskView], which: int, mask: Array, height: Array, box: ObjectBox) -> Array:
@@ -78,7 +79,7 @@ def shows_ground(cv2: Any, views: Sequence[MaskView], which: int, mask: Array, h
 
     at_ground = difference(0.0)
     above = np.min([difference(part * size) for part in _ABOVE], axis=0)
-    is_ground = asked[part] & (at_ground < _AGREE) & (at_ground < _CLEARLY * above)
+    is_ground = asked[part] & (at_ground < np.where(at_ground < _AGREE, _BETTER, _CLEARLY) * above)
     shown[part] = cv2.boxFilter(is_ground.astype(np.float32), -1, (3, 3))
     return shown
 
