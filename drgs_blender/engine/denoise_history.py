@@ -88,7 +88,8 @@ class Histories:
         )
         turned = not still and len(situation) == len(old.situation)
         turned = turned and all(a is b for a, b in zip(situation[1:], old.situation[1:]))
-        history = History(old.history.signal, scene_state, still, turned, old.pictures)
+        ages = old.history.ages if turned else None
+        history = History(old.history.signal, scene_state, still, turned, old.pictures, ages)
         return Sequence(history, old.past, fit, situation, old.pictures)
 
     def store(self, frame: Frame, sequence: Sequence, prepared: PreparedScene) -> None:

@@ -132,6 +132,7 @@ def render(
     kept = None
     if history is not None and history.signal is not None and history.turned and keeps_light(frame, backend):
         kept = history.signal.to_cpu()
+    ages = np.zeros((bottom - top, right - left), np.uint8)
 
     def needed(buffer: GBuffer) -> Array | None:
         """Which points to trace, None for all; the others keep the light of the picture before."""
@@ -140,7 +141,8 @@ def render(
         if kept.light.shape[::2] != (bottom - top, right - left + 2 * PAD):
             return None
         cameras, corner = (parameters, past.parameters), (left, top, camera.width)
-        return to_trace(buffer, numbers.name, kept, cameras, history.pictures, corner)
+        before = np.zeros_like(ages) if history.ages is None else history.ages
+        return to_trace(buffer, numbers.name, kept, cameras, history.pictures, corner, (before, ages))
 
     def draw_strips() -> None:
         """Fill the films; what this takes, the splats above all, is given back before the light is denoised."""
@@ -181,7 +183,7 @@ def render(
         )
     report(1.0, "Done")
     if history is not None:
-        history.signal = signal
+        history.signal, history.ages = signal, None if kept is None else ages
     before, after = motions[:2]
     made = {name: values for matte in mattes for name, values in matte.passes().items()}
     made |= surfaces.passes()

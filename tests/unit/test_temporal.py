@@ -9,7 +9,7 @@ from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.frame import Camera, RenderSettings
 from drgs_blender.render.camera import camera_parameters, camera_ray
 from drgs_blender.render.denoise.demodulation import LIGHT, PAD, SOURCE, Signal
-from drgs_blender.render.denoise.kept_light import to_trace
+from drgs_blender.render.denoise.kept_light import SETTLED, to_trace
 from drgs_blender.render.denoise.svgf_spatial import prepare
 from drgs_blender.render.denoise.svgf_temporal import NoisyPicture, denoise_next
 from drgs_blender.render.denoise.svgf_window import window
@@ -400,13 +400,14 @@ def seen_by(guides: Guides) -> GBuffer:
     return buffer
 
 
-def traced(guides: Guides, before: Guides, turn: int = 0, pixels: float = 0.0) -> np.ndarray:
+def traced(guides: Guides, before: Guides, turn: int = 0, pixels: float = 0.0, age: int = SETTLED) -> np.ndarray:
     """(H, W) bool: pixels that get light of their own, the view having gone `pixels` to the left since `before`."""
     matrix = camera().matrix_world.copy()
     matrix[0, 3] = pixels * PITCH  # where it was
     cameras = parameters(), parameters(matrix_world=matrix)
     numbers = np.arange(2, dtype=np.int32)
-    return to_trace(seen_by(guides), numbers, signal_of(before), cameras, turn, (0, 0, W)).reshape(H, W)
+    given = seen_by(guides), numbers, signal_of(before), cameras, turn, (0, 0, W)
+    return to_trace(*given, (np.full((H, W), age, np.uint8), np.zeros((H, W), np.uint8))).reshape(H, W)
 
 
 def signal_of(guides: Guides) -> Signal:
@@ -434,12 +435,26 @@ def test_what_comes_into_view_is_traced() -> None:
     np.testing.assert_array_equal(traced(wall(), other), chess | box)
 
 
+def test_light_of_few_pictures_is_not_kept() -> None:
+    assert traced(wall(), wall(), age=SETTLED - 1).all()
+    ages = [np.full((H, W), 1, np.uint8), np.zeros((H, W), np.uint8)]
+    shifted = camera().matrix_world.copy()
+    shifted[0, 3] = 6 * PITCH
+    for turn in range(4):  # the view goes on by six pixels with every picture
+        cameras = parameters(), parameters(matrix_world=shifted)
+        to_trace(seen_by(wall()), np.zeros(1, np.int32), signal_of(wall()), cameras, turn, (0, 0, W), tuple(ages))
+        assert (ages[1][:, :6] == 1).all()
+        assert (ages[1][:, -6:] == min(turn + 2, SETTLED)).all()
+        ages.reverse()
+
+
 def test_surfaces_in_two_layers_and_catchers_are_traced() -> None:
     buffer = seen_by(wall())
     buffer.points.flags[1] = CATCHER
     buffer.points.pixel[4] = 3  # two points of one pixel
     cameras = parameters(), parameters()
-    found = to_trace(buffer, np.zeros(1, np.int32), signal_of(wall()), cameras, 0, (0, 0, W))
+    ages = np.full((H, W), SETTLED, np.uint8), np.zeros((H, W), np.uint8)
+    found = to_trace(buffer, np.zeros(1, np.int32), signal_of(wall()), cameras, 0, (0, 0, W), ages)
     assert found[[1, 3, 4]].all()
     assert not found[5]
 

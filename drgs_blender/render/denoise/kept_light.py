@@ -2,7 +2,8 @@
 
 While only the camera moves, light on surfaces stays, but for reflections. Then a picture traces the pixels that have
 just come into view, and of the others every second one, as the white squares of a chessboard; the next picture traces
-the black ones. The rest have no light of their own, NaN, and `svgf_temporal` gives them their past.
+the black ones. The rest have no light of their own, NaN, and `svgf_temporal` gives them their past. Light of few
+samples is not kept: a dark one would stay a blotch until the next.
 """
 
 from __future__ import annotations
@@ -22,9 +23,18 @@ from .svgf_temporal import SAME_NORMAL, SAME_PLANE
 
 Array = np.ndarray
 
+#: Pictures that have to go into a pixel's light before it is kept.
+SETTLED = 3
+
 
 def to_trace(
-    buffer: GBuffer, numbers: Array, past: Signal, cameras: tuple[Array, Array], turn: int, corner: tuple[int, int, int]
+    buffer: GBuffer,
+    numbers: Array,
+    past: Signal,
+    cameras: tuple[Array, Array],
+    turn: int,
+    corner: tuple[int, int, int],
+    ages: tuple[Array, Array],
 ) -> Array:
     """Points of a picture with one sample a pixel that need light of their own.
 
@@ -42,6 +52,8 @@ def to_trace(
         Odd for every second picture: which half of the pixels is traced.
     corner : tuple of int
         First column and row of the window, and columns of the whole picture.
+    ages : tuple of (h, w) uint8 array
+        How many pictures have gone into the light of each pixel of the last picture, and of this one, which is written.
 
     Returns
     -------
@@ -50,21 +62,23 @@ def to_trace(
     points = buffer.points
     chosen = np.empty(len(points), np.bool_)
     keys = points.pixel, points.flags, buffer.object_index, buffer.position, points.normal
-    given = keys, plain(numbers), past.guide, cameras, turn % 2, corner
+    given = keys, plain(numbers), past.guide, cameras, turn % 2, corner, ages
     over_range(_choose, len(points), *given, chosen, fewest=ELEMENTS)
     return chosen
 
 
 @njit
-def _choose(first, last, keys, numbers, guide, cameras, turn, corner, out):  # type: ignore[no-untyped-def]
+def _choose(first, last, keys, numbers, guide, cameras, turn, corner, ages, out):  # type: ignore[no-untyped-def]
     pixel, flags, owner, position, normal = keys
     left, top, width = corner
     now, then = cameras
+    before, age = ages
     rows, columns = guide.shape[0], guide.shape[2] - 2 * PAD
     for i in range(first, last):
         out[i] = True
         row, column = pixel[i] // width, pixel[i] % width
-        if (row + column + turn) % 2 == 0 or flags[i] & (CATCHER | SECOND | UNLIT):
+        age[row - top, column - left] = 1
+        if flags[i] & (CATCHER | SECOND | UNLIT):
             continue
         if (i > 0 and pixel[i - 1] == pixel[i]) or (i + 1 < len(pixel) and pixel[i + 1] == pixel[i]):
             continue
@@ -86,4 +100,8 @@ def _choose(first, last, keys, numbers, guide, cameras, turn, corner, out):  # t
             + nz * (position[i, 2] - guide[yy, POSITION + 2, c])
         )
         alike = nx * normal[i, 0] + ny * normal[i, 1] + nz * normal[i, 2]
-        out[i] = not (abs(away) * guide[yy, WIDTH, c] < F(SAME_PLANE) and alike >= SAME_NORMAL)
+        if not (abs(away) * guide[yy, WIDTH, c] < F(SAME_PLANE) and alike >= SAME_NORMAL):
+            continue
+        known = before[yy, c - PAD]
+        out[i] = (row + column + turn) % 2 == 0 or known < SETTLED
+        age[row - top, column - left] = min(known + 1, SETTLED)

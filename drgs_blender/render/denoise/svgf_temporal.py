@@ -88,6 +88,8 @@ class History:
         Nothing but the camera, and the noise.
     pictures : int
         How many have gone into it.
+    ages : (h, w) uint8 array, optional
+        How many into each pixel, see `kept_light.to_trace`; None: not known.
     """
 
     signal: Signal | None = None
@@ -95,6 +97,7 @@ class History:
     still: bool = False
     turned: bool = False
     pictures: int = 0
+    ages: Array | None = None
 
 
 def denoise_next(
