@@ -1,6 +1,6 @@
 """What light costs: time to equal quality against Cycles and Mitsuba, what makes the time, and what it buys.
 
-python bench/bench_light.py [--part equal-psnr mitsuba denoised relmse cost efficiency cases ablation] [--size 200] ...
+python bench/bench_light.py [--part equal-psnr mitsuba denoised relmse cost memory efficiency cases ablation] ...
 
 Each part writes its own section. Everything runs on two processors, as far as the system allows that to be set.
 """
@@ -25,6 +25,7 @@ PARTS = {
     "denoised": ("Light: time to equal PSNR, denoised", light_renderers.denoised),
     "relmse": ("Light: relative error at 32 samples", light_renderers.relative_error),
     "cost": ("Light: what makes the time", light_cost.cost),
+    "memory": ("Light: memory of a large frame", light_cost.memory),
     "efficiency": ("Light: what denoiser, MIS and mesh bring", light_efficiency.efficiency),
     "cases": ("Light: noise of single cases", light_variance.variance),
     "ablation": ("Light: inter-reflection, shadows and reflections", light_ablation.ablation),

@@ -1,14 +1,23 @@
-"""The memory that this process may use: that of the machine, or of a container (a cgroup of Linux), if that is less."""
+"""The memory that this process may use: that of the machine, or of a container (a cgroup of Linux), if that is less.
+
+And arrays that take no more of it than is written.
+"""
 
 from __future__ import annotations
 
+import math
+import mmap
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+
 _ROOT = Path("/")
+#: Bytes from which on NumPy asks for huge pages.
+_LARGE = 1 << 22
 
 
 def total_memory(root: Path = _ROOT) -> float:
@@ -60,6 +69,30 @@ def give_back() -> None:
 
         with suppress(OSError, AttributeError):  # another C library
             ctypes.CDLL(None).malloc_trim(0)
+
+
+def sparse_zeros(shape: tuple[int, ...]) -> np.ndarray:
+    """Zeros, of which on Linux only those parts take memory that are written, and all of it goes back when they go.
+
+    NumPy asks for huge pages of 2 MiB for large arrays: who writes a part of each row of a picture takes memory for all
+    of it. Here pages have the usual size, whose first write costs more time.
+
+    Parameters
+    ----------
+    shape : tuple of int
+
+    Returns
+    -------
+    float32 array
+    """
+    size = 4 * math.prod(shape)
+    if sys.platform == "linux" and size >= _LARGE:
+        with suppress(OSError):  # none left: NumPy says so in its own way
+            pages = mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+            with suppress(OSError):  # a kernel without huge pages
+                pages.madvise(mmap.MADV_NOHUGEPAGE)
+            return np.frombuffer(pages, np.float32).reshape(shape)
+    return np.zeros(shape, np.float32)
 
 
 def _windows() -> tuple[float, float]:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .memory import sparse_zeros
+
 Array = np.ndarray
 
 #: Rows that are divided by a colour at a time.
@@ -132,13 +134,14 @@ def with_colours(names: tuple[str, ...]) -> tuple[str, ...]:
 
 def without_colour(light: Array, colour: Array) -> Array:
     """(h, w, 3) float32 `light` / `colour`; where a channel has none, the mean of the others, as in Cycles."""
-    made = np.zeros(light.shape, np.float32)
+    made = sparse_zeros(light.shape)
     for first in range(0, len(light), _ROWS):  # what is computed on the way takes more memory than the pass
-        rows = slice(first, first + _ROWS)
-        if not light[rows].any():
+        columns = np.flatnonzero(light[first : first + _ROWS].any(axis=(0, 2)))
+        if not len(columns):
             continue
-        known = colour[rows] != 0
-        out = np.where(known, light[rows] / np.where(known, colour[rows], 1), 0)
+        part = slice(first, first + _ROWS), slice(columns[0], columns[-1] + 1)  # the rest takes no memory
+        known = colour[part] != 0
+        out = np.where(known, light[part] / np.where(known, colour[part], 1), 0)
         grey = out.sum(axis=-1, keepdims=True) / np.maximum(known.sum(axis=-1, keepdims=True), 1)
-        made[rows] = np.where(known, out, grey)
+        made[part] = np.where(known, out, grey)
     return made

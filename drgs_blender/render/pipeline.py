@@ -16,6 +16,7 @@ from ..compute.warp.posed_surfels import with_fields
 from ..core.cryptomatte import KINDS
 from ..core.errors import Cancelled, UsageError
 from ..core.frame import Camera, Frame
+from ..core.memory import give_back
 from ..core.passes import BY_NAME, pass_of
 from .backend import CPU, RenderBackend
 from .camera import camera_parameters
@@ -169,6 +170,7 @@ def render(
                     motion.add(buffer, scene)
 
     draw_strips()
+    give_back()
     seen = film.pixels
     motions = [None if motion is None else motion.motion(seen.position, seen.coverage) for motion in moving]
     signal = None

@@ -10,9 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drgs_blender.core.memory import available_memory, give_back, total_memory
+from drgs_blender.core.memory import available_memory, give_back, sparse_zeros, total_memory
 
 GIB = 1 << 30
+
+
+def resident() -> int:
+    """Bytes of this process in memory."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def system(root: Path, free: int, own: str, groups: dict[str, tuple[str, int]]) -> Path:
@@ -63,12 +68,27 @@ def test_of_this_machine():
 
 @pytest.mark.skipif(sys.platform != "linux" or not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="not glibc")
 def test_what_lies_free_between_arrays_in_use_is_given_back():
-    def resident() -> int:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
     parts = [np.ones(96 << 10, np.uint8) for _ in range(400)]
     last = parts.pop()
     before = resident()
     parts.clear()
     give_back()
     assert before - resident() > 30 << 20 and last.all()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere they are NumPy's")
+def test_of_sparse_zeros_only_what_is_written_takes_memory():
+    before = resident()
+    picture = sparse_zeros((2048, 2048, 8))
+    assert picture.dtype == np.float32 and picture.flags.c_contiguous and picture.flags.writeable
+    picture[:, :256] = 1.0  # a part of each row, in each of the huge pages that NumPy would ask for
+    assert picture.nbytes // 10 < resident() - before < picture.nbytes // 6
+    assert picture.sum() == 2048 * 256 * 8
+    del picture
+    assert resident() - before < 4 << 20
+
+
+def test_small_sparse_zeros_are_those_of_numpy():
+    small = sparse_zeros((3, 4))
+    assert small.flags.owndata and small.dtype == np.float32 and not small.any()
+    assert sparse_zeros((0, 3)).shape == (0, 3)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
+import sys
 import time
 import weakref
 
@@ -9,6 +12,7 @@ import numpy as np
 import pytest
 from shapes import look_along_y, scene_of, sphere_mesh, sphere_surfels
 
+from drgs_blender.core import memory
 from drgs_blender.core.asset.model import PosedSurfels
 from drgs_blender.core.errors import Cancelled, UsageError
 from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
@@ -49,6 +53,39 @@ def test_strips_and_batches_do_not_change_a_bit(
         again = pipeline.render(PreparedScene(scene, light, posed), this)
         for name in ALL:
             assert np.array_equal(again[name], whole[name]), (height, name)
+
+
+def pages(array: np.ndarray) -> int:
+    """Bytes of a mapped array that were written or read."""
+    size, library = os.sysconf("SC_PAGE_SIZE"), ctypes.CDLL(None)
+    there = np.zeros(-(-array.nbytes // size), np.uint8)
+    given = ctypes.c_void_p(array.ctypes.data), ctypes.c_size_t(array.nbytes), ctypes.c_void_p(there.ctypes.data)
+    assert library.mincore(*given) == 0
+    return int((there & 1).sum()) * size
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks Linux which pages are there")
+def test_pixels_that_show_nothing_take_no_memory(
+    ball: tuple[TraceScene, PosedSurfels, EnvironmentLight], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A ball that fills a tenth of a picture's height, and passes of it large enough to have pages of their own."""
+    scene, posed, light = ball
+    this = frame(look_along_y(192, focal=30.0), camera_sees="surfels", denoise="svgf")
+    monkeypatch.setattr(pipeline, "strip_height", lambda width, subpixels: 4)
+    monkeypatch.setattr(memory, "_LARGE", 1 << 60)
+    expected = pipeline.render(PreparedScene(scene, light, posed), this)
+    monkeypatch.setattr(memory, "_LARGE", 1 << 14)
+    found = pipeline.render(PreparedScene(scene, light, posed), this)
+    seen = np.flatnonzero(expected["Coverage"].any(axis=(1, 2)))
+    rows = (seen[-1] - seen[0] + 1) / 192
+    assert rows < 0.15
+    for name in ("Normal", "Albedo", "Variance", "UV", "CryptoObject00"):
+        assert 0 < pages(found[name]) <= rows * found[name].nbytes + (1 << 15), name
+    assert 0 < pages(found["DiffDir"]) < found["DiffDir"].nbytes / 2  # made in bands of rows
+    for name in ("TransDir", "CryptoObject01", "CryptoMaterial02"):
+        assert pages(found[name]) == 0, name
+    for name in ALL:
+        assert found[name].tobytes() == expected[name].tobytes(), name
 
 
 def test_what_strips_take_is_given_back_before_light_is_denoised(

@@ -12,6 +12,7 @@ import numpy as np
 
 from ...compute.jit import inlined, njit
 from ...compute.threads import ROWS, over_range
+from ...core.memory import sparse_zeros
 from ..film.guides import Guides
 from ..sampling import ONE, ZERO, F, luminance
 
@@ -57,8 +58,8 @@ class Signal:
 def demodulate(components: Array, variance: Array, guides: Guides, split: bool = True) -> Signal:
     """Divide light by surface colour and coverage; parameters as of `svgf_spatial.denoise`."""
     h, w = guides.coverage.shape
-    guide = np.zeros((h, GUIDES, w + 2 * PAD), np.float32)
-    light = np.zeros((h, planes_of(split), w + 2 * PAD), np.float32)
+    guide = sparse_zeros((h, GUIDES, w + 2 * PAD))
+    light = sparse_zeros((h, planes_of(split), w + 2 * PAD))
     spans = np.zeros((h, 2), np.int32)
     over_range(_demodulate, len(light), components, variance, guides.plain(), guide, light, spans, fewest=ROWS)
     return Signal(guide, light, spans)
@@ -71,7 +72,7 @@ def planes_of(split: bool) -> int:
 
 def modulate(signal: Signal, guides: Guides) -> Array:
     """(h, w, 4, 3) float32: light multiplied by surface colour and coverage again."""
-    out = np.zeros((*guides.coverage.shape, 4, 3), np.float32)
+    out = sparse_zeros((*guides.coverage.shape, 4, 3))
     over_range(_modulate, len(signal.spans), signal.light, signal.spans, guides.plain(), out, fewest=ROWS)
     return out
 

@@ -12,6 +12,7 @@ from ...compute.jit import njit
 from ...compute.threads import ROWS, over_range
 from ...core.cryptomatte import DRGS_MATERIAL, KINDS, identities
 from ...core.frame import Frame
+from ...core.memory import sparse_zeros
 from ..gbuffer.gbuffer import GBuffer
 from ..scene.trace_scene import TraceScene
 from ..shading_points import CATCHER
@@ -32,7 +33,7 @@ class CryptoFilm:
         self._kind, self._scene, self._origin, self._width = kind, scene, (x0, y0), frame.camera.width
         objects = [item.name for item in frame.objects] + [mesh.name for mesh in frame.meshes]
         self._identities = identities(objects if kind == "object" else [*scene.mesh_materials.names, DRGS_MATERIAL])
-        self._passes = [np.zeros((y1 - y0, x1 - x0, 4), np.float32) for _ in range(PASSES_PER_KIND)]
+        self._passes = [sparse_zeros((y1 - y0, x1 - x0, 4)) for _ in range(PASSES_PER_KIND)]
 
     def add(self, buffer: GBuffer) -> None:
         """Take the samples of a strip."""
@@ -47,7 +48,11 @@ class CryptoFilm:
         out = np.zeros((y1 - y0, self._passes[0].shape[1], 2 * PASSES_PER_KIND, 2), np.float32)
         over_range(_rank, y1 - y0, rows, self._identities[owner], out, fewest=ROWS)
         for i, pixels in enumerate(self._passes):
-            pixels[y0 - top : y1 - top] = out[:, :, 2 * i : 2 * i + 2].reshape(*pixels[y0 - top : y1 - top].shape)
+            found = out[:, :, 2 * i : 2 * i + 2].reshape(y1 - y0, -1, 4)
+            columns = np.flatnonzero(found.any(axis=(0, 2)))
+            if len(columns):  # what is not written takes no memory
+                some = slice(columns[0], columns[-1] + 1)
+                pixels[y0 - top : y1 - top, some] = found[:, some]
 
     def passes(self) -> dict[str, Array]:
         """Name -> (h, w, 4) float32."""

@@ -25,6 +25,7 @@ import numpy as np
 from ...compute.jit import njit
 from ...compute.threads import ROWS, over_range
 from ...core.frame import Camera, RenderSettings
+from ...core.memory import sparse_zeros
 from ...core.passes import COLOURS, without_colour
 from ..camera import FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, footprints, sample_ray
 from ..gbuffer.gbuffer import GBuffer
@@ -91,7 +92,7 @@ class Pixels(NamedTuple):
         """Pixels (h, w) that nothing covers."""
         scalars = {"coverage": (), "roughness": (), "metallic": (), "object_row": (), "depth": ()}
         widths = scalars | {"components": (4, 3), "variance": (2,)}
-        made = cls(*(np.zeros((*size, *widths.get(name, (3,))), np.float32) for name in cls._fields))
+        made = cls(*(sparse_zeros((*size, *widths.get(name, (3,)))) for name in cls._fields))
         made.depth[:] = EMPTY_DEPTH
         return made
 
@@ -124,7 +125,7 @@ class Film:
         self.parameters = parameters
         self.round = camera.panorama in ("fisheye", "equisolid")
         self.pixels = Pixels.empty(size)
-        self.environment, self.veiled = (np.zeros((*size, 3), np.float32) for _ in range(2))
+        self.environment, self.veiled = (sparse_zeros((*size, 3)) for _ in range(2))
         self.unlit: Array | None = None
         self.transmitted: Array | None = None
         self._objects: ObjectNumbers | None = None
@@ -245,6 +246,8 @@ class Film:
         if not self.pixels.catcher.any():
             return np.zeros_like(self.pixels.coverage)
         _, light, unshadowed = np.moveaxis(self.pixels.catcher, 2, 0)
+        if not unshadowed.any():
+            return np.zeros(light.shape, np.float32)
         return np.where(unshadowed > 0, np.clip(1 - light / np.where(unshadowed > 0, unshadowed, 1), 0, 1), 0)
 
     def _beauty(self, light: Array, environment: Array, shadow: Array) -> Array:
@@ -304,7 +307,8 @@ def _develop(y0, y1, points, surfaces, light, p, pixels):  # type: ignore[no-unt
                 w = weight[i]
                 total += w
                 for k in range(3):
-                    pixels.emission[y, x, k] += w * surfaces.emission[i, k]
+                    if surfaces.emission[i, k] != zero:  # what is not written takes no memory
+                        pixels.emission[y, x, k] += w * surfaces.emission[i, k]
                 for c in range(4):
                     for k in range(3):
                         pixels.components[y, x, c, k] += w * shone[i, c, k]
@@ -385,7 +389,8 @@ def _background(first, last, p, x0, y0, alpha, envmap, out):  # type: ignore[no-
                     continue
                 r, g, b = _world(p, (y0 + y) * width + x0 + x, k, envmap)
                 red, green, blue = red + left * r, green + left * g, blue + left * b
-            out[y, x, 0], out[y, x, 1], out[y, x, 2] = red, green, blue
+            if red != np.float32(0.0) or green != np.float32(0.0) or blue != np.float32(0.0):
+                out[y, x, 0], out[y, x, 1], out[y, x, 2] = red, green, blue
 
 
 @njit

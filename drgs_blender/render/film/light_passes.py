@@ -29,7 +29,7 @@ def light_parts(light: Array, noisy: Array, transmitted: Array | None, colours: 
     """
     parts = [light[:, :, i] for i in range(4)]
     if transmitted is None or not transmitted.any():
-        return [*parts, np.zeros_like(parts[2]), np.zeros_like(parts[3])]
+        return [*parts, *(np.zeros(parts[2].shape, np.float32) for _ in range(2))]
     through, whole = transmitted, noisy[:, :, 2:]
     if light is not noisy:
         through = light[:, :, 2:] * np.clip(np.where(whole > 0, through / np.where(whole > 0, whole, 1), 0), 0, 1)
@@ -47,10 +47,9 @@ def light_parts(light: Array, noisy: Array, transmitted: Array | None, colours: 
 
 def add_light(light: Array, environment: Array, emission: Array, opaque: Array | np.float32) -> Array:
     """(h, w, 4) float32 Combined of (h, w, 4, 3) light, what is behind it and what surfaces emit."""
-    colour = light[:, :, 0] + light[:, :, 1]
+    out = np.empty((*light.shape[:2], 4), np.float32)
+    colour = np.add(light[:, :, 0], light[:, :, 1], out=out[..., :3])
     for part in (light[:, :, 2], light[:, :, 3], environment, emission):
         colour += part
-    out = np.empty((*light.shape[:2], 4), np.float32)
-    out[..., :3] = colour
     out[..., 3] = opaque
     return out

@@ -17,6 +17,7 @@ import numpy as np
 from ...compute.jit import njit
 from ...compute.threads import ELEMENTS, ROWS, over_range
 from ...core.frame import Frame
+from ...core.memory import sparse_zeros
 from ...core.passes import AOV_VALUE, AOVS, COLOURS, pass_of
 from ..camera import POSITION
 from ..gbuffer.gbuffer import GBuffer
@@ -60,9 +61,7 @@ class SurfaceFilm:
         self._scene, self._frame, self._parameters, self._origin = scene, frame, parameters, (x0, y0)
         self._put_colours = put_colours
         self.pixels = {
-            name: np.zeros((y1 - y0, x1 - x0, channels), np.float32)
-            for name, channels in widths.items()
-            if name in wanted
+            name: sparse_zeros((y1 - y0, x1 - x0, channels)) for name, channels in widths.items() if name in wanted
         }
         self._uvs = scene.mesh_materials.uv_maps() if "UV" in self.pixels else None
 
