@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import bpy
@@ -65,16 +66,20 @@ def add_mesh(name: str, vertices: np.ndarray, faces: list[list[int]], material: 
 
 
 def turned(profile: Sequence[tuple[float, float]], around: int = 64) -> tuple[np.ndarray, list[list[int]]]:
-    """Vertices and faces of a profile (radius, height) turned about the vertical."""
+    """Vertices and faces of a profile (radius, height) turned about the vertical; on it, a ring is one vertex."""
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
-    ring = np.stack([np.cos(angle), np.sin(angle)], -1)
-    vertices = np.concatenate([np.c_[r * ring, np.full(around, z)] for r, z in profile])
-    faces = [
-        [c * around + k, c * around + (k + 1) % around, (c + 1) * around + (k + 1) % around, (c + 1) * around + k]
-        for c in range(len(profile) - 1)
-        for k in range(around)
-    ]
-    return vertices, faces
+    circle = np.stack([np.cos(angle), np.sin(angle)], -1)
+    vertices, rings, count = [], [], 0
+    for radius, height in profile:
+        points = 1 if radius < 1e-9 else around
+        vertices.append(np.c_[radius * circle[:points], np.full(points, height)])
+        rings.append([count + k % points for k in range(around + 1)])
+        count += points
+    faces = []
+    for low, high in pairwise(rings):
+        corners = ([low[k], low[k + 1], high[k + 1], high[k]] for k in range(around))
+        faces += [list(dict.fromkeys(face)) for face in corners]  # three corners beside a pole
+    return np.concatenate(vertices), faces
 
 
 def add_world() -> bpy.types.World:

@@ -11,7 +11,6 @@ scene is taken where nothing changed that it is made of. Frames are always rende
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
 import sys
 from collections.abc import Sequence
@@ -20,63 +19,53 @@ from functools import partial
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tools"))
+sys.path[:0] = [str(ROOT / "tools"), str(ROOT / "examples")]
 
 import environments  # noqa: E402
-from steps import Step, StepFailed, run_steps  # noqa: E402
-
-EXAMPLES = ROOT / "examples"
+from demo_run import (  # noqa: E402
+    DRGS,
+    EXAMPLES,
+    building,
+    check_folder,
+    exit_code,
+    first_steps,
+    for_blender,
+    frame_count,
+    frames_saved,
+    variables,
+)
+from demo_shots import FRAMES  # noqa: E402
+from steps import Step, run_steps  # noqa: E402
 
 
 def steps(out: Path, frames: str) -> list[Step]:
     """All that follows the environments; seconds are those of two processors."""
-    engine, blender = environments.python_of(environments.ENGINE), environments.blender()
-    drgs = [engine, "-m", "drgs_blender.cli.main"]
+    engine, count = environments.python_of(environments.ENGINE), frame_count(frames, FRAMES)
     extension, scene = out / "extension.zip", out / "demo.blend"
-
-    def rendered(line: str) -> tuple[str, float] | None:
-        nonlocal done
-        saved = line.startswith("Saved: ")
-        if not (saved or (line.startswith("Fra:") and ("| Preparing" in line or "| Sample 0/" in line))):
-            return None
-        done += saved
-        return f"Rendering, {done} of {count} frames", done / count
-
-    done, count = 0, _count(frames)
-    building = [environments.python_of(environments.ENGINE), ROOT / "tools/extension.py", "--out", extension]
     pattern = out / "frames" / "####.exr"
     strip = [engine, EXAMPLES / "demo_strip.py", "--out", out / "strip.png"]
-    setting = [blender, "-P", EXAMPLES / "demo_scene.py", extension, scene]
-    of_scene = (EXAMPLES / "captured", extension, EXAMPLES / "demo_scene.py", EXAMPLES / "blender_scenes.py")
-    blenders = () if os.environ.get("DRGS_BLENDER") else (environments.FOR_BLENDER,)
+    setting = [environments.blender(), "-P", EXAMPLES / "demo_scene.py", extension, scene]
+    scripts = (EXAMPLES / name for name in ("demo_scene.py", "demo_shots.py", "blender_scenes.py"))
+    of_scene = (EXAMPLES / "captured", extension, *scripts)
     return [
         # Those of the simulation first; what is not compiled when it is needed is waited for.
         environments.kernels("kernels", "simulate", "frame", "mesh", "lights", "denoise", seconds=45.0),
-        Step("extension", "Building the extension", building, 0.5, (environments.FOR_ENGINE,)),
-        Step("scene", "Setting the scene", setting, 20.0, ("extension", *blenders), scene, of_scene),
+        building(extension),
+        Step("scene", "Setting the scene", setting, 20.0, ("extension", *for_blender()), scene, of_scene),
         Step(
             "frames",
             "Starting Blender",
-            [*drgs, "render", scene, "--frames", frames, "--out", pattern, "--denoise", "svgf", "--overwrite"],
+            [*DRGS, "render", scene, "--frames", frames, "--out", pattern, "--denoise", "svgf", "--overwrite"],
             4.0 + 2.2 * count,
             ("scene",),
-            count=rendered,
+            count=frames_saved("Rendering", count),
             before=partial(shutil.rmtree, out / "frames", ignore_errors=True),
-            measured="rendering",
+            measured=True,
+            title="Rendering",
         ),
         Step("strip", "Making the strip", strip, 6.0, ("kernels",)),
         Step("sheet", "Making the contact sheet", [engine, __file__, "--out", out, "--sheet"], 2.0, ("frames",)),
     ]
-
-
-def _count(frames: str) -> int:
-    """How many frames a range like 1-24x2,30 has."""
-    found: set[int] = set()
-    for part in frames.split(","):
-        span, _, stride = part.partition("x")
-        first, _, last = span.partition("-")
-        found.update(range(int(first), int(last or first) + 1, int(stride or 1)))
-    return max(len(found), 1)
 
 
 def run(out: Path, frames: str, before: Sequence[Step] = ()) -> None:
@@ -87,16 +76,9 @@ def run(out: Path, frames: str, before: Sequence[Step] = ()) -> None:
     StepFailed
     """
     out = out.resolve()
-    settings = {
-        "BLENDER_USER_RESOURCES": str(out / "blender"),
-        "DRGS_ENGINE": str(environments.python_of(environments.ENGINE)),
-        "DRGS_BLENDER": str(environments.blender()),
-        "PYTHONUNBUFFERED": "1",
-    }
-    first = list(before) or [Step(environments.FOR_ENGINE, "", [sys.executable, "-c", ""], 0.1)]
-    if not before and not os.environ.get("DRGS_BLENDER"):
-        first.append(Step(environments.FOR_BLENDER, "", [sys.executable, "-c", ""], 0.1))
-    seconds = run_steps([*first, *steps(out, frames)], out / "log.txt", ROOT, settings)
+    chosen = steps(out, frames)
+    check_folder("--out", out)
+    seconds = run_steps([*first_steps(before), *chosen], out / "log.txt", ROOT, variables(out))
     print(f"Done in {seconds:.0f} s. Look at contact-sheet.png, animation.webp and strip.png in {out}")
 
 
@@ -123,24 +105,13 @@ def main(arguments: Sequence[str] | None = None, before: Sequence[Step] = ()) ->
     """The command line; `before` are steps of whoever calls."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "demo")
-    parser.add_argument("--frames", default="1-24")
+    parser.add_argument("--frames", default=f"1-{FRAMES}")
     parser.add_argument("--sheet", action="store_true", help="only the contact sheet, of the frames that are there")
     options = parser.parse_args(arguments)
-    try:
-        _count(options.frames)
-    except ValueError:
-        parser.error(f"--frames {options.frames} is no range like 1-24, 1-24x2 or 7")
     if options.sheet:
         publish(sorted((options.out / "frames").glob("*.exr")), options.out)
         return 0
-    try:
-        run(options.out, options.frames, before)
-    except StepFailed as failure:
-        print(f"demo: {failure}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
-    return 0
+    return exit_code("demo", "make demo", partial(run, options.out, options.frames, before))
 
 
 if __name__ == "__main__":

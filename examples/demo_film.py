@@ -1,23 +1,26 @@
 """The film of docs/film: photographs, what was learned from them, and what can be done with that.
 
-    .venv/bin/python examples/demo_film.py [--out out/film] [--publish docs/film]
+    .venv/bin/python examples/demo_film.py [--out out/film] [--publish out/film]
 
-Blender makes two scenes, `drgs render` and `drgs denoise` their frames, Pillow the titles, and PyAV film.webm. Frames
-that are there already are not rendered again, so that a film that was interrupted is gone on with.
+Blender makes two scenes, `drgs render` and `drgs denoise` their frames, Pillow the titles, and PyAV film.webm, which
+`make env` installs. Frames that are there already are not rendered again, so that a film that was interrupted is gone
+on with.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import sys
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 ROOT = Path(__file__).resolve().parent.parent
-EXAMPLES, PICTURES = ROOT / "examples", ROOT / "docs" / "film"
+PICTURES = ROOT / "docs" / "film"
 sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 
 import environments  # noqa: E402
@@ -31,6 +34,7 @@ from demo_pictures import (  # noqa: E402
     to_bytes,
     with_alpha,
 )
+from demo_run import DRGS, EXAMPLES, building, check_folder, exit_code, first_steps, frames_saved, variables  # noqa: E402
 from demo_shots import CAPTURED, ROUND, SHOTS, TURN  # noqa: E402
 from steps import Step, StepFailed, run_steps  # noqa: E402
 
@@ -38,6 +42,10 @@ from drgs_blender.core.color import linear_to_srgb  # noqa: E402
 from drgs_blender.render.film.frame_files import read_frame  # noqa: E402
 
 FPS, SIZE = 12, (640, 360)
+#: Pixels of the words and of the space between two (the font's own is filled by a j), and where they stand.
+TEXT, SPACE, CAPTION = 20, 8, (25, SIZE[1] - 20)
+#: Pixels of each of the forty photographs, five rows above the words.
+SIDE = (SIZE[1] - 50) // 5
 #: Said of the parts.
 WORDS = {
     "photographs": "forty photographs of a robot",
@@ -61,31 +69,30 @@ _ALONG, _HOLD, _ZOOM, _DISSOLVE, _END = 20, 12, 14, 6, 36
 
 def steps(out: Path) -> list[Step]:
     """What is rendered, one after another; seconds are those of two processors."""
-    engine = environments.python_of(environments.ENGINE)
-    drgs = [engine, "-m", "drgs_blender.cli.main"]
     extension = out / "extension.zip"
     scene = [environments.blender(), "-P", EXAMPLES / "demo_film_scene.py", extension, out]
     scripts = ("demo_film_scene.py", "demo_shots.py", "demo_scene.py", "blender_scenes.py")
     of_scene = (EXAMPLES / "captured", *(EXAMPLES / name for name in scripts), extension)
-    build = [engine, ROOT / "tools/extension.py", "--out", extension]
     turntable = [
-        *(*drgs, "render", out / "turntable.blend", "--frames", f"1-{TURN}", "--out", out / "turntable" / "####.exr"),
+        *(*DRGS, "render", out / "turntable.blend", "--frames", f"1-{TURN}", "--out", out / "turntable" / "####.exr"),
         *("--denoise", "svgf", "--passes", "Combined,Albedo,Roughness,Normal,Coverage"),
     ]
+    text = "Rendering the turntable"
     found = [
-        Step("extension", "Building the extension", build, 0.5),
+        building(extension),
         Step("scene", "Setting the scenes", scene, 40.0, ("extension",), out / "stage.blend", of_scene),
-        Step("turntable", "Rendering the turntable", turntable, 60.0, ("scene",)),
+        Step("turntable", text, turntable, 60.0, ("scene",), count=frames_saved(text, TURN), measured=True),
     ]
     for name, (first, last) in SHOTS.items():
         span, noisy, clean = f"{first}-{last}", out / "noisy" / "####.exr", out / name / "####.exr"
-        render = [*drgs, "render", out / "stage.blend", "--frames", span, "--out", noisy]
+        render = [*DRGS, "render", out / "stage.blend", "--frames", span, "--out", noisy]
         render += ["--denoise", "none", "--passes", "temporal"]
-        denoise = [*drgs, "denoise", noisy, "--frames", span, "--sequence", span, "--out", clean]
+        denoise = [*DRGS, "denoise", noisy, "--frames", span, "--sequence", span, "--out", clean]
         denoise += ["--passes", "Combined"]
-        count = last - first + 1
-        found.append(Step(name, f"Rendering {name}", render, 2.5 * count, (found[-1].name,)))
-        found.append(Step(f"{name}, denoised", f"Denoising {name}", denoise, 1.0 * count, (name,)))
+        count, text = last - first + 1, f"Rendering {name}"
+        rendering = Step(name, text, render, 2.5 * count, (found[-1].name,), count=frames_saved(text, count))
+        rendering.measured = True
+        found += [rendering, Step(f"{name}, denoised", f"Denoising {name}", denoise, 1.0 * count, (name,))]
     return found
 
 
@@ -117,22 +124,25 @@ def ground() -> np.ndarray:
 
 def titled(picture: np.ndarray, words: str, part: float) -> np.ndarray:
     """The picture with words at the lower left, as visible as `part` says."""
-    sheet = Image.new("L", SIZE)
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(20)
-    draw.text((25, SIZE[1] - 25), words, 110, font, anchor="ls", stroke_width=3)  # a shadow, on light grounds
-    dark = np.asarray(sheet, np.float32)[..., None] / 255 * part
-    sheet.paste(0, (0, 0, *SIZE))
-    draw.text((25, SIZE[1] - 25), words, 255, font, anchor="ls")
-    bright = np.asarray(sheet, np.float32)[..., None] / 255 * part
-    return mix(mix(picture, np.zeros(3), dark), np.asarray(INK) / 255, bright)
+    font = ImageFont.load_default(TEXT)
+
+    def drawn(ink: int, stroke: int) -> np.ndarray:
+        sheet = Image.new("L", SIZE)
+        draw, x = ImageDraw.Draw(sheet), float(CAPTION[0])
+        for word in words.split():
+            draw.text((x, CAPTION[1]), word, ink, font, anchor="ls", stroke_width=stroke)
+            x += font.getlength(word) + SPACE
+        return np.asarray(sheet, np.float32)[..., None] / 255 * part
+
+    shaded = mix(picture, np.zeros(3), drawn(110, 3))  # a shadow, on light grounds
+    return mix(shaded, np.asarray(INK) / 255, drawn(255, 0))
 
 
 def photographs() -> Iterator[np.ndarray]:
     """One photograph after another, then the chosen one alone, as large as the turntable shows it."""
     sheet = Image.open(PICTURES / "photographs.webp").convert("RGB")
-    cell, rows = sheet.width // 8, 5
+    cell, side = sheet.width // 8, SIDE
     chosen = Image.open(EXAMPLES / "captured" / "robot.png").convert("RGBA")
-    side = SIZE[1] // rows
     left = (SIZE[0] - 8 * side) // 2
     behind = ground()
     for i in range(_ALONG + _HOLD + _ZOOM):
@@ -216,7 +226,6 @@ def publish(pictures: Sequence[np.ndarray], folder: Path) -> None:
     """Write film.webm (VP9) and the smaller film.webp, which pages show."""
     import av
 
-    folder.mkdir(parents=True, exist_ok=True)
     with av.open(folder / "film.webm", "w") as file:
         stream = file.add_stream("libvpx-vp9", rate=FPS)
         stream.width, stream.height = SIZE
@@ -229,37 +238,37 @@ def publish(pictures: Sequence[np.ndarray], folder: Path) -> None:
     save_animation(folder / "film.webp", small, FPS, quality=72)
 
 
+def run(out: Path, folder: Path, cut: bool) -> None:
+    """Render what is missing unless this is the `cut` alone, and write the film to a folder.
+
+    Raises
+    ------
+    StepFailed
+    """
+    if importlib.util.find_spec("av") is None:  # before half an hour of rendering
+        raise StepFailed("the encoder of film.webm is missing, the package av; `make env` installs it")
+    check_folder("--out", out)
+    check_folder("--publish", folder)
+    if not cut:
+        run_steps([*first_steps(()), *steps(out)], out / "log.txt", ROOT, variables(out))
+    if absent := missing(out):
+        first = absent[0].relative_to(out)
+        raise StepFailed(
+            f"{len(absent)} frames are missing in {out}, the first is {first}; without --cut they are rendered"
+        )
+    publish(film(out), folder)
+    print(f"Look at film.webm and film.webp in {folder}")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "film", help="scenes and frames")
-    parser.add_argument("--publish", type=Path, default=PICTURES, help="folder of the film; default docs/film")
+    parser.add_argument("--publish", type=Path, help="folder of the film; default that of --out")
     parser.add_argument("--cut", action="store_true", help="only the film, of the frames that are there")
     options = parser.parse_args(arguments)
     out = options.out.resolve()
-    settings = {
-        "BLENDER_USER_RESOURCES": str(out / "blender"),
-        "DRGS_ENGINE": str(environments.python_of(environments.ENGINE)),
-        "DRGS_BLENDER": str(environments.blender()),
-        "PYTHONUNBUFFERED": "1",
-    }
-    try:
-        if not options.cut:
-            run_steps(steps(out), out / "log.txt", ROOT, settings)
-    except StepFailed as failure:
-        print(f"film: {failure}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
-    if absent := missing(out):
-        print(
-            f"film: {len(absent)} frames are missing in {out}, the first is {absent[0].relative_to(out)}; "
-            "without --cut they are rendered",
-            file=sys.stderr,
-        )
-        return 1
-    publish(film(out), options.publish)
-    print(f"{options.publish / 'film.webm'}")
-    return 0
+    folder = (options.publish or out).resolve()
+    return exit_code("film", "examples/demo_film.py", partial(run, out, folder, options.cut))
 
 
 if __name__ == "__main__":

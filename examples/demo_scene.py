@@ -31,10 +31,10 @@ from blender_scenes import (
     stand,
     turned,
 )
+from demo_shots import FRAMES
 
 #: Reconstructed from photographs, see `make_captured.py`.
 CAPTURED = Path(__file__).resolve().parent / "captured"
-FRAMES = 24
 SIZE = 640, 360
 #: One of Blender's own: soft light from above, which fills the sun's shadows.
 WORLD = "courtyard.exr"

@@ -19,8 +19,8 @@ from mathutils import Vector
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from blender_scenes import add_camera, add_material, add_mesh, add_turning_world, import_drgs, install, stand
+from demo_shots import SIMULATED as FRAMES
 
-FRAMES = 48
 #: Young's moduli of the two cows, Pa.
 SOFT, FIRM = 2e5, 8e5
 

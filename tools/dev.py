@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import ctypes
 import functools
+import importlib
 import json
 import os
 import re
@@ -30,6 +31,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import job_runner
 import suites
+from environments import STAMP
 from suites import Failure
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -98,6 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"dev.py: {failure}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
+        print("dev.py: interrupted", file=sys.stderr)
         return 130
 
 
@@ -203,7 +206,7 @@ def about_blender(version: str) -> tuple[Path, dict[str, object], list[list[str]
 
 def is_made(folder: Path, wanted: dict[str, object]) -> bool:
     """Whether an environment is there, as it is wanted."""
-    stamp = folder / "drgs-stamp.json"
+    stamp = folder / STAMP
     if not (python_of(folder).exists() and stamp.exists()):
         return False
     return stamp.read_text(encoding="utf-8") == json.dumps(wanted, indent=1, sort_keys=True)
@@ -216,7 +219,7 @@ def ensure(
 
     A stamp in the folder remembers what was wanted, so a second call does nothing.
     """
-    interpreter, stamp = python_of(folder), folder / "drgs-stamp.json"
+    interpreter, stamp = python_of(folder), folder / STAMP
     text = json.dumps(wanted, indent=1, sort_keys=True)
     if is_made(folder, wanted):
         return interpreter
@@ -471,16 +474,20 @@ def no_window() -> str:
 
 def run_demo(args: argparse.Namespace) -> int:
     """Render the demo, and make both environments meanwhile."""
-    sys.path.insert(0, str(ROOT / "examples"))
-    import demo
-    from environments import environments
-
-    return demo.main(args.rest, environments())
+    return with_steps("demo", args.rest)
 
 
 def run_demo_simulation(args: argparse.Namespace) -> int:
-    """Bake and render simulated matter with both environments."""
-    return with_both("examples/demo_simulation.py", args.rest)
+    """Bake and render simulated matter, and make both environments meanwhile."""
+    return with_steps("demo_simulation", args.rest)
+
+
+def with_steps(script: str, rest: Sequence[str]) -> int:
+    """Run a script of the examples that takes the environments as steps before its own."""
+    sys.path.insert(0, str(ROOT / "examples"))
+    from environments import environments
+
+    return int(importlib.import_module(script).main(rest, environments()))
 
 
 def run_bench(args: argparse.Namespace) -> int:

@@ -13,6 +13,8 @@ from steps import Step, counted
 ROOT = Path(__file__).resolve().parent.parent
 ENGINE = ROOT / ".venv"
 BLENDER = ROOT / ".venv-blender"
+#: In a folder of an environment, what was installed there.
+STAMP = "drgs-stamp.json"
 #: Names of the steps.
 FOR_ENGINE, FOR_BLENDER = "engine", "blender"
 
@@ -43,14 +45,14 @@ def blender() -> Path:
 
 
 def environments(seconds: tuple[float, float] = (90.0, 30.0)) -> list[Step]:
-    """The engine's environment and Blender's, each a moment's work where it is there.
+    """The engine's environment and Blender's, each a moment's work where it is there, made to its end.
 
     Parameters
     ----------
     seconds : that they take
     """
     command = [sys.executable, ROOT / "tools" / "dev.py", "env"]
-    engine_there, blender_there = python_of(ENGINE).is_file(), python_of(BLENDER).is_file()
+    engine_there, blender_there = is_whole(ENGINE), is_whole(BLENDER)
     text = _doing(engine_there, "the engine's Python (.venv)")
     found = [Step(FOR_ENGINE, text, [*command, "--engine"], 1.0 if engine_there else seconds[0])]
     if not os.environ.get("DRGS_BLENDER"):
@@ -60,6 +62,11 @@ def environments(seconds: tuple[float, float] = (90.0, 30.0)) -> list[Step]:
     return found
 
 
+def is_whole(folder: Path) -> bool:
+    """Whether an environment was once made to its end: the stamp comes last."""
+    return python_of(folder).is_file() and (folder / STAMP).is_file()
+
+
 def _doing(is_there: bool, what: str) -> str:
     return f"{'Checking' if is_there else 'Making'} {what}"
 
@@ -67,4 +74,5 @@ def _doing(is_there: bool, what: str) -> str:
 def kernels(name: str, *jobs: str, seconds: float, after: str = FOR_ENGINE) -> Step:
     """What the engine compiles for `jobs`, as soon as its environment stands, or `after` another step."""
     command = [python_of(ENGINE), "-m", "drgs_blender.compute.prepare", *jobs]
-    return Step(name, "Starting the engine", command, seconds, (after,), count=counted)
+    title = "Preparing the engine"
+    return Step(name, "Starting the engine", command, seconds, (after,), count=counted, title=title)

@@ -1,6 +1,7 @@
 """Commands that depend on each other, side by side, with one line that says what is under way. Standard library only.
 
-What the commands write goes to a log file; of one that fails the last lines are shown.
+Each that has ended stays as a line with its time. What the commands write goes to a log file; of one that fails the
+last lines are shown.
 """
 
 from __future__ import annotations
@@ -25,8 +26,10 @@ from typing import IO
 _LINES = 12
 #: Seconds between two looks at the clock, and before time left is estimated.
 _TICK, _EARLY = 0.5, 3.0
-#: Part of a step from which on what it counts gives its speed; part that is done, at most, of one that is late.
-_ESTIMATED, _NEARLY = 0.15, 0.9
+#: Part of a step from which on what it counts gives its speed.
+_ESTIMATED = 0.15
+#: Part of the time left that steps may have of which only `Step.seconds` is known.
+_UNCOUNTED = 0.25
 #: Seconds that a command has to end what it started.
 _GRACE = 5.0
 _COUNT = re.compile(r"(\d+) of (\d+)")
@@ -45,13 +48,13 @@ class Step:
     name : what the others call it, and the log
     text : what is done, for people
     command : program and arguments
-    seconds : that it takes, about: its weight in how much of all is done
+    seconds : that it takes on some machine: believed where it is little beside what others are seen to take
     after : names of the steps that come before it
     makes, of : the file that it makes, and what that depends on; the same again is not made again
     count : of a line that it writes what is to be said instead of `text`, and the part that is done; or None
     before : what is done before it starts
-    measured : the work in a word, such as "rendering", where only what it counts tells its time: before, nothing is
-        said but the time until it begins
+    measured : whether it first does something else than what it counts, such as starting a program
+    title : what the line calls it that has its time; `text` without
     """
 
     name: str
@@ -63,7 +66,8 @@ class Step:
     of: tuple[Path, ...] = ()
     count: Callable[[str], tuple[str, float] | None] = lambda line: None
     before: Callable[[], object] = lambda: None
-    measured: str = ""
+    measured: bool = False
+    title: str = ""
     #: What is known while it runs.
     process: subprocess.Popen[bytes] | None = None
     status: str = ""
@@ -71,7 +75,6 @@ class Step:
     began: float = 0.0
     first: tuple[float, float] = (0.0, 0.0)  # the least part that was counted, and the last moment it was so
     latest: float = 0.0  # moment of the newest part
-    took: float = 0.0
     tail: deque[str] = field(default_factory=lambda: deque(maxlen=_LINES))
     thread: threading.Thread | None = None
     stamp: str = ""  # digest of `of` at its start
@@ -128,6 +131,11 @@ class Line:
             self._write(f"{text}; {left}\n" if left else f"{text}\n")
         self._last = text
 
+    def keep(self, text: str) -> None:
+        """Say a line that stays."""
+        self.clear()
+        self._write(f"{text}\n")
+
     def clear(self) -> None:
         """Leave an empty line on a terminal."""
         if self._terminal:
@@ -180,6 +188,7 @@ class _Run:
             step.stamp = digest(step.of, command)
             if step.makes.is_file() and _stamp(step.makes) == step.stamp:
                 self._write(step, f"{step.makes} is up to date")
+                self._line.keep(f"{step.title or step.text}: nothing has changed")
                 self._done.add(step.name)
                 return False
             _stamp_file(step.makes).unlink(missing_ok=True)
@@ -244,8 +253,9 @@ class _Run:
                 )
             if step.makes is not None:
                 _stamp_file(step.makes).write_text(json.dumps({"of": step.stamp}), encoding="utf-8")
-            step.took = time.monotonic() - step.began
             self._done.add(step.name)
+            if name := step.title or step.text:
+                self._line.keep(f"{name}: {time.monotonic() - step.began:.1f} s")
 
     def _show(self) -> None:
         running = [s for s in self._steps if s.process is not None and s.name not in self._done]
@@ -253,53 +263,43 @@ class _Run:
         self._line.show(text, self._left())
 
     def _left(self) -> str:
-        """The time until the last step, of those that wait for each other, is done."""
+        """The time until the last step, of those that wait for each other, is done; "" where too little tells it."""
         now = time.monotonic()
         if now - self._began < _EARLY:
             return ""
-        pace = self._pace()
-        unknown = [step for step in self._steps if self._is_unknown(step)]
-        if any(step.process is not None for step in unknown):
-            return ""
-        known: dict[str, float] = {}
+        remaining = [step for step in self._steps if step.name not in self._done]
+        remains: dict[str, float] = {}
+        guessed = 0.0
+        for step in remaining:
+            counted = self._by_count(step, now)
+            if counted is None:
+                spent = now - step.began if step.process is not None else 0.0
+                if spent > step.seconds:
+                    return ""
+                guessed += step.seconds
+            remains[step.name] = step.seconds if counted is None else counted
+        ends: dict[str, float] = {}
 
         def until_end(step: Step) -> float:
-            if step.name not in known:
-                later = (until_end(other) for other in self._steps if step.name in other.after)
-                known[step.name] = self._remains(step, pace, now) + max(later, default=0.0)
-            return known[step.name]
+            if step.name not in ends:
+                later = (until_end(other) for other in remaining if step.name in other.after)
+                ends[step.name] = remains[step.name] + max(later, default=0.0)
+            return ends[step.name]
 
-        def until_begin(step: Step) -> float:
-            before = (other for other in self._steps if other.name in step.after)
-            return max((until_begin(other) + self._remains(other, pace, now) for other in before), default=0.0)
+        left = max(map(until_end, remaining), default=0.0)
+        return f"about {clock(left)} left" if guessed <= _UNCOUNTED * left else ""
 
-        if unknown:
-            next_one = min(unknown, key=until_begin)
-            return f"{next_one.measured} begins in about {clock(until_begin(next_one))}"
-        return f"about {clock(max(map(until_end, self._steps)))} left"
-
-    def _is_unknown(self, step: Step) -> bool:
-        """Whether nothing tells yet how long a step still takes."""
-        return bool(step.measured) and step.name not in self._done and step.part <= step.first[0]
-
-    def _pace(self) -> float:
-        """How many times as long as they should steps have taken."""
-        ended = [step for step in self._steps if step.took and step.seconds >= 1.0]
-        return sum(step.took for step in ended) / sum(step.seconds for step in ended) if ended else 1.0
-
-    def _remains(self, step: Step, pace: float, now: float) -> float:
-        """Seconds that a step still takes, by what it counts or by the clock."""
-        if step.name in self._done:
-            return 0.0
+    @staticmethod
+    def _by_count(step: Step, now: float) -> float | None:
+        """Seconds that a step still takes, by what it has counted; None where that does not tell."""
         if step.process is None:
-            return pace * step.seconds
+            return None
         if step.measured:
-            rate = (step.latest - step.first[1]) / max(step.part - step.first[0], 1e-6)
+            if step.part <= step.first[0]:
+                return None
+            rate = (step.latest - step.first[1]) / (step.part - step.first[0])
             return max(rate * (1.0 - step.part) - (now - step.latest), 0.0)
-        spent = now - step.began
-        if step.part > _ESTIMATED:
-            return spent * max(1.0 - step.part, 0.0) / step.part
-        return max(pace * step.seconds - spent, (1.0 - _NEARLY) * spent)
+        return (now - step.began) * max(1.0 - step.part, 0.0) / step.part if step.part > _ESTIMATED else None
 
     def _end(self) -> None:
         """End what still runs, with all that it started."""

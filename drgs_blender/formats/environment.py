@@ -16,6 +16,8 @@ from .latlong import directions, openexr_cube, sample_cube
 
 Array = np.ndarray
 
+#: Negative values down to this part of the mean are rounding of programs that write pictures: too little to be told.
+_ROUNDING = 1e-3
 #: CIE XYZ (white point E, as Radiance means it) to Rec.709 with D65 scaled to equal energy.
 _XYZ_TO_REC709 = np.array([[2.6899, -1.2758, -0.4138], [-1.0221, 1.9783, 0.0438], [0.0612, -0.2245, 1.1633]])
 
@@ -61,8 +63,9 @@ def read_picture_environment(path: Path) -> EnvironmentFile:
 def _finish(radiance: Array, layout: str, notes: list[str]) -> EnvironmentFile:
     """Check what every environment must be: not negative, and about twice as wide as high."""
     if negative := int(np.count_nonzero(radiance < 0)):
-        notes.append(f"{negative} negative values set to 0")
-        radiance = np.maximum(radiance, 0.0)
+        lowest, radiance = radiance.min(), np.maximum(radiance, 0.0)
+        if -lowest > _ROUNDING * radiance.mean(dtype=np.float64):
+            notes.append(f"{negative} negative values set to 0")
     if not radiance.any():
         notes.append("completely black: it gives no light")
     height, width = radiance.shape[:2]

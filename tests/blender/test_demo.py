@@ -79,6 +79,19 @@ def test_day_becomes_evening_and_the_lamp_goes_on(scene, demo, export):
     assert glow[0] == 0 and glow[1] > 5
 
 
+@pytest.mark.parametrize("part_of", ("add_stage", "add_lamp"))
+def test_faces_of_the_scene_have_an_area(scene, demo, part_of):
+    """Else each render of the demo would tell of faces without."""
+    getattr(demo, part_of)(*([Vector((1, 1, 0))] if part_of == "add_lamp" else []))
+    meshes = [obj.data for obj in scene.objects if obj.type == "MESH"]
+    assert len(meshes) == 2
+    for mesh in meshes:
+        mesh.calc_loop_triangles()
+        assert min(triangle.area for triangle in mesh.loop_triangles) > 1e-9, mesh.name
+        edges = [edge for polygon in mesh.polygons for edge in polygon.edge_keys]
+        assert all(edges.count(edge) <= 2 for edge in edges[:50]), mesh.name
+
+
 def test_the_film_begins_at_the_camera_of_the_photograph(scene, film, export):
     scene.render.resolution_x, scene.render.resolution_y = 640, 360
     film.go_around("robot")

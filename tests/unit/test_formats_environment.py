@@ -131,6 +131,16 @@ def test_exr_layers_luminance_and_bad_values(tmp_path: Path) -> None:
         read(write_exr(path, {"Z": b}))
 
 
+@pytest.mark.parametrize("lowest, told", [(-1e-4, False), (-1e-2, True)])
+def test_negative_values_below_rounding_are_not_told(tmp_path: Path, lowest: float, told: bool) -> None:
+    """Blender's own environments have some, -7e-7 in studio.exr."""
+    pixels = np.full((4, 8, 3), 0.5, np.float32)
+    pixels[1, 2, 0] = lowest
+    file = read(write_exr(tmp_path / "a.exr", {"RGB": pixels}))
+    assert file.environment.radiance[1, 2, 0] == 0
+    assert any("1 negative values set to 0" in note for note in file.notes) == told
+
+
 def test_exr_primaries_are_converted(tmp_path: Path) -> None:
     """ACEScg white stays white; its red is outside Rec.709."""
     acescg = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)

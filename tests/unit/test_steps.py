@@ -17,6 +17,7 @@ from processes import all_gone
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
 
+import environments  # noqa: E402
 import steps  # noqa: E402
 from steps import Line, Step, StepFailed, clock, counted, run_steps  # noqa: E402
 
@@ -37,6 +38,11 @@ def run(tmp_path):
     return together
 
 
+def shown(said: str) -> list[str]:
+    """What was under way, without the lines of what had ended."""
+    return [line for line in said.splitlines() if " done. " in line]
+
+
 def test_steps_run_side_by_side_and_after_what_they_wait_for(run, tmp_path):
     """Two wait for each other's files, and a third for both."""
     meet = "import os, time\nopen('{0}', 'w').close()\nend = time.monotonic() + 30\n"
@@ -45,7 +51,7 @@ def test_steps_run_side_by_side_and_after_what_they_wait_for(run, tmp_path):
     said, log = run(
         step("last", last, after=("a", "b")), step("a", meet.format("a", "b")), step("b", meet.format("b", "a"))
     )
-    lines = said.splitlines()
+    lines = shown(said)
     assert lines[0] == "0 of 3 done. doing a, doing b" and lines[-1].startswith("2 of 3 done. doing last")
     assert re.search(r"^ *[\d.]+ last: here$", log, re.M)
 
@@ -53,7 +59,7 @@ def test_steps_run_side_by_side_and_after_what_they_wait_for(run, tmp_path):
 def test_what_a_command_counts_is_said_once_for_each_change(run):
     program = "import time\nfor i in (1, 1, 2): print(f'Baking bread, {i} of 2', flush=True); time.sleep(0.3)"
     said, _ = run(step("bread", program, count=counted))
-    assert [line.split(" done. ")[1] for line in said.splitlines()] == [
+    assert [line.split(" done. ")[1] for line in shown(said)] == [
         "doing bread",
         "Baking bread, 1 of 2",
         "Baking bread, 2 of 2",
@@ -143,20 +149,37 @@ def test_time_left_is_said_roughly():
     assert [clock(seconds) for seconds in (1, 12, 44, 95, 300)] == ["5 s", "10 s", "45 s", "2 min", "5 min"]
 
 
-def test_time_left_of_what_is_measured_is_not_said_before(monkeypatch):
-    """Until it begins, the time until then; of its first part nothing; then what the parts that are left take."""
+def test_each_step_and_its_time_are_told_as_it_ends(run, tmp_path):
+    bread = tmp_path / "bread"
+    baking = step("bread", f"import time; time.sleep(0.3); open({str(bread)!r}, 'w').close()", makes=bread)
+    silent = Step("silent", "", [sys.executable, "-c", ""], 1.0)
+    oven = step("oven", "", after=("bread",), title="Heating the oven")
+    times = lambda said: [line for line in said.splitlines() if " done. " not in line]  # noqa: E731
+    first, second = times(run(silent, baking, oven)[0])
+    told = re.fullmatch(r"doing bread: ([\d.]+) s", first)
+    assert told and float(told[1]) >= 0.3 and re.fullmatch(r"Heating the oven: [\d.]+ s", second)
+    baking.process = oven.process = silent.process = None
+    assert times(run(silent, baking, oven)[0])[0] == "doing bread: nothing has changed"
+
+
+def job_of(*chosen: Step) -> steps._Run:
+    return steps._Run(chosen, Path("log"), Path("."), {}, io.StringIO(), Line(io.StringIO()))
+
+
+def test_time_left_is_not_said_before_it_is_measured(monkeypatch):
+    """Nothing until the frames have been counted; then what those that are left take, and the short step after."""
     now = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
     first = step("first", "")
-    frames = step("frames", "", after=("first",), measured="rendering", count=counted)
+    frames = step("frames", "", after=("first",), measured=True, count=counted)
     last = step("last", "", after=("frames",))
-    job = steps._Run([first, frames, last], Path("log"), Path("."), {}, io.StringIO(), Line(io.StringIO()))
-    first.seconds, last.seconds = 60.0, 30.0
+    job = job_of(first, frames, last)
+    first.seconds, frames.seconds, last.seconds = 60.0, 50.0, 10.0
     first.process, first.began = object(), now
     now += 10.0
-    assert job._left() == "rendering begins in about 50 s"
+    assert job._left() == ""
     job._done.add("first")
-    first.took, frames.process, frames.began = 60.0, object(), now
+    frames.process, frames.began = object(), now
     now += 40.0
     assert job._left() == ""  # the program starts
     job._count(frames, "0 of 4", 0.0)
@@ -166,16 +189,39 @@ def test_time_left_of_what_is_measured_is_not_said_before(monkeypatch):
     assert job._left() == ""
     job._count(frames, "1 of 4", 0.25)
     now += 5.0
-    assert job._left() == "about 85 s left"  # three of 20 s, less 5, and the last step
+    assert job._left() == "about 65 s left"  # three of 20 s, less 5, and the last step
+    last.seconds = 40.0
+    assert job._left() == "", "too much of it is not measured here"
+    last.seconds, now = 10.0, now + 30.0
+    assert job._left() == "", "nothing measured is left"
 
 
-@pytest.mark.slow
-def test_time_left_is_that_of_the_longest_row_of_steps(run):
-    """Of steps side by side only the longer one counts, and what those before took tells the pace."""
-    nothing = "import time; time.sleep(4)"
-    row = [Step(name, name, [sys.executable, "-c", nothing], 2.0) for name in ("a", "b")]
-    row += [Step("c", "c", [sys.executable, "-c", nothing], 20.0, after=("a",))]
-    row += [Step("d", "d", [sys.executable, "-c", ""], 20.0, after=("c",))]
-    said, _ = run(*row)
-    left = re.search(r"2 of 4 done\. c; about (\d+) s left", said)
-    assert left and 70 <= int(left[1]) <= 85  # twice as slow as they should be
+def test_time_left_is_that_of_the_longer_row_and_of_no_step_that_is_late(monkeypatch):
+    now = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    kernels, frames, short = step("kernels", "", count=counted), step("frames", "", count=counted), step("short", "")
+    short.seconds = 10.0
+    job = job_of(kernels, frames, short)
+    for one in (kernels, frames, short):
+        one.process, one.began = object(), now
+    now += 8.0
+    job._count(kernels, "1 of 2", 0.5)
+    assert job._left() == "", "of the frames nothing is known"
+    job._count(frames, "1 of 5", 0.2)
+    now += 1.0
+    assert job._left() == "", "a third of it is a guess"
+    job._count(frames, "1 of 6", 0.16)
+    assert job._left() == "about 45 s left"
+    now += 2.0
+    assert job._left() == "", "the short one takes longer than it should"
+
+
+def test_an_environment_that_was_not_made_to_its_end_is_made(tmp_path, monkeypatch):
+    monkeypatch.setattr(environments, "ENGINE", tmp_path)
+    python = environments.python_of(tmp_path)
+    python.parent.mkdir()
+    python.touch()
+    half = environments.environments()[0]
+    (tmp_path / environments.STAMP).touch()
+    whole = environments.environments()[0]
+    assert half.text.startswith("Making") and whole.text.startswith("Checking") and half.seconds > 10 * whole.seconds
