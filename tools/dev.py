@@ -18,6 +18,7 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -92,6 +93,7 @@ ALL = (suites.LINT, "blender", FLOOR, NEWEST_LTS, "farm", "engine")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand; the return value is the exit code."""
     args = parse(argv)
+    before = signal.signal(signal.SIGTERM, job_runner.interrupt)  # programs in groups of their own end, too
     try:
         return args.run(args)
     except Failure as failure:
@@ -99,6 +101,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         return 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -497,6 +501,7 @@ def run_docs(args: argparse.Namespace) -> int:
     """Build the site: the reference of Blender's side by Blender, all else by the generator."""
     blender, generator = ensure_blender(), ensure_docs()
     pages = ROOT / "build" / "docs" / "blender"
+    print("== reference of operators and properties, by Blender", flush=True)
     shutil.rmtree(pages, ignore_errors=True)
     command = [str(blender), str(ROOT / "tools" / "blender_reference.py"), "--out", str(pages)]
     try:

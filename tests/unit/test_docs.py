@@ -109,7 +109,7 @@ def test_programs_below_pictures_exist(page: Path) -> None:
     targets = (ROOT / "Makefile").read_text(encoding="utf-8")
     for name, below in shown(page):
         own = below if page.stem == "benchmarks" else below.partition("![")[0]  # one run may draw all of a section
-        python = "python" if page.stem == "benchmarks" else r"\.venv/bin/python"  # commands there are of bench/report.py
+        python = "python" if page.stem == "benchmarks" else r"\.venv/bin/python"  # bench/report.py writes the former
         made_by = re.search(rf"`(?:make ([\w-]+)|{python} (\S+\.py)([^`]*))`", own)
         assert made_by, f"{name}: no program"
         target, program, options = made_by.groups()
