@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from pathlib import Path
 
 import bpy
@@ -14,8 +15,24 @@ import imbuf
 
 from ..drgs_blender.core.errors import EXIT_CANNOT_WRITE, EXIT_CLASSES
 from ..drgs_blender.core.file_integrity import is_whole
+from ..drgs_blender.core.phases import is_preparing
 from ..drgs_blender.core.switches import is_on
 from . import engine_link, messages
+
+#: Seconds between lines that say how many kernels are compiled.
+_NEWS_SECONDS = 10.0
+
+#: When the next one may be said.
+_next_news = 0.0
+
+
+def is_news(phase: str) -> bool:
+    """Whether a phase is to be printed: kernels are compiled, which may take minutes, and nothing was said lately."""
+    global _next_news
+    if not is_preparing(phase) or time.monotonic() < _next_news:
+        return False
+    _next_news = time.monotonic() + _NEWS_SECONDS
+    return True
 
 
 def fail(text: str, code: int) -> None:

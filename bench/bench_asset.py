@@ -22,7 +22,7 @@ import numpy as np
 from bench_evaluate import how_made, mean, of_truth, score, similarity, under_other_lights
 from decouple_score import with_materials_of
 from PIL import Image
-from report import DOCUMENT, OUT, ROOT, store_row, table, write_section
+from report import DOCUMENT, OUT, add_publish, picture_path, store_row, table, write_section
 
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.asset.model import Asset
@@ -33,7 +33,7 @@ from drgs_blender.reconstruct.pipeline import Progress, Settings, reconstruct
 from drgs_blender.reconstruct.readers import read_capture
 
 FOLDER = OUT / "assets"
-FIGURE = ROOT / "docs" / "images" / "assets.png"
+FIGURE = "assets.png"
 #: What the sheet shows.
 LIGHT, VIEW = "city", 1
 DEFORMED, DEFORMED_SIMILARITY = "Relit and deformed scaled: frame / foreground", "Relit and deformed: SSIM / FLIP"
@@ -128,11 +128,12 @@ def rescore_deformed(objects: list[str], scenes: Path, samples: int) -> None:
     DOCUMENT.write_text(f"{before}<!-- begin asset -->{section}", encoding="utf-8")
 
 
-def sheet(objects: list[str], scenes: Path, samples: int) -> None:
+def sheet(options: argparse.Namespace) -> None:
     """Of each asset one view: as photographed; under another light, the true one and ours; the same bent."""
     rows = []
-    for name in objects:
-        truth = read_truth(scenes / name)
+    for name in options.objects:
+        folder = options.scenes / name
+        truth = read_truth(folder)
         assert truth is not None
         shown: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
@@ -144,11 +145,11 @@ def sheet(objects: list[str], scenes: Path, samples: int) -> None:
             for item in truth.sets
             if item.name in ("test", f"relit-{LIGHT}", f"posed-{LIGHT}")
         ]
-        score(FOLDER / f"{name}.drgs", scenes / name, "surfels", samples, replace(truth, sets=wanted), show)
+        score(FOLDER / f"{name}.drgs", folder, "surfels", options.samples, replace(truth, sets=wanted), show)
         row = (shown["test"][0], *shown[f"relit-{LIGHT}"], *shown[f"posed-{LIGHT}"])
         rows.append(np.concatenate(row, axis=1))
     pixels = np.concatenate(rows).clip(0, 1)
-    Image.fromarray((255 * pixels + 0.5).astype(np.uint8)).save(FIGURE, optimize=True)
+    Image.fromarray((255 * pixels + 0.5).astype(np.uint8)).save(picture_path(FIGURE, options), optimize=True)
 
 
 def main() -> None:
@@ -161,9 +162,10 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=128)
     parser.add_argument("--deformed", action="store_true", help="score the assets that are there, deformed, again")
     parser.add_argument("--sheet", action="store_true", help="draw the assets that are there")
+    add_publish(parser)
     options = parser.parse_args()
     if options.sheet:
-        return sheet(options.objects, options.scenes, options.samples)
+        return sheet(options)
     if options.deformed:
         return rescore_deformed(options.objects, options.scenes, options.samples)
     for name in options.objects:
@@ -187,7 +189,7 @@ def main() -> None:
         f"over the other lights. With the true materials: "
         f"on the own shape; no bound, as learned ones may make up for its errors. The true asset: the ceiling. "
         f"{how_made(options.scenes)}\n\n"
-        f"![One view of each: as photographed; under another light, Cycles and ours; bent](images/{FIGURE.name})\n\n"
+        f"![One view of each: as photographed; under another light, Cycles and ours; bent](images/{FIGURE})\n\n"
     )
     cells = [(*key.split("|"), *cells) for key, cells in sorted(rows.items())]
     write_section("asset", "Photographs to assets", body + table(COLUMNS, cells))

@@ -21,7 +21,7 @@ from bench_thin import save
 from crack_healing import and_back, cost, healed
 from judge import frame_camera
 from ours import SESSION
-from report import OUT, ROOT, table, write_section
+from report import OUT, add_publish, picture_path, table, write_section
 
 from drgs_blender.core.asset import Mesh
 from drgs_blender.core.frame import Inside, ObjectState
@@ -34,8 +34,7 @@ from drgs_blender.simulation.settings import parse_settings
 
 Array = np.ndarray
 
-FIGURE = ROOT / "docs" / "images" / "broken.png"
-HEALING = FIGURE.with_name("cracks.webp")
+FIGURE, HEALING = "broken.png", "cracks.webp"
 FOLDER = OUT / "broken"
 LAST, AZIMUTH = 24, -40
 #: Views from which rays are cast, and rays of each along a side of the picture.
@@ -165,7 +164,7 @@ def pool() -> list[object]:
     ]  # fmt: skip
 
 
-def healing(state: ObjectState, mesh: Mesh, motions: dict[str, dict[str, Any]], size: int, samples: int) -> str:
+def healing(state: ObjectState, mesh: Mesh, motions: dict[str, dict[str, Any]], args: argparse.Namespace) -> str:
     """A table of what heals in bakes by settings, and pictures of the first around where most does."""
     rows, pictures = [], []
     for title, given in motions.items():
@@ -181,7 +180,7 @@ def healing(state: ObjectState, mesh: Mesh, motions: dict[str, dict[str, Any]], 
         frames = range(alone.at - BEFORE, min(alone.at + AFTER, LAST + 1))
         near = AROUND * np.ptp(mesh.vertices, axis=0).max()
         places = np.concatenate([alone.places - near, alone.places + near])
-        camera = frame_camera(places, size, azimuth=AZIMUTH, fill=0.9)
+        camera = frame_camera(places, args.size, azimuth=AZIMUTH, fill=0.9)
         floor = min(float(cache.read(frame).vertices[:, 2].min()) for frame in cache.frames()) - 0.02
         for known in (False, True):
             row = []
@@ -189,9 +188,9 @@ def healing(state: ObjectState, mesh: Mesh, motions: dict[str, dict[str, Any]], 
                 now = shown(state, cache, frame, Inside())
                 if not known and now.particles is not None:
                     now = replace(now, particles=replace(now.particles, broken=None))
-                row.append(picture(now, floor, camera, samples))
+                row.append(picture(now, floor, camera, args.samples))
             pictures.append(np.concatenate(row, axis=1))
-    save(HEALING, [np.concatenate(pictures, axis=0)])
+    save(picture_path(HEALING, args), [np.concatenate(pictures, axis=0)])
     columns = [
         "matter", "bonds broken", "bonds heal", "cut faces heal", "walls heal", "these, kept", "of the bytes",
         "of the time",
@@ -204,6 +203,7 @@ def main() -> None:
     parser.add_argument("--asset", type=Path, required=True)
     parser.add_argument("--size", type=int, default=300)
     parser.add_argument("--samples", type=int, default=64)
+    add_publish(parser)
     args = parser.parse_args()
     key = SESSION.load_asset(args.asset)
     mesh = SESSION.asset(key).mesh
@@ -231,10 +231,10 @@ def main() -> None:
         every = np.concatenate([cache.read(f).points for f in (1, LAST)])
         camera = frame_camera(every, args.size, azimuth=AZIMUTH, fill=0.82)
         pictures.append(picture(shown(state, cache, frame, None), float(low) - 0.02, camera, args.samples))
-    save(FIGURE, pictures)
+    save(picture_path(FIGURE, args), pictures)
     again = "snow, pushed together"
     motions[again] = pulled(f"{args.asset.stem}-{again}", mesh, frames["snow"][1], frames["snow"][2], back=True)
-    mended = healing(state, mesh, motions, args.size, args.samples)
+    mended = healing(state, mesh, motions, args)
     columns = [
         "matter",
         "particles",

@@ -17,7 +17,7 @@ import trimesh
 from bench_thin import BOUNCES, STRENGTH, ground, save
 from judge import environments, frame_camera
 from ours import SESSION, pinhole
-from report import OUT, ROOT
+from report import OUT, add_publish, picture_path
 
 from drgs_blender.core.asset import Asset, Mesh
 from drgs_blender.core.asset.container import write_asset
@@ -31,7 +31,7 @@ from drgs_blender.simulation.coupled_settings import parse_coupled
 
 Array = np.ndarray
 
-FIGURE = ROOT / "docs" / "images" / "coupled.png"
+FIGURE = "coupled.png"
 FOLDER = OUT / "coupled"
 #: Frames that are shown of each.
 FALLEN, FLOWN = (1, 4, 8, 30), (1, 8, 11, 15)
@@ -108,6 +108,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=260)
     parser.add_argument("--samples", type=int, default=32)
     parser.add_argument("--resolution", type=int, default=48)
+    add_publish(parser)
     options = parser.parse_args()
     FOLDER.mkdir(parents=True, exist_ok=True)
     cat, cow = (str((options.assets / f"{name}.drgs").resolve()) for name in ("cat", "spot"))
@@ -134,7 +135,7 @@ def main() -> None:
         row("sand", {"bodies": fall, "resolution": options.resolution}, FALLEN, camera, options.samples),
         row("impact", {"bodies": fly, "resolution": options.resolution}, FLOWN, camera, options.samples),
     ]
-    save(FIGURE, [np.concatenate([np.concatenate(pictures, axis=1) for pictures in rows])])
+    save(picture_path(FIGURE, options), [np.concatenate([np.concatenate(pictures, axis=1) for pictures in rows])])
 
 
 if __name__ == "__main__":

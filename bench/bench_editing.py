@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from judge import blender_python, environments, to_srgb
-from report import OUT, ROOT, table, write_section
+from report import OUT, ROOT, add_publish, picture_path, table, write_section
 from scipy.spatial import cKDTree
 from subjects import asset_path, textured_spot
 
@@ -26,7 +26,7 @@ from drgs_blender.evaluate.scenes import read_layers
 Array = np.ndarray
 Layers = dict[str, Array]
 
-FIGURE = ROOT / "docs" / "images" / "editing.png"
+FIGURE = "editing.png"
 LIGHTS = ("forest", "sunset")
 CHANNELS = ("Albedo", "Roughness", "Metallic")
 #: Subject -> the part that each edit is masked by, as in editing_job.py.
@@ -146,7 +146,7 @@ def differing(a: Layers, b: Layers) -> int:
     return sum(int((a[name] != b[name]).sum()) for name in a)
 
 
-def draw(pictures: dict[str, dict[str, Layers]]) -> None:
+def draw(pictures: dict[str, dict[str, Layers]], options: argparse.Namespace) -> None:
     """Two rows a subject, over white."""
     import matplotlib
 
@@ -164,8 +164,7 @@ def draw(pictures: dict[str, dict[str, Layers]]) -> None:
             panel.imshow((over_white * 255 + 0.5).astype(np.uint8))
             panel.set_title(title.format(**PARTS[name]), fontsize=8)
             panel.axis("off")
-    FIGURE.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(FIGURE, dpi=90)
+    figure.savefig(picture_path(FIGURE, options), dpi=90)
     pyplot.close(figure)
 
 
@@ -173,6 +172,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--samples", type=int, default=512)
+    add_publish(parser)
     options = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     pictures: dict[str, dict[str, Layers]] = {}
@@ -188,7 +188,7 @@ def main() -> None:
             for step, about in SAME.items():
                 count = sum(values.size for values in first.values())
                 same.append([name, about, f"{differing(first, pictures[name][step])} of {count}"])
-    draw(pictures)
+    draw(pictures, options)
     write_section("editing", "Edited materials", report(options, rows, same))
 
 
@@ -202,7 +202,7 @@ def report(options: argparse.Namespace, rows: list[list[object]], same: list[lis
         f"{LIGHTS[0]}.exr, posed under {LIGHTS[1]}.exr. Every edit was made in Blender by the operators and settings "
         "of the sidebar (`bench/editing_job.py`), after *Restore Captured Material*. The helmet's parts are attributes "
         "that `drgs make` keeps of its source, spot's are vertex groups.\n\n"
-        f"![Materials edited, posed and shown as captured](images/{FIGURE.name})\n\n"
+        f"![Materials edited, posed and shown as captured](images/{FIGURE})\n\n"
         "Means of the passes Albedo, Roughness and Metallic over the pixels that show the part and nothing else, as "
         "captured → edited, and how many of the pixels that show nothing of it have another bit in one of these "
         "passes. Here a pixel is one point of the mesh; surfels let through a little of what lies behind them.\n\n"

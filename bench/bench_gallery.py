@@ -4,7 +4,8 @@ python bench/bench_gallery.py [--part composed lights poses reflections thin] [-
 python bench/bench_gallery.py --part variants --scenes scenes
 
 All but variants show examples/captured. Variants are learned from photographs, in minutes: scenes are those of
-`drgs evaluate --make-scenes scenes --objects spot --train 40 --test 8`. Writes docs/images/gallery-PART.webp.
+`drgs evaluate --make-scenes scenes --objects spot --train 40 --test 8`. Writes out/gallery/gallery-PART.webp;
+--publish writes to docs/images.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from judge import environments, look_at, to_srgb
 from light_ablation import ALONE
 from ours import SESSION, pinhole
 from PIL import Image, ImageDraw, ImageFont
-from report import OUT, ROOT
+from report import OUT, ROOT, add_publish, picture_path
 from scipy.spatial import cKDTree
 
 from drgs_blender.core.asset import Asset, Mesh
@@ -43,7 +44,6 @@ Array = np.ndarray
 Tile = tuple[str, Array]
 
 FOLDER = OUT / "gallery"
-IMAGES = ROOT / "docs" / "images"
 CAPTURED = ROOT / "examples" / "captured"
 #: Lights: a name for artists, the HDRI of Blender's, its strength.
 LIGHTS = {
@@ -58,7 +58,7 @@ DIRECTIONS = 32
 GAP, TITLE = 6, 20
 
 
-def sheet(part: str, rows: list[list[Tile]]) -> None:
+def sheet(part: str, rows: list[list[Tile]], options: argparse.Namespace) -> None:
     """Write tiles of one size as the picture of a part."""
     height, width, _ = rows[0][0][1].shape
     across, down = width + GAP, height + TITLE + GAP
@@ -69,7 +69,7 @@ def sheet(part: str, rows: list[list[Tile]]) -> None:
             tile = Image.fromarray((255 * np.clip(pixels, 0, 1) + 0.5).astype(np.uint8))
             picture.paste(tile, (x * across, y * down + TITLE))
             draw.text((x * across + 3, y * down + 2), title, fill="black", font=font)
-    picture.save(IMAGES / f"gallery-{part}.webp", quality=88, method=6)
+    picture.save(picture_path(f"gallery-{part}.webp", options), quality=88, method=6)
 
 
 def encoded(linear: Array) -> Array:
@@ -313,11 +313,13 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, help="folder with spot, for variants")
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--samples", type=int, default=128)
+    add_publish(parser)
     options = parser.parse_args()
     for part in options.part:
         if part == "variants" and options.scenes is None:
             parser.error("--part variants needs --scenes")
-        sheet(part, PARTS[part](options))
+        print(f"{part}: renders, some minutes", flush=True)
+        sheet(part, PARTS[part](options), options)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import light_renderers
 import light_variance
 from light_cases import FOLDER
 from light_scenes import EVERY
-from report import write_section
+from report import add_publish, write_section
 
 PARTS = {
     "equal-psnr": ("Light: time to equal PSNR, Cycles", light_renderers.equal_psnr),
@@ -58,6 +58,7 @@ def main() -> None:
     parser.add_argument("--cases-spp", type=int, nargs="*", default=(8, 32, 128), help="of Cycles; none: without it")
     parser.add_argument("--ablation-size", type=int, default=400, help="of the pictures of part ablation")
     parser.add_argument("--ablation-rays", type=int, default=512)
+    add_publish(parser)
     options = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):  # inherited by every process that is started from here
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])

@@ -17,7 +17,7 @@ import numpy as np
 from bench_thin import BOUNCES, STRENGTH, bent, ground, plant, save, surfels_of
 from judge import environments, frame_camera
 from ours import SESSION, pinhole
-from report import OUT, ROOT
+from report import OUT, add_publish, picture_path
 
 from drgs_blender.core.asset import Asset, Mesh
 from drgs_blender.core.asset.container import write_asset
@@ -30,7 +30,7 @@ from drgs_blender.simulation.settings import parse_settings
 
 Array = np.ndarray
 
-FIGURE = ROOT / "docs" / "images" / "matter.png"
+FIGURE = "matter.png"
 FOLDER = OUT / "matter"
 #: Pascals; the frame that is shown of each.
 MODULI, FALLEN = (2e4, 8e4, 3.2e5), 13
@@ -101,10 +101,11 @@ def main() -> None:
     parser.add_argument("--asset", type=Path, required=True)
     parser.add_argument("--size", type=int, default=240)
     parser.add_argument("--samples", type=int, default=32)
+    add_publish(parser)
     options = parser.parse_args()
     FOLDER.mkdir(parents=True, exist_ok=True)
     rows = fallen(options.asset, options.size, options.samples), blown(options.size, options.samples)
-    save(FIGURE, [np.concatenate([np.concatenate(row, axis=1) for row in rows])])
+    save(picture_path(FIGURE, options), [np.concatenate([np.concatenate(row, axis=1) for row in rows])])
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import numpy as np
 from bench_asset import FOLDER, relit_truth
 from bench_evaluate import mean, of_truth, similarity
 from decouple_score import with_materials_of
-from report import ROOT, table, write_section
+from report import add_publish, picture_path, table, write_section
 
 from drgs_blender.build.proxy import mesh_from_surfels
 from drgs_blender.cli.evaluate import session_renderer
@@ -47,7 +47,7 @@ FINE, COARSE = 192, 32
 ALONG, VIEWS = 192, 4
 #: What the figure shows of what was learned from photographs.
 LIGHT, VIEW = "city", 1
-FIGURE = ROOT / "docs" / "images" / "driven-by.png"
+FIGURE = "driven-by.png"
 
 
 def bend(vertices: Array) -> tuple[Motion, Motion]:
@@ -133,6 +133,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, required=True)
     parser.add_argument("--objects", nargs="+", default=["cat", "helmet", "robot", "spot", "fern"])
     parser.add_argument("--samples", type=int, default=64)
+    add_publish(parser)
     options = parser.parse_args()
     rows: list[list[object]] = []
     strips: list[Array] = []
@@ -158,7 +159,7 @@ def main() -> None:
         f"an import of surfels alone has {FINE} along the longest side. {VIEWS} views under each light.\n\n"
     )
     if strips:
-        write_png(FIGURE, (np.clip(np.concatenate(strips), 0, 1) * 255 + 0.5).astype(np.uint8))
+        write_png(picture_path(FIGURE, options), (np.clip(np.concatenate(strips), 0, 1) * 255 + 0.5).astype(np.uint8))
         body += (
             "![Posed and relit: Cycles, then carried by surface, automatically, by particles](images/driven-by.png)\n\n"
         )

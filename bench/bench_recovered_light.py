@@ -15,12 +15,12 @@ import numpy as np
 from bench_asset import FOLDER
 from judge import to_srgb
 from PIL import Image
-from report import OUT, ROOT, store_row, table, write_section
+from report import OUT, add_publish, picture_path, store_row, table, write_section
 
 from drgs_blender.core.asset.container import read_asset
 from drgs_blender.evaluate.truth import read_truth
 
-FIGURE = ROOT / "docs" / "images" / "recovered-light.png"
+FIGURE = "recovered-light.png"
 #: Rows of the maps that are compared.
 ROWS = 32
 #: Exponents of the cosine lobes through which light is compared, by their names: what reflects it, and the angle at
@@ -89,6 +89,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, required=True)
     parser.add_argument("--assets", type=Path, default=FOLDER)
     parser.add_argument("--objects", nargs="+", default=["cat", "fern", "helmet", "robot", "spot"])
+    add_publish(parser)
     options = parser.parse_args()
     rows: dict[str, list[str]] = {}
     strips = []
@@ -101,7 +102,7 @@ def main() -> None:
         strips.append(strip(found, true))
         rows = store_row(OUT / "recovered-light.json", name, errors(found, true))
         print(name, *rows[name], flush=True)
-    Image.fromarray(np.concatenate(strips)).save(FIGURE)
+    Image.fromarray(np.concatenate(strips)).save(picture_path(FIGURE, options))
     write_section("recovered_light", "The light that is recovered", report(rows, options.objects))
 
 
@@ -113,7 +114,7 @@ def report(rows: dict[str, list[str]], shown: list[str]) -> str:
         "mean square over all directions, in parts of the true mean, of the light that reaches a surface through "
         f"cosine lobes of exponents {exponents}; angle between the brightest directions of the last."
     )
-    picture = f"![True and recovered light of {', '.join(shown)}](images/{FIGURE.name})"
+    picture = f"![True and recovered light of {', '.join(shown)}](images/{FIGURE})"
     return f"{body}\n\n{picture}\n\n" + table(COLUMNS, [[name, *cells] for name, cells in sorted(rows.items())])
 
 

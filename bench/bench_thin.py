@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from judge import blender_python, cycles_pictures, decibels, environments, frame_camera, systematic_error, to_srgb
 from ours import pinhole
-from report import OUT, ROOT, table, write_section
+from report import OUT, ROOT, add_publish, picture_path, table, write_section
 from scipy.ndimage import binary_erosion
 
 from drgs_blender.build.proxy import mesh_from_surfels
@@ -41,7 +41,7 @@ GROUND = 0.5
 RESOLUTION = 192
 #: Triangles of proxies.
 FACES = 2000
-FIGURE = ROOT / "docs" / "images" / "proxies.png"
+FIGURE = "proxies.png"
 
 
 def sheets(strips: Array, colours: Array, roughness: float) -> Mesh:
@@ -189,6 +189,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=256)
     parser.add_argument("--spp", type=int, default=256)
     parser.add_argument("--subjects", nargs="+", choices=SUBJECTS, default=list(SUBJECTS))
+    add_publish(parser)
     options = parser.parse_args()
     folder = OUT / "thin"
     folder.mkdir(parents=True, exist_ok=True)
@@ -235,11 +236,11 @@ def main() -> None:
         f"Blender, the surfels by a proxy of about {FACES} triangles. PSNR in sRGB without the noise "
         "of either, inside the subject and on the ground around it; processor seconds of a frame, and of making and "
         "binding that mesh.\n\n"
-        f"![Of each subject at rest and bent: Cycles, and surfels](images/{FIGURE.name})\n\n"
+        f"![Of each subject at rest and bent: Cycles, and surfels](images/{FIGURE})\n\n"
         + table(("Subject", "Surfels", "Pose", "Light meets", "Subject dB", "Ground dB", "CPU s", "Mesh CPU s"), rows)
     )
     if len(figure) == len(SUBJECTS):
-        save(FIGURE, [np.concatenate(figure)])
+        save(picture_path(FIGURE, options), [np.concatenate(figure)])
     write_section("thin", "Thin and open structures", body)
 
 

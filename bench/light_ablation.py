@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from judge import environments, look_at, psnr, to_srgb
 from ours import SESSION, pinhole
-from report import ROOT, table
+from report import picture_path, table
 from subjects import asset_path
 
 from drgs_blender.core.color import LUMINANCE
@@ -19,7 +19,7 @@ from drgs_blender.formats.registry import read_environment
 
 Array = np.ndarray
 
-FIGURE = ROOT / "docs" / "images" / "ablation.png"
+FIGURE = "ablation.png"
 #: Indirect bounces of the full method.
 BOUNCES = 3
 #: Seen by the camera and by nothing else: every point has the whole sky.
@@ -90,7 +90,7 @@ def scenes(options: argparse.Namespace) -> dict[str, Frame]:
     }
 
 
-def draw(pictures: dict[str, dict[str, Array]]) -> None:
+def draw(pictures: dict[str, dict[str, Array]], options: argparse.Namespace) -> None:
     """A row a scene, a column a variant."""
     import matplotlib
 
@@ -103,8 +103,7 @@ def draw(pictures: dict[str, dict[str, Array]]) -> None:
             axes.imshow(to_srgb(picture[..., :3]))
             axes.set_title(name, fontsize="small")
             axes.axis("off")
-    FIGURE.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(FIGURE, dpi=100)
+    figure.savefig(picture_path(FIGURE, options), dpi=100)
     pyplot.close(figure)
 
 
@@ -120,13 +119,13 @@ def ablation(options: argparse.Namespace) -> str:
         for name in list(VARIANTS)[1:]:
             ratio = light[name] / light["full"]
             rows.append((scene, name, f"{ratio:.3f}", f"{psnr(found[name], found['full'], mask):.1f}"))
-    draw(pictures)
+    draw(pictures, options)
     return (
         f"{options.ablation_size}x{options.ablation_size}, {options.ablation_rays} rays, mesh as primary surface, "
         f"{BOUNCES} indirect bounces in full. One object: robot, roughness 0.1, metallic 1, forest.exr; composed: "
         "helmet, robot and a metallic spot on a glossy ground, sunset.exr. Without inter-reflection: no bounce, rays "
         "that meet something bring nothing. Without visibility: every point has the whole sky. Light and PSNR over "
         "what the objects cover.\n\n"
-        f"![Full, without inter-reflection, without visibility](images/{FIGURE.name})\n\n"
+        f"![Full, without inter-reflection, without visibility](images/{FIGURE})\n\n"
         + table(("Scene", "Variant", "mean light / full", "PSNR against full, dB"), rows)
     )

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from judge import frame_camera, psnr
 from light_cases import BOUNCES, Case, Reference
-from report import OUT, ROOT, table
+from report import OUT, ROOT, picture_path, table
 from subjects import source_digest, spread_materials
 
 from drgs_blender.build.make import make_asset
 from drgs_blender.core.asset import Asset, Mesh
 from drgs_blender.core.asset.container import read_asset, write_asset
 
-FIGURE = ROOT / "docs" / "images" / "efficiency.png"
+FIGURE = "efficiency.png"
 MESH = Path("data/meshes/odedstein/armadillo/armadillo.obj")
 #: Rays of each picture that a reference is the mean of.
 PART = 128
@@ -115,7 +115,7 @@ def measure(case: Case, options: argparse.Namespace) -> list[Curve]:
     return curves
 
 
-def draw(curves: list[Curve]) -> None:
+def draw(curves: list[Curve], options: argparse.Namespace) -> None:
     """Quality and time over samples, side by side."""
     import matplotlib
 
@@ -134,8 +134,7 @@ def draw(curves: list[Curve]) -> None:
         axes.grid(alpha=0.3)
         axes.xaxis.set_major_formatter("{x:.0f}")
     left.legend(fontsize="small")
-    FIGURE.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(FIGURE, dpi=120)
+    figure.savefig(picture_path(FIGURE, options), dpi=120)
     pyplot.close(figure)
 
 
@@ -145,7 +144,7 @@ def efficiency(options: argparse.Namespace) -> str:
         return f"Not measured: {MESH.name} is not among the development data here (DRGS_SHARED)."
     case = Armadillo("armadillo", "armadillo", "city")
     curves = measure(case, options)
-    draw(curves)
+    draw(curves, options)
     mesh = read_asset(case.files[0]).mesh
     text = (
         f"Armadillo, {len(mesh.faces):,} triangles, spread materials, {case.light}.exr, {options.size}x{options.size}, "
@@ -154,7 +153,7 @@ def efficiency(options: argparse.Namespace) -> str:
         f"over the subject against {options.reference_rays} rays (mean over seeds, same subpixels and tracer) without "
         "denoiser. Seconds: whole frame, everything rebuilt. Without MIS, all samples at the visible point are of "
         "the cosine; further hits are as always.\n\n"
-        f"![PSNR and time over samples](images/{FIGURE.name})\n\n"
+        f"![PSNR and time over samples](images/{FIGURE})\n\n"
     )
     columns = ("Samples", *(f"{c.name}: dB / s" for c in curves))
     rows = [

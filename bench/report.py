@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
@@ -15,11 +16,14 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENT = ROOT / "docs" / "benchmarks.md"
 OUT = ROOT / "out" / "bench"
+#: Pictures of pages, and where they go unless they are published.
+IMAGES, GALLERY = ROOT / "docs" / "images", ROOT / "out" / "gallery"
 
 HEADER = """# Benchmarks
 
-Every figure here was measured by a program in `bench/`, which wrote its own section. `make bench` runs them all. Some
-tables have a plot below them in the site that `make docs` builds, drawn from their numbers.
+Every figure here was measured by a program in `bench/`, which wrote its own section. `make bench` runs them all; in the
+commands below `python` is that of the checkout, `.venv/bin/python`. Some tables have a plot below them in the site that
+`make docs` builds, drawn from their numbers.
 """
 
 
@@ -68,6 +72,19 @@ def store_row(file: Path, name: str, value: Any) -> dict[str, Any]:
     rows[name] = value
     file.write_text(json.dumps(rows, indent=1))
     return rows
+
+
+def add_publish(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--publish`` of programs that draw pictures of pages."""
+    parser.add_argument("--publish", action="store_true", help="pictures go to docs/images, not to out/gallery")
+
+
+def picture_path(name: str, options: argparse.Namespace) -> Path:
+    """Where a picture of a page is written, which is said: out/gallery, with ``--publish`` docs/images."""
+    folder = IMAGES if options.publish else GALLERY
+    folder.mkdir(parents=True, exist_ok=True)
+    print(f"writes {(folder / name).relative_to(ROOT)}", flush=True)
+    return folder / name
 
 
 def section_pattern(name: str) -> re.Pattern[str]:

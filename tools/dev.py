@@ -19,6 +19,7 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -94,6 +95,7 @@ ALL = (suites.LINT, "blender", FLOOR, NEWEST_LTS, "farm", "engine")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand; the return value is the exit code."""
     args = parse(argv)
+    before = signal.signal(signal.SIGTERM, job_runner.interrupt)  # programs in groups of their own end, too
     try:
         return args.run(args)
     except Failure as failure:
@@ -102,6 +104,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("dev.py: interrupted", file=sys.stderr)
         return 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -504,6 +508,7 @@ def run_docs(args: argparse.Namespace) -> int:
     """Build the site: the reference of Blender's side by Blender, all else by the generator."""
     blender, generator = ensure_blender(), ensure_docs()
     pages = ROOT / "build" / "docs" / "blender"
+    print("== reference of operators and properties, by Blender", flush=True)
     shutil.rmtree(pages, ignore_errors=True)
     command = [str(blender), str(ROOT / "tools" / "blender_reference.py"), "--out", str(pages)]
     try:

@@ -243,10 +243,12 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     source, html = args.out / "source", args.out / "html"
     try:
+        print("== pages and plots, reference of the Python modules", flush=True)
         modules = lay_out(ROOT, source, args.out / "blender")
         shutil.rmtree(html, ignore_errors=True)
         options = ["-W", "--keep-going", "-q", "-j", "auto", "-d", str(args.out / "doctrees")]
         options += ["-c", str(ROOT / "tools" / "site"), str(source)]
+        print("== the site, by Sphinx: some minutes, and silent unless something is wrong", flush=True)
         if code := sphinx(["-E", "-b", "html", *options, str(html)]):
             return code
         check(modules, html)

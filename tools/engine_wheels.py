@@ -14,12 +14,15 @@ import csv
 import hashlib
 import io
 import json
+import os
 import re
 import subprocess
 import sys
 import tempfile
+import time
 import zipfile
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -131,6 +134,7 @@ def fetch(platform: str, python: str) -> list[Path]:
     """
     names = locked(platform, python)
     for name in missing(platform, python):
+        print(f"fetches {name}", flush=True)
         distribution, version, *_, abi, tags = name.removesuffix(".whl").split("-")
         _download(f"{distribution}=={version}", python, () if tags == "any" else tags.split("."), (abi,))
     for name, digest in names.items():
@@ -140,6 +144,26 @@ def fetch(platform: str, python: str) -> list[Path]:
         if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
             raise WheelError(f"{path} is not the file of tools/engine_wheels.json; delete it, and it is fetched again")
     return [CACHE / name for name in names]
+
+
+def slim_all(wheels: Sequence[Path]) -> list[Path]:
+    """`slim` of each, side by side, as LZMA leaves Python's lock alone; says each that is not there yet."""
+
+    def packed(wheel: Path) -> Path:
+        if (target := _slimmed(wheel)).is_file():
+            return target
+        began = time.monotonic()
+        made = slim(wheel)
+        size, seconds = made.stat().st_size / 1e6, time.monotonic() - began
+        print(f"packed {wheel.name}, {size:.1f} MB, in {seconds:.0f} s", flush=True)
+        return made
+
+    if waiting := sum(not _slimmed(wheel).is_file() for wheel in wheels):
+        print(f"packs {waiting} wheels, once; the largest take minutes", flush=True)
+    largest = sorted(set(wheels), key=lambda wheel: -wheel.stat().st_size)  # first, so that nothing waits for it alone
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:  # some 300 MB each
+        made = dict(zip(largest, pool.map(packed, largest), strict=True))
+    return [made[wheel] for wheel in wheels]
 
 
 def slim(wheel: Path) -> Path:

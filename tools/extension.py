@@ -193,11 +193,7 @@ def build(
         Naming every fault.
     """
     text = (root / MANIFEST).read_text(encoding="utf-8")
-    packages = (
-        []
-        if bundle is None
-        else [engine_wheels.slim(path) for path in engine_wheels.fetch(bundle[0], bundle[1].python)]
-    )
+    packages = [] if bundle is None else engine_wheels.slim_all(engine_wheels.fetch(bundle[0], bundle[1].python))
     if bundle is not None:
         text = manifest_text(text, *bundle, (path.name for path in packages))
     manifest = tomllib.loads(text)

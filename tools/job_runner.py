@@ -138,7 +138,7 @@ class Runner:
     @contextlib.contextmanager
     def _ending(self) -> Iterator[None]:
         """End everything that still runs, also where this program is asked to end."""
-        before = signal.signal(signal.SIGTERM, _interrupt)
+        before = signal.signal(signal.SIGTERM, interrupt)
         try:
             yield
         finally:
@@ -222,7 +222,8 @@ class _Running:
         return f"{time.monotonic() - self.began:.0f} s"
 
 
-def _interrupt(*_: object) -> None:
+def interrupt(*_: object) -> None:
+    """Handler of a signal that ends a program as Ctrl+C does."""
     raise KeyboardInterrupt
 
 

@@ -103,7 +103,7 @@ def test_versions_of_the_lock_are_those_of_the_table():
         assert {name.lower().replace("-", "_"): version for name, version in wanted.items()} == found
 
 
-def test_slim_wheels_are_the_same_packages_without_what_nobody_reads(tmp_path):
+def test_slim_wheels_are_the_same_packages_without_what_nobody_reads(tmp_path, capfd):
     path, big = tmp_path / "small-1.0-py3-none-any.whl", bytes(3 << 20)
     files = {
         "small/__init__.py": b"x = 1\n",
@@ -126,7 +126,10 @@ def test_slim_wheels_are_the_same_packages_without_what_nobody_reads(tmp_path):
     assert {row.partition(",")[0] for row in record.splitlines()} == {*kept, "small-1.0.dist-info/RECORD"}
     once = slim.read_bytes()
     slim.unlink()
-    assert engine_wheels.slim(path).read_bytes() == once
+    capfd.readouterr()
+    for again, said in ((False, f"packed {path.name}"), (True, "")):  # what is there is not packed again
+        assert engine_wheels.slim_all([path]) == [slim] and slim.read_bytes() == once
+        assert said in (out := capfd.readouterr().out) and bool(out) != again
 
 
 def source_with(folder: Path, *names: str) -> Path:

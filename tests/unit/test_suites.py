@@ -145,6 +145,27 @@ def test_an_interrupt_ends_everything(tmp_path, how):
     assert all(gone(int(path.read_text())) for path in files)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such signal")
+def test_a_program_of_dev_ends_with_it(tmp_path):
+    (tmp_path / "tools").mkdir()
+    (tmp_path / "tools" / "extension.py").write_text(SLEEP.format("", ""))
+    program = (
+        f"import pathlib, sys; sys.path.insert(0, {str(ROOT / 'tools')!r}); import dev\n"
+        "dev.both, dev.ROOT = lambda: None, pathlib.Path.cwd()\n"
+        "dev.python_of = lambda _: pathlib.Path(sys.executable)\n"
+        "sys.exit(dev.main(['extension']))\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", program], cwd=tmp_path)
+    files = [tmp_path / name for name in ("pid", "child")]
+    until = time.monotonic() + 30
+    while not all(path.exists() and path.read_text() for path in files):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) == 130
+    assert all(gone(int(path.read_text())) for path in files)
+
+
 def test_jobs_wait_for_others_and_for_an_empty_machine(suites, tmp_path):
     note = (
         "import time; open('log', 'a').write('{0} begins\\n'); time.sleep(0.2); open('log', 'a').write('{0} ends\\n')"
