@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import bpy
@@ -133,7 +133,7 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
                         self.warn(f'Object "{name}" has other vertices than before the bake; its light is lost')
                         break
                     write_colours(obj.data, self._attribute_name(number), colours)
-        self.report({"INFO"}, f"Baked the light of {len(self._frames)} frames on {len(self._names)} objects")
+        self.report({"INFO"}, f"Baked the light of {_count(self._frames, 'frame')} on {_count(self._names, 'object')}")
         return {"FINISHED"}
 
     def _visited(self, context: bpy.types.Context) -> Iterator[int]:
@@ -193,6 +193,11 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
         of_faces = uvs.reshape(-1, 3, 2) if fit.corners is None else uvs[fit.corners]
         np.save(path, of_faces, allow_pickle=False)
         return [self._image(obj), str(path)]
+
+
+def _count(items: Sequence[object], word: str) -> str:
+    """How many there are, in words."""
+    return f"{len(items)} {word}" if len(items) == 1 else f"{len(items)} {word}s"
 
 
 def show_image(path: Path, sequence: bool) -> None:

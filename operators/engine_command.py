@@ -224,7 +224,7 @@ class CommandOperator(DrgsOperator):
                 self._tell_warnings("\n".join(errors[:-1]), ended=True)
                 raise AssetError(self._subject, f"{self._failure}: {reason.rstrip('.')}", "")
             self._tell_warnings(output, ended=True)
-            for line in lines:
+            for line in map(self._without_work_file, lines):
                 if line.startswith(_PREFIX):
                     continue
                 messages.note("INFO", line)
@@ -236,6 +236,12 @@ class CommandOperator(DrgsOperator):
             return self.done(context)
         finally:
             self.clear()
+
+    def _without_work_file(self, line: str) -> str:
+        """A line without the file that it is of, where that goes with the work."""
+        if self._folder is None or not line.startswith(str(self._folder)):
+            return line
+        return line.partition(": ")[2] or line
 
     def _release(self, context: bpy.types.Context) -> None:
         running.end(self._running)

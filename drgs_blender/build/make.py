@@ -23,6 +23,8 @@ from .texture import CUT, CUT_OUT, Materials
 from .topology import Net, weld
 
 Array = np.ndarray
+#: Surfels along the mesh's diagonal, at least.
+DENSITY = 140.0
 #: Alpha below which a corner of a face shows nothing.
 _SEEN = 1 / 255
 log = logging.getLogger(__name__)
@@ -33,12 +35,12 @@ def make_asset(
     *,
     up: str | None = None,
     max_triangles: int = MAX_TRIANGLES,
-    density: float = 140.0,
+    density: float | None = None,
     pretrained: Surfels | None = None,
     environment: Environment | str | Path | None = None,
     pose: Pose = "rest",
     scale: float = 1.0,
-    max_surfels: int = MAX_SURFELS,
+    max_surfels: int | None = None,
     max_texture: int = MAX_TEXTURE,
 ) -> Asset:
     """Make an asset from a mesh with textures: glTF, GLB, OBJ, PLY, DAE and whatever else `formats` reads.
@@ -51,8 +53,8 @@ def make_asset(
         "z", "y", "-z" or "-y", the up axis of the file; None is what its format says, and Z where it says nothing.
     max_triangles : int
         Budget of the subdivision that gives texture detail its vertices; a finer mesh is left as it is.
-    density : float
-        See `deform.attach.attach`.
+    density : float, optional
+        See `deform.attach.attach`; None: 140.
     pretrained : Surfels, optional
         Surfels whose place and opacity the attached ones take over (Algorithm 1).
     environment : Environment, str or Path, optional
@@ -61,8 +63,8 @@ def make_asset(
         Of a skinned glTF file, "rest" as Blender's importer rests it or "default" as viewers show the file.
     scale : float
         Factor on all lengths.
-    max_surfels : int
-        Surfels that pieces of faces cut for detail of textures and normal maps may reach.
+    max_surfels : int, optional
+        Surfels that pieces of faces cut for detail of textures and normal maps may reach; None: 400000.
     max_texture : int
         Largest side in pixels of the textures that the mesh keeps; 0: it keeps none.
 
@@ -79,17 +81,29 @@ def make_asset(
     report["notes"] += _assumed(file, up)
     scale_mesh(mesh, scale, name)
     surfels, binding, report["surfels"] = attach(
-        mesh, pretrained, density=density, detail=detail if detail.any else None, most=max_surfels
+        mesh,
+        pretrained,
+        density=DENSITY if density is None else density,
+        detail=detail if detail.any else None,
+        most=MAX_SURFELS if max_surfels is None else max_surfels,
     )
     left = report["surfels"].get("hidden_pieces", 0)
-    if left and len(surfels) >= max_surfels:
-        report["surfels"]["notes"] = [_surfel_note(len(surfels), left, max_surfels, density)]
+    if left and (note := _surfel_note(len(surfels), left, max_surfels, density)):
+        report["surfels"]["notes"] = [note]
     provenance = {"mesh": plain_name(name), "made": "surfels attached to the mesh", "report": report}
     return Asset(surfels, mesh, binding, read_environment_of(environment), provenance)
 
 
-def _surfel_note(count: int, left: int, most: int, density: float) -> str:
-    """Why `left` surfels of `count` show less than is known of the surface; -1: none was made smaller for it."""
+def _surfel_note(count: int, left: int, most: int | None, density: float | None) -> str:
+    """Why `left` surfels of `count` show less than is known of the surface; -1: none was made smaller for it.
+
+    Empty where no limit is the reason, and where two defaults meet, which the user did not choose.
+    """
+    if left < 0 and most is density is None:
+        return ""
+    density, most = DENSITY if density is None else density, MAX_SURFELS if most is None else most
+    if count < most:
+        return ""
     if left < 0:
         return (
             f"no surfels are made smaller for textures and normal maps: --density {density:g} alone makes {count} of "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import logging
+import os
 import re
 import shutil
 from collections.abc import Collection
@@ -114,6 +115,15 @@ def has_pictures(source: Path) -> bool:
         return bool(_photographs(source)) or find_video(source) is not None
     except (OSError, AssetError):
         return False
+
+
+def check_pictures(source: Path) -> None:
+    """Say of what has neither cameras nor pictures what is expected. Raises AssetError; not of what is not there."""
+    more = "a video, or photographs with their cameras, as COLMAP and nerfstudio write them"
+    expected = f"Give a folder with photographs in it or in its {', '.join(FOLDERS[:-2])} or {FOLDERS[-2]}, {more}"
+    problem = "is neither a folder of photographs nor a video" if source.is_file() else "holds no pictures"
+    if os.access(source, os.R_OK):
+        raise AssetError(str(source), problem, expected)
 
 
 def _photographs(source: Path) -> list[Path]:

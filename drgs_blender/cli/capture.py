@@ -14,6 +14,7 @@ from pathlib import Path
 from ..core.errors import Cancelled
 from .frame_lines import emit
 from .interrupt import interruptible
+from .output import check_folders
 from .progress import WORK_SECONDS, FractionBar
 from .uncalibrated import FIELDS, MASKS_HELP, add_options, capture_settings, said_of_masks, tell_unused
 
@@ -40,6 +41,7 @@ def run(args: argparse.Namespace) -> int:
     from ..capture.pipeline import make_capture
     from ..reconstruct.settings import Reading
 
+    check_folders(args.out / WORK)
     given = {name: value for name in (*FIELDS, "masks") if (value := getattr(args, name)) is not None}
     reading = Reading(**given)
     masks = resolve_mode(reading.masks, args.input, calibrated=False)

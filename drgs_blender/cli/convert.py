@@ -12,20 +12,22 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.errors import UsageError
+from ..core.errors import AssetError, UsageError
 from ..core.file_types import SPZ_VERSIONS, USD_KERNELS, Held
 from ..core.frame_sequences import frame_path
 from ..formats.axes import UP_AXES
 from ..formats.point_cache import SUFFIXES as POINT_CACHES
 from .convert_sequence import OPTIONS, convert_sequence, is_sequence
 from .frame_range import check_template, parse_frames, requested_frames
-from .output import check_writable
+from .output import check_writable, write_preview
 from .pose_file import add_vertex_order, check_vertex_order, in_asset_order, is_point_cache, open_cache, read_poses
 from .progress import clock
 from .relight import finite, positive
 from .sampling import int_range
 
 logger = logging.getLogger(__name__)
+
+_EXR = b"\x76\x2f\x31\x01"
 
 EXAMPLES = """examples:
   drgs convert capture.ply capture.spz
@@ -38,6 +40,7 @@ EXAMPLES = """examples:
   drgs convert splats.spz splats.ply --up=-y
   drgs convert splats.ply splats.spz --spz-version 3
   drgs convert lego.drgs light.exr
+  drgs convert 'frames/####.exr' 'look/####.png' --frames
   drgs convert helmet.drgs helmet.glb --as splats --materials
   drgs convert shot.blend walk.usdc --object Robot --frames 1-24 --surfels
   drgs convert robot.drgs walk.usdz --vertices walk.pc2 --frames
@@ -49,7 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs convert``."""
     parser.add_argument(
         "input", type=Path, metavar="IN",
-        help="asset, splats, mesh, environment, a .blend with DR-GS objects, or a frame that Blender exported",
+        help="asset, splats, mesh, environment, a .blend with DR-GS objects, a frame that Blender exported, or a "
+        "rendered one, to look at (.png)",
     )  # fmt: skip
     parser.add_argument("output", type=Path, metavar="OUT", help="file to write; its extension chooses the format")
     parser.add_argument(
@@ -215,14 +219,46 @@ def convert_poses(args: argparse.Namespace) -> int:
     return 0
 
 
+def rendered_frame(path: Path) -> np.ndarray | None:
+    """Combined, (h, w, 4) linear, of a frame that DR-GS rendered; None of other files."""
+    from ..render.film.frame_files import read_checksum, read_frame
+
+    try:
+        with path.open("rb") as file:
+            if file.read(len(_EXR)) != _EXR:
+                return None
+        read_checksum(path)
+    except (OSError, AssetError):  # the readers say what is wrong with it
+        return None
+    return read_frame(path)[0].get("Combined")
+
+
+def convert_frame(args: argparse.Namespace, combined: np.ndarray) -> None:
+    """Write a rendered frame as a picture to look at."""
+    if args.output.suffix.lower() != ".png":
+        problem = f"is a rendered frame, and cannot be written as {args.output.suffix or 'a file without an extension'}"
+        raise UsageError(str(args.input), problem, "Name OUT .png, or .exr to use it as a light")
+    for option in ("kind", "up", "from_up", "vertices", "env", "colour"):
+        if getattr(args, option):
+            name = {"kind": "as"}.get(option, option).replace("_", "-")
+            raise UsageError(f"--{name}", "does not go with a rendered frame", "Leave it out")
+    check_writable(args.output, (args.input,))
+    write_preview(args.output, combined)
+    height, width = combined.shape[:2]
+    print(f"{args.output}: {width} x {height} picture, sRGB, without Blender's view transform")
+
+
 def convert(args: argparse.Namespace) -> None:
     """Read, convert, write, and say what was converted."""
     from ..formats.writers import WRITERS, either, find_writer, names_for
     from .convert_source import open_source
 
+    suffix = args.output.suffix.lower()
+    if suffix != ".exr" and (frame := rendered_frame(args.input)) is not None:  # else it is a light
+        convert_frame(args, frame)
+        return
     with clock(args, "reading"):
         source = open_source(args)
-    suffix = args.output.suffix.lower()
     wanted: list[Held] = [args.kind] if args.kind else list({w.kind: 0 for w in WRITERS if suffix in w.extensions})
     if wanted and not set(wanted) & set(source.kinds):
         words = {"environment": "captured light", "mesh": "mesh", "splats": "splats"}

@@ -10,6 +10,7 @@ import logging
 from pathlib import Path
 
 from ..core.errors import UsageError
+from ..core.file_types import Kind
 from ..core.frame_sequences import frame_path
 from ..formats.axes import UP_AXES
 from .frame_range import check_template, requested_frames
@@ -96,7 +97,12 @@ def _import(args: argparse.Namespace) -> int:
         raise UsageError("--exposure", "belongs to --remove-light", "Give both")
 
     from ..build.importer import import_asset
+    from ..formats.registry import find_format
 
+    kinds: dict[Kind, Path | None] = {"surfels": args.surfels, "mesh": args.mesh, "environment": args.env}
+    for kind, path in kinds.items():
+        if path is not None:
+            find_format(path, kind)  # before minutes of compiling
     prepare_engine(args, "import")
     given = {name: value for name in ("resolution", "max_triangles") if (value := getattr(args, name)) is not None}
     with clock(args, "importing"):

@@ -117,7 +117,7 @@ def build_parser() -> argparse.ArgumentParser:
         parents=[shared],
     )
     parser.add_argument("--version", action="version", version=f"drgs {__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for command in COMMANDS:
         module = importlib.import_module(f".{command.module}", __package__)
         sub = commands.add_parser(
@@ -156,7 +156,11 @@ def run_command(arguments: Sequence[str], run: Callable[[argparse.Namespace], in
     """Parse and run; every way to end becomes an exit code here. `run` does it instead of the command's own module."""
     verbose = 0
     try:
-        args = build_parser().parse_args(join_values(arguments))
+        parser = build_parser()
+        args = parser.parse_args(join_values(arguments))
+        if args.command is None:
+            parser.print_help(sys.stderr)
+            parser.exit(errors.EXIT_USAGE, "\ndrgs: a COMMAND is missing; those above are known\n")
         verbose = getattr(args, "verbose", 0)
         args.verbose, args.quiet = verbose, getattr(args, "quiet", False)
         args.progress = getattr(args, "progress", None)

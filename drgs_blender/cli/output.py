@@ -53,6 +53,7 @@ def check_writable(path: Path, inputs: Iterable[Path | None] = ()) -> None:
     """
     check_not_input(path, inputs)
     _check_name(path)
+    check_folders(path)
     try:
         if path.is_dir():
             raise WriteError(str(path), "is a folder", "Choose the name of a file")
@@ -66,6 +67,14 @@ def check_writable(path: Path, inputs: Iterable[Path | None] = ()) -> None:
     except (OSError, RuntimeError) as error:  # pathlib's RuntimeError: links in a circle
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise WriteError(str(path), f"cannot be written ({reason})", "Check the folder and its permissions") from error
+
+
+def check_folders(path: Path) -> None:
+    """Refuse an output below something that is no folder. Raises WriteError, which names that."""
+    for parent in path.parents:
+        with contextlib.suppress(OSError, RuntimeError):  # one that cannot be looked at is told when it is made
+            if parent.exists() and not parent.is_dir():
+                raise WriteError(str(parent), "is no folder", f"Choose another place for {path.name}, or remove it")
 
 
 def check_not_input(path: Path, inputs: Iterable[Path | None]) -> None:

@@ -182,12 +182,14 @@ def run(args: argparse.Namespace) -> int:
     from ..capture.masks.default_mode import resolve_mode
     from ..capture.masks.stage import check_mode
     from ..capture.normal_model import load_model
-    from ..capture.pictures import has_pictures
+    from ..capture.pictures import check_pictures, has_pictures
     from ..reconstruct.readers import has_cameras, read_capture
     from ..reconstruct.settings_table import NONE, as_tables
 
-    # The readers say what is wrong with what has neither cameras nor pictures.
-    calibrated = has_cameras(args.capture) or not has_pictures(args.capture)
+    calibrated = has_cameras(args.capture)
+    if not calibrated and not has_pictures(args.capture):
+        check_pictures(args.capture)
+        calibrated = True  # the readers say what else is wrong with it
     masks = resolve_mode(reading.masks, args.capture, calibrated)
     check_mode(masks)
     if reading.normals != NONE:

@@ -201,7 +201,10 @@ def check_size(camera: Camera, passes: Sequence[str]) -> None:
 
 
 def override(settings: RenderSettings, args: argparse.Namespace) -> RenderSettings:
-    """`settings` with every option that was given."""
+    """`settings` with every option that was given.
+
+    Sub-pixel samples that were not given are at most the samples of a pixel.
+    """
     numbers = (
         "samples",
         "bounces",
@@ -217,6 +220,8 @@ def override(settings: RenderSettings, args: argparse.Namespace) -> RenderSettin
     if args.strategy_samples or args.samples is not None:
         given["strategy_samples"] = args.strategy_samples
     result = replace(settings, **given)
+    if result.subpixel_count > result.sample_count and args.subpixel_samples is None:
+        return replace(result, subpixel_samples=result.sample_count)
     if result.subpixel_count > result.sample_count:
         problem = f"{result.subpixel_count} is more than the {result.sample_count} samples of a pixel"
         raise UsageError("--subpixel-samples", problem, "Use more samples, or fewer of these")

@@ -97,9 +97,11 @@ def channel_faults(state: ObjectState, asset: Asset, shown: Collection[str], set
         if settings.rays_see == "surfels" and not (passes or emits):
             found.append(f"{name}: {own} {_BE[len(lobes)]} shown to the camera alone; other rays meet surfels without")
     if passes and settings.camera_sees == "surfels":
-        found.append(f"{name}: light passes it, so the camera sees its mesh, not its surfels")
+        found.append(
+            f"{name}: part of it is transparent (such as glass), so the camera sees its mesh instead of its surfels"
+        )
     if (passes or emits) and settings.rays_see == "surfels":
-        found.append(f"{name}: it emits light or lets light pass, so rays meet its mesh, not its surfels")
+        found.append(f"{name}: part of it emits light or is transparent, so rays meet its mesh instead of its surfels")
     if bare and state.visibility.shadow_catcher and settings.rays_see == "mesh":
         found.append(f"{name}: has no mesh, so as a shadow catcher it is in no reflection. Set Rays See to Surfels")
     if bare and asset.surfels.emission is not None:

@@ -235,6 +235,14 @@ FORMATS: tuple[Format, ...] = (
 )
 
 
+_ASSET = "Render it by `drgs relight` or import it into Blender; `drgs convert` writes its mesh, splats or light"
+#: What to do with a file of the one kind where the other is wanted.
+_INSTEAD: dict[tuple[Kind, Kind | None], str] = {
+    ("mesh", "surfels"): "`drgs make`, Make Asset in Blender, makes an asset of a mesh",
+    ("surfels", "mesh"): "`drgs import`, Import in Blender, makes an asset of surfels or splats",
+}
+
+
 def find_format(path: Path, kind: Kind | None = None) -> Format:
     """The format of the file (or folder) at `path`, of the wanted `kind` where one is given.
 
@@ -261,12 +269,15 @@ def find_format(path: Path, kind: Kind | None = None) -> Format:
     understood = "; ".join(f"{f.name} ({' '.join(f.extensions)})" for f in wanted)
     if kind is None:
         understood = f"DR-GS asset (.drgs); {understood}"
+    instead = ""
     if recognised:
         found = f"is {recognised[0].name}, not {kind}"
+        instead = recognised[0].instead or _INSTEAD.get((recognised[0].kind, kind), "")
+    elif head.startswith(ZIP) and b"manifest.json" in head[:64]:
+        found, instead = "is a DR-GS asset already", _ASSET
     else:
         found = "is a folder" if folder else "is of no known format" if head else "is empty"
-    instead = recognised[0].instead + ". " if recognised and recognised[0].instead else ""
-    raise AssetError(str(path), found, f"{instead}Understood: {understood}")
+    raise AssetError(str(path), found, f"{instead}. Understood: {understood}".removeprefix(". "))
 
 
 def read(path: str | Path, *, kind: Kind | None = None) -> AnyFile:

@@ -34,6 +34,13 @@ def colours(obj, name: str) -> np.ndarray:
     return values.reshape(-1, 4)
 
 
+def test_what_is_said_names_no_file_that_goes_with_the_work(lit, capfd):
+    assert bpy.ops.drgs.bake_light(samples=3) == {"FINISHED"}
+    said = capfd.readouterr().out
+    assert "\n86 vertices of " in f"\n{said}" and "Baked the light of 1 frame on 1 object\n" in said
+    assert "drgs-bake-" not in said and ".npy" not in said
+
+
 @pytest.mark.slow
 def test_a_frame_and_an_animation_go_to_attributes_of_all_objects(lit, scene, tmp_path):
     bpy.ops.import_scene.drgs(filepath=str(write_ball(tmp_path / "two.drgs")))

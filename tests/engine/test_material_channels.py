@@ -205,7 +205,8 @@ def test_what_is_not_shown_or_otherwise_is_said(save, asset_path, make_frame, tm
     assert said(varnished, camera_sees="mesh", rays_see="surfels") == [f"Ball: {only}"]
     (told,) = said(varnished, shading_model="paper")
     assert told == "Ball: the shading model Cook-Torrance leaves out its specular and coat. Choose Principled"
-    assert said(save(opacity=0.5)) == ["Ball: light passes it, so the camera sees its mesh, not its surfels"]
+    told = "Ball: part of it is transparent (such as glass), so the camera sees its mesh instead of its surfels"
+    assert said(save(opacity=0.5)) == [told]
     asset = read_asset(asset_path)
     own = replace(asset.surfels, coat=np.ones(len(asset.surfels), np.float32))
     write_asset(tmp_path / "bare.drgs", Asset(own, Mesh.empty()))

@@ -99,7 +99,8 @@ def test_what_is_said_of_a_mesh_in_place_of_surfels_stays(
     """A frame that is drawn as of meshes is still one of *Camera Sees: Surfels*."""
     frame = veil(make_frame(subpixel_samples=0), session, folder)
     said = session.render(frame).warnings
-    assert said == ["Ball: light passes it, so the camera sees its mesh, not its surfels"]
+    told = "Ball: part of it is transparent (such as glass), so the camera sees its mesh instead of its surfels"
+    assert said == [told]
     session.view("A", frame)
     refined = session.refine("A")
     assert refined is not None and refined.warnings == said

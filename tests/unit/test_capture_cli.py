@@ -185,6 +185,16 @@ def test_what_has_cameras_or_no_pictures_is_left_to_the_readers(tmp_path, photog
     assert has_cameras(scene.folder)
 
 
+def test_what_is_expected_of_a_folder_without_pictures_is_said(tmp_path, capsys):
+    """Not that another command would take them: this one does."""
+    (tmp_path / "notes.txt").touch()
+    for path, problem in ((tmp_path, "holds no pictures"), (tmp_path / "notes.txt", "is neither a folder of")):
+        assert main(["reconstruct", str(path), "--out", str(tmp_path / "o.drgs")]) == EXIT_BAD_ASSET
+        said = capsys.readouterr().err
+        assert f"{path}: {problem}" in said and "or in its images, photos or input, a video, or" in said
+        assert "drgs capture" not in said
+
+
 def test_a_world_that_is_to_stay_stays_and_brings_its_points(tmp_path, caplog):
     import json
 

@@ -12,11 +12,12 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from drgs_blender.cli import doctor
+from drgs_blender.cli import doctor, import_surfels
 from drgs_blender.cli.find_blender import find_blender
 from drgs_blender.cli.inspect_file import as_lines, short_lines
 from drgs_blender.cli.main import main
 from drgs_blender.compute.warp import runtime
+from drgs_blender.core import errors
 from drgs_blender.core.asset.container import read_asset
 from drgs_blender.core.errors import DeviceError
 from drgs_blender.formats.gltf import read_gltf
@@ -176,6 +177,50 @@ def test_inspect_knows_every_kind(cube, tmp_path, capsys):
     assert described(tmp_path / "paint.png", capsys)["kind"] == "environment"
     assert main(["inspect", str(cube)]) == 0
     assert "faces: 12 x 3 int32" in capsys.readouterr().out
+
+
+def test_a_rendered_frame_becomes_a_picture_to_look_at(tmp_path, capsys):
+    """And is taken for a light only where one is written."""
+    combined = np.zeros((4, 8, 4), np.float32)
+    combined[:2] = (0.5, 0.25, 0, 0.5)  # premultiplied
+    for number in (1, 2):
+        write_frame(tmp_path / f"{number:04}.exr", {"Combined": combined * number}, {})
+    pattern = ["convert", str(tmp_path / "####.exr")]
+    assert main([*pattern, str(tmp_path / "look" / "####.png"), "--frames"]) == 0
+    assert "0001.png: 8 x 4 picture, sRGB" in capsys.readouterr().out
+    first, second = (np.asarray(Image.open(tmp_path / "look" / f"000{k}.png")) for k in (1, 2))
+    assert first[0, 0].tolist() == [255, 188, 0, 128] and not first[2:].any() and second[0, 0, 3] == 255
+    frame = str(tmp_path / "0001.exr")
+    assert main(["convert", frame, str(tmp_path / "a.jpg")]) == errors.EXIT_USAGE
+    assert "0001.exr: is a rendered frame, and cannot be written as .jpg. Name OUT .png" in capsys.readouterr().err
+    assert main(["convert", frame, str(tmp_path / "a.png"), "--env", frame]) == errors.EXIT_USAGE
+    assert "--env: does not go with a rendered frame" in capsys.readouterr().err
+    assert main(["convert", frame, str(tmp_path / "light.exr")]) == 0
+    assert "8 x 4 environment" in capsys.readouterr().out
+
+
+def test_what_is_an_asset_already_is_said(tmp_path, capsys):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    asset = tmp_path / "a.drgs"
+    assert main(["make", str(tmp_path / "a.obj"), "--out", str(asset), "--density", "4"]) == 0
+    for command in ("make", "import"):
+        assert main([command, str(asset), "--out", str(tmp_path / "b.drgs")]) == errors.EXIT_BAD_ASSET
+        said = capsys.readouterr().err
+        assert "a.drgs: is a DR-GS asset already. Render it by `drgs relight` or import it into Blender" in said
+
+
+def test_what_is_no_surfels_is_refused_before_kernels_are_compiled(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(import_surfels, "prepare_engine", lambda *_: pytest.fail("compiles first"))
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    out = ["--out", str(tmp_path / "b.drgs")]
+    assert main(["import", str(tmp_path / "a.obj"), *out]) == errors.EXIT_BAD_ASSET
+    assert "is Wavefront OBJ, not surfels. `drgs make`, Make Asset in Blender, makes" in capsys.readouterr().err
+    surfels = str(splats(tmp_path / "s.ply"))
+    packed = str(tmp_path / "s.spz")
+    assert main(["convert", surfels, packed]) == 0
+    assert main(["import", surfels, "--mesh", packed, *out]) == errors.EXIT_BAD_ASSET
+    assert main(["make", packed, *out]) == errors.EXIT_BAD_ASSET
+    assert capsys.readouterr().err.count("s.spz: is SPZ, not mesh. `drgs import`, Import in Blender, makes") == 2
 
 
 def test_inspect_names_the_passes_of_another_program(tmp_path, capsys):

@@ -212,6 +212,24 @@ def test_only_given_options_override_the_scene():
     assert (changed.film_transparent, changed.shading_model, changed.seed, changed.bounces) == (False, "paper", 9, 4)
 
 
+def test_positions_that_were_not_given_are_at_most_the_rays():
+    """Those of the scene, and those that the number of samples chooses."""
+    scene = RenderSettings(samples=16, subpixel_samples=4)
+    for words, most in ((["--samples", "1"], 1), (["--strategy-samples", "1,1,0"], 2), (["--samples", "8"], 4)):
+        assert sampling.override(scene, options(words, False)).subpixel_count == most
+    assert sampling.override(RenderSettings(), options(["--samples", "1"], True)).subpixel_count == 1
+    with pytest.raises(errors.UsageError, match="32 is more than the 16 samples"):
+        sampling.override(scene, options(["--subpixel-samples", "32"], False))
+
+
+def test_without_a_command_all_are_listed(capsys):
+    for words in ([], ["-q"]):
+        assert main(words) == errors.EXIT_USAGE
+        said = capsys.readouterr()
+        assert not said.out and "COMMAND is missing" in said.err
+        assert all(re.search(rf"^ +{c.name} +{c.about[:20]}", said.err, re.M) for c in COMMANDS)
+
+
 def test_more_positions_than_rays_is_refused():
     with pytest.raises(errors.UsageError, match="--subpixel-samples"):
         sampling.override(RenderSettings(), options(["--samples", "4", "--subpixel-samples", "8"], True))
@@ -239,6 +257,23 @@ def test_unwritable_output_is_found_before_the_work(tmp_path):
         with pytest.raises(errors.WriteError):
             check_writable(path)
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("below", ["o.exr", "a/b/o.exr"])
+def test_a_file_in_the_place_of_a_folder_is_named(tmp_path, monkeypatch, capsys, below):
+    """Also by the commands, those of a folder among them."""
+    (tmp_path / "file").touch()
+    with pytest.raises(errors.WriteError, match="is no folder") as caught:
+        check_writable(tmp_path / "file" / below)
+    assert caught.value.subject == str(tmp_path / "file")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "s.blend").touch()
+    commands = {
+        "make m.glb": "file/a.drgs", "render s.blend --frames 1": f"file/{below}", "capture photographs": "file/statue"
+    }  # fmt: skip
+    for command, out in commands.items():
+        assert main([*command.split(), "--out", out]) == errors.EXIT_CANNOT_WRITE
+        assert "file: is no folder. Choose another place" in capsys.readouterr().err
 
 
 def test_farm_lines_parse_and_stay_benign(capsys):

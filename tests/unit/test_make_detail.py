@@ -11,6 +11,7 @@ import trimesh
 from PIL import Image as Pillow
 from test_build_make import plane, ramp
 
+from drgs_blender.build import make
 from drgs_blender.build.make import make_asset, read_mesh_file
 from drgs_blender.build.surface_detail import CornerFrames
 from drgs_blender.core.asset.container import read_asset, write_asset
@@ -110,7 +111,7 @@ def test_normals_of_the_file_shade_a_mesh_that_is_divided() -> None:
     np.testing.assert_allclose(shading_normals(asset), np.tile(lean, (len(asset.surfels), 1)), atol=2e-3)
 
 
-def test_surfels_show_textures_that_the_mesh_has_no_vertices_for() -> None:
+def test_surfels_show_textures_that_the_mesh_has_no_vertices_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """More surfels, less error; none where nothing is hidden, and never more than the budget."""
     file = plane(2, checker(240, 15))  # its edges are not those of halved triangles
 
@@ -132,6 +133,13 @@ def test_surfels_show_textures_that_the_mesh_has_no_vertices_for() -> None:
     assert len(dense.surfels) == 256 and "--density 10 alone makes 256 of them, --max-surfels is 1" in note
     enough = make_asset(plane(2, checker(8, 2)), max_triangles=8, density=10, max_surfels=20_000)
     assert len(enough.surfels) < 20_000 and "notes" not in enough.provenance["report"]["surfels"]
+    monkeypatch.setattr(make, "DENSITY", 10.0)
+    monkeypatch.setattr(make, "MAX_SURFELS", 1)
+    plain = make_asset(file, max_triangles=8)  # defaults that meet are not the user's choice
+    assert len(plain.surfels) == 256 and "notes" not in plain.provenance["report"]["surfels"]
+    for chosen in ({"density": 10}, {"max_surfels": 1}):
+        (note,) = make_asset(file, max_triangles=8, **chosen).provenance["report"]["surfels"]["notes"]
+        assert "--density 10 alone makes 256 of them, --max-surfels is 1" in note
     plain = make_asset(plane(2), max_triangles=8, density=10, max_surfels=20_000)
     assert len(plain.surfels) == 256 and "hidden_pieces" not in plain.provenance["report"]["surfels"]
 
