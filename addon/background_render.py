@@ -26,13 +26,13 @@ _NEWS_SECONDS = 10.0
 _next_news = 0.0
 
 
-def is_news(phase: str) -> bool:
-    """Whether a phase is to be printed: kernels are compiled, which may take minutes, and nothing was said lately."""
+def say_preparing(phase: str) -> None:
+    """Without a window, print now and then how many kernels are compiled, which may take minutes."""
     global _next_news
-    if not is_preparing(phase) or time.monotonic() < _next_news:
-        return False
-    _next_news = time.monotonic() + _NEWS_SECONDS
-    return True
+    if bpy.app.background and is_preparing(phase) and time.monotonic() >= _next_news:
+        _next_news = time.monotonic() + _NEWS_SECONDS
+        sys.stdout.write(f"drgs: {phase}\n")
+        sys.stdout.flush()
 
 
 def fail(text: str, code: int) -> None:

@@ -178,8 +178,7 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
     def _progress(self, phase: str, fraction: float) -> None:
         self.update_stats("", phase)
         self.update_progress(fraction)
-        if bpy.app.background and background_render.is_news(phase):
-            self.report({"INFO"}, phase)  # which Blender prints
+        background_render.say_preparing(phase)
 
     def _show(self, depsgraph: bpy.types.Depsgraph, frame: Frame, passes: dict[str, np.ndarray]) -> None:
         """Hand the passes to Blender, whose rows run upwards."""

@@ -7,6 +7,7 @@ import os
 import subprocess
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -65,6 +66,19 @@ def test_a_warning_is_printed_once_without_a_window(ball, scene, captured, capfd
     printed = "".join(capfd.readouterr())
     assert printed.count("Fog") == 1 and "Warning: 1 volume object is not rendered by DR-GS: Fog" in printed
     assert not [record for record in caplog.records if "Fog" in record.message]
+
+
+def test_compiling_is_said_without_a_window_but_not_each_kernel(monkeypatch, capsys):
+    background, preparing = part("addon.background_render"), part("drgs_blender.core.phases").PREPARING
+    engine = SimpleNamespace(update_stats=lambda *_: None, update_progress=lambda _: None)
+    progress = part("addon.render_engine.engine").DrgsRenderEngine._progress
+    monkeypatch.setattr(background, "_next_news", 0.0)
+    for phase in ("Light", f"{preparing}, 1 of 9", f"{preparing}, 2 of 9", "Light"):
+        progress(engine, phase, 0.5)
+    assert capsys.readouterr().out == f"drgs: {preparing}, 1 of 9\n"
+    monkeypatch.setattr(background, "_next_news", time.monotonic())
+    progress(engine, f"{preparing}, 7 of 9", 0.5)
+    assert capsys.readouterr().out == f"drgs: {preparing}, 7 of 9\n"
 
 
 def test_without_a_card_f12_is_rendered_on_the_processor_and_says_so(ball, scene):
