@@ -17,7 +17,9 @@ def jobs_of(frame: Frame) -> list[str]:
         jobs += ["captured", "lights"]
     if settings.rays_see == "surfels" or (frame.camera.panorama and settings.camera_sees == "surfels"):
         jobs.append("surfel rays")
-    if settings.denoise == "svgf":
+    seen = [state.visibility for state in frame.objects] + [state.visibility for state in frame.meshes]
+    catchers = any(visibility.shadow_catcher for visibility in seen)
+    if settings.denoise == "svgf" or (settings.denoise != "none" and catchers):
         jobs.append("denoise")
     if frame.lights or frame.meshes:
         jobs.append("lights")

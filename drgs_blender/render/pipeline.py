@@ -20,6 +20,7 @@ from ..core.memory import give_back
 from ..core.passes import BY_NAME, pass_of
 from .backend import CPU, RenderBackend
 from .camera import camera_parameters
+from .denoise.catchers import smooth_catchers
 from .denoise.demodulation import PAD
 from .denoise.kept_light import to_trace
 from .denoise.oidn import QUALITIES, denoise_oidn, require
@@ -179,6 +180,7 @@ def render(
     if history is None:
         components = denoised(film, frame, check, backend)
     else:
+        smooth_catchers(seen.catcher, film.catchers, check)
         picture = NoisyPicture(seen.components, seen.variance, film.guides(), motions[2])
         components, signal = backend.denoise_next(
             picture, history.signal, split_light(frame), history.still, check, history.turned
@@ -201,7 +203,12 @@ def render(
 
 
 def denoised(film: Film, frame: Frame, check: Check, backend: RenderBackend = CPU) -> Array | None:
-    """(h, w, 4, 3) light of the film without noise, by the denoiser of the frame; None without one."""
+    """(h, w, 4, 3) light of the film without noise, by the denoiser of the frame; None without one.
+
+    That of its catchers is denoised in the film itself.
+    """
+    if frame.settings.denoise != "none":
+        smooth_catchers(film.pixels.catcher, film.catchers, check)
     if frame.settings.denoise in QUALITIES:
         settings = frame.settings
         light, guides = film.pixels.components, film.guides()

@@ -261,9 +261,10 @@ class Progressive:
             if lights is not None and lights.seen:
                 rows = slice(strip.rows[0] - camera.window[1], strip.rows[1] - camera.window[1])
                 film.pixels.emission[rows] += visible_lights(lights.tables, self._parameters, camera.window[0], buffer)
+        components = denoised(film, self.frame, check, self._backend)  # first: the world is seen through its catchers
         made = surfaces.passes() | groups.passes(film.seen_environment())
         names = tuple(name for name in self.frame.passes if name not in made)
-        made |= film.passes(names, made, denoised(film, self.frame, check, self._backend))
+        made |= film.passes(names, made, components)
         return {name: made[name] for name in self.frame.passes}
 
 

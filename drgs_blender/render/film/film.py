@@ -32,6 +32,7 @@ from ..gbuffer.gbuffer import GBuffer
 from ..lights.environment import EnvironmentLight, envmap_radiance, map_at
 from ..sampling import luminance
 from ..shading_points import CATCHER, UNLIT, Radiance
+from .catcher_film import CatcherFilm
 from .guides import Guides
 from .light_passes import LIGHT_PASSES, add_light, light_parts
 from .object_numbers import ObjectNumbers, number_of
@@ -125,6 +126,7 @@ class Film:
         self.parameters = parameters
         self.round = camera.panorama in ("fisheye", "equisolid")
         self.pixels = Pixels.empty(size)
+        self.catchers = CatcherFilm(camera, settings, parameters)
         self.environment, self.veiled = (sparse_zeros((*size, 3)) for _ in range(2))
         self.unlit: Array | None = None
         self.transmitted: Array | None = None
@@ -149,6 +151,7 @@ class Film:
         y0, y1 = buffer.rows
         rows = slice(y0 - top, y1 - top)
         points = buffer.points
+        self.catchers.add(buffer, radiance)
         unlit = np.flatnonzero(points.flags & UNLIT)
         if len(unlit):
             row, column = np.divmod(points.pixel[unlit], int(self.parameters[WIDTH]))
@@ -340,11 +343,8 @@ def _develop(y0, y1, points, surfaces, light, p, pixels):  # type: ignore[no-unt
                 nx, ny, nz = surfaces.normal[nearest, 0], surfaces.normal[nearest, 1], surfaces.normal[nearest, 2]
             pixels.normal[y, x, 0], pixels.normal[y, x, 1], pixels.normal[y, x, 2] = nx, ny, nz
             inverse = np.float32(1.0) / total
-            pixels.albedo[y, x, 0], pixels.albedo[y, x, 1], pixels.albedo[y, x, 2] = (
-                r * inverse,
-                g * inverse,
-                b * inverse,
-            )
+            pixels.albedo[y, x, 0], pixels.albedo[y, x, 1] = r * inverse, g * inverse
+            pixels.albedo[y, x, 2] = b * inverse
             pixels.roughness[y, x], pixels.metallic[y, x] = rough * inverse, metal * inverse
             pixels.object_row[y, x] = np.float32(surfaces.object_index[nearest])
             first = last
