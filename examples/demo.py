@@ -49,7 +49,7 @@ def steps(out: Path, frames: str) -> list[Step]:
     of_scene = (EXAMPLES / "captured", extension, *scripts)
     return [
         # Those of the simulation first; what is not compiled when it is needed is waited for.
-        environments.kernels("kernels", "simulate", "frame", "mesh", "lights", "denoise", seconds=45.0),
+        environments.kernels("kernels", "simulate", "frame", "mesh", "lights", "denoise", "broken", seconds=45.0),
         building(extension),
         Step("scene", "Setting the scene", setting, 20.0, ("extension", *for_blender()), scene, of_scene),
         Step(

@@ -49,16 +49,21 @@ def building(extension: Path) -> Step:
 
 
 def frames_saved(text: str, count: int) -> Callable[[str], tuple[str, float] | None]:
-    """Of lines of `drgs render`, how many of `count` frames are done; `text` begins what is said of it."""
-    done = 0
+    """Of lines of `drgs render`, how many of `count` frames are done; `text` begins what is said of it.
+
+    The part that is done is that of the frames which were not there before: these alone tell the time of one.
+    """
+    done = there = 0
 
     def counted(line: str) -> tuple[str, float] | None:
-        nonlocal done
-        saved = line.startswith("Saved: ")
-        if not (saved or (line.startswith("Fra:") and ("| Preparing" in line or "| Sample 0/" in line))):
+        nonlocal done, there
+        saved, skipped = line.startswith("Saved: "), line.startswith("skipping existing frame")
+        begun = line.startswith("Fra:") and ("| Preparing" in line or "| Sample 0/" in line)
+        if not (saved or skipped or begun):
             return None
         done += saved
-        return f"{text}, {done} of {count} frames", done / count
+        there += skipped
+        return f"{text}, {done + there} of {count} frames", done / max(count - there, 1)
 
     return counted
 

@@ -39,7 +39,7 @@ from steps import Step, run_steps  # noqa: E402
 
 SPOT, CAT = EXAMPLES / "spot", EXAMPLES / "cat" / "egyptian_cat.glb"
 #: Of the engine's kernels.
-JOBS = ("make", "simulate", "frame", "mesh", "lights", "denoise")
+JOBS = ("make", "simulate", "frame", "mesh", "lights", "denoise", "broken")
 #: Each rendered from its .blend.
 SHOTS = ("droop", "fall")
 
@@ -58,12 +58,12 @@ def steps(out: Path, frames: str) -> list[Step]:
         environments.kernels("kernels", *JOBS, seconds=45.0),
         building(extension),
         Step(
-            "cow", "Making the cow", make_cow, 10.0, (environments.FOR_ENGINE,), cow, (SPOT,),
+            "cow", "Making the cow", make_cow, 8.0, (environments.FOR_ENGINE,), cow, (SPOT,),
             before=partial(textured_cow, out),
         ),
-        Step("cat", "Making the cat", make_cat, 10.0, ("cow",), cat, (CAT,)),
+        Step("cat", "Making the cat", make_cat, 18.0, ("cow",), cat, (CAT,)),
         Step(
-            "scene", "Baking what falls and droops", setting, 120.0, after, out / "fall.blend",
+            "scene", "Baking what falls and droops", setting, 145.0, after, out / "fall.blend",
             (SPOT, CAT, extension, *scripts), before=partial(forget_frames, out),
         ),
         Step("check", "Measuring how far the cows droop", [*own, "--measure"], 1.0, ("scene",)),
@@ -77,7 +77,7 @@ def steps(out: Path, frames: str) -> list[Step]:
                 shot,
                 "Starting Blender",
                 render,
-                4.0 + 2.2 * count,
+                10.0 * count,
                 (found[-1].name,),
                 count=frames_saved(f"Rendering {shot}", count),
                 measured=True,

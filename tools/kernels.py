@@ -20,8 +20,14 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import kernel_archive
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from drgs_blender.core.frame import ObjectState
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = ROOT / "examples"
@@ -52,6 +58,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[object]]]:
     yield "viewport", [*own, "viewport", folder]
     yield "captured", [*drgs, "relight", folder / "playbot.drgs", "--captured", *relight[relight.index("--camera") :]]
     yield "surface passes", [*own, "surface passes", folder]
+    yield "broken", [*own, "broken", folder]
     yield "panorama", [*own, "panorama", folder]
     yield "linked lights", [*own, "linked lights", folder]
     yield "light groups", [*own, "light groups", folder]
@@ -94,6 +101,36 @@ def make_environment(folder: Path) -> None:
     (folder / "bodies.json").write_text(json.dumps(settings | {"bodies": bodies}))
     camera = {"matrix_world": [[1, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0], [0, 0, 0, 1]], "width": 48, "height": 48}
     (folder / "camera.json").write_text(json.dumps(camera | {"fov_x": 40}))
+
+
+def torn(body: ObjectState, lifted: float) -> ObjectState:
+    """An object of which particles have lifted the upper half."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from drgs_blender.core.asset.container import read_asset
+    from drgs_blender.core.frame import Inside, Particles
+    from drgs_blender.simulation.fill import fill
+
+    mesh = read_asset(Path(body.asset)).mesh
+    height = np.ptp(mesh.vertices[:, 2])
+    filled = fill(mesh.vertices, mesh.faces, height / 12)
+    spacing, rest = filled.space.spacing, np.ascontiguousarray(filled.points, np.float32)
+    to_cells = np.eye(4)
+    to_cells[:3, :3] /= spacing
+    to_cells[:3, 3] = -filled.space.origin / spacing
+    middle = mesh.vertices[:, 2].min() + height / 2
+
+    def moved(places: np.ndarray) -> np.ndarray:
+        up = np.where(places[:, 2:] > middle, [[0.0, 0.0, lifted * height]], 0.0)
+        return np.asarray(places + up, np.float32)
+
+    gradients = np.tile(np.eye(3, dtype=np.float32), (len(rest), 1, 1))
+    particles = Particles(rest, moved(rest), gradients, cells=to_cells)
+    return replace(
+        body, vertices=moved(mesh.vertices), particles=particles, tear=2 * spacing, inside=Inside((0.0, 1.0, 0.0))
+    )
 
 
 def engine(folder: Path, what: str) -> None:
@@ -154,6 +191,12 @@ def engine(folder: Path, what: str) -> None:
         elif what == "surface passes":
             names = ("DiffDir", "GlossDir", "Mist", "UV", "IndexMA")
             client.render(replace(frame, passes=names))
+        elif what == "broken":
+            for sees in ("surfels", "mesh"):
+                for lifted in (0.05, 1.0):  # as whole as it was; then apart
+                    client.render(
+                        replace(frame, objects=[torn(body, lifted)], settings=replace(settings, camera_sees=sees))
+                    )
         elif what == "panorama":
             around = replace(camera, panorama="fisheye", fov=3.0)
             client.render(replace(frame, camera=around, settings=replace(settings, film_transparent=True)))

@@ -248,9 +248,8 @@ class _Run:
                 self._line.clear()
                 command = " ".join(str(part) for part in step.command)
                 status = "\n".join(f"    {line}" for line in step.tail)
-                raise StepFailed(
-                    f"{step.text} failed ({step.process.returncode}): {command}\n{status}\nAll of it: {self._log}"
-                )
+                failed = f"{step.title or step.text} failed ({step.process.returncode})"
+                raise StepFailed(f"{failed}: {command}\n{status}\nAll of it: {self._log}")
             if step.makes is not None:
                 _stamp_file(step.makes).write_text(json.dumps({"of": step.stamp}), encoding="utf-8")
             self._done.add(step.name)
@@ -260,7 +259,7 @@ class _Run:
     def _show(self) -> None:
         running = [s for s in self._steps if s.process is not None and s.name not in self._done]
         text = f"{len(self._done)} of {len(self._steps)} done. {', '.join(s.status for s in running)}"
-        self._line.show(text, self._left())
+        self._line.show(text.rstrip(), self._left())
 
     def _left(self) -> str:
         """The time until the last step, of those that wait for each other, is done; "" where too little tells it."""

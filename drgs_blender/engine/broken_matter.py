@@ -29,6 +29,12 @@ _ROUGH = 0.5
 _ENDS, _MOST, _LEAST = 3.4, 90, 0.3
 
 
+def can_break(state: ObjectState) -> bool:
+    """Whether an object is of particles that are known to be neighbours, until they are apart."""
+    particles = state.particles
+    return particles is not None and particles.cells is not None and state.tear > 0 and not particles.skin
+
+
 class _Known(NamedTuple):
     """What is known of an asset's mesh, and the particles in it, at rest."""
 
@@ -64,9 +70,7 @@ class BrokenMatter:
             Particles, or the lattice that they fill, are not what they must be; names the object.
         """
         particles, mesh = state.particles, loaded.asset.mesh
-        if particles is None or particles.cells is None or state.tear <= 0:
-            return None
-        if particles.skin or not len(mesh.faces):
+        if particles is None or particles.cells is None or not can_break(state) or not len(mesh.faces):
             return None
         check_particles(state)
         vertices = mesh.vertices if state.vertices is None else state.vertices

@@ -6,6 +6,7 @@ from ..core.frame import Frame, Light, MeshState
 from ..core.passes import AOVS, COLOURS
 from ..render.film.surface_film import CHANNELS
 from ..render.lights.light_groups import groups_of
+from .broken_matter import can_break
 
 
 def jobs_of(frame: Frame) -> list[str]:
@@ -25,6 +26,8 @@ def jobs_of(frame: Frame) -> list[str]:
         jobs.append("lights")
     if frame.previous is not None or frame.next is not None:
         jobs.append("motion")
+    if any(can_break(state) for state in frame.objects):
+        jobs.append("broken")
     if any(name.startswith("Crypto") for name in frame.passes):
         jobs.append("mattes")
     if {*CHANNELS, *COLOURS}.intersection(frame.passes) or any(name.startswith(AOVS) for name in frame.passes):

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from pictures import assert_same_bits, fresh
 
+from drgs_blender.compute import manifest
 from drgs_blender.core.errors import AssetError
 from drgs_blender.core.frame import Inside, MotionStep, Particles, Pose
+from drgs_blender.deform import bond_kernels, crack_nodes, cut_faces, wall_faces
 from drgs_blender.deform.bonds import Bonds
+from drgs_blender.engine.kernel_jobs import jobs_of
 from drgs_blender.engine.scene_warnings import scene_warnings
 from drgs_blender.render.scene.ray_masks import CAMERA, ORDINARY, SHADOW, SURFELS
 from drgs_blender.render.scene.trace_mesh import mask_of
@@ -292,3 +295,25 @@ def test_surfels_are_tied_to_what_is_left_of_cut_faces_and_not_to_walls(session,
     assert len(shut) == 1
     for mask in shut.values():
         assert mask & (ORDINARY | SURFELS | SHADOW | CAMERA) == SURFELS | light | CAMERA
+
+
+def test_kernels_of_broken_matter_are_compiled_ahead(session, make_frame, filling):
+    """Those that a frame calls when its matter breaks are among those that are prepared while it is whole."""
+    whole = torn_frame(make_frame, filling, 0.0, GREEN)
+    session.render(torn_frame(make_frame, filling, 1.2, GREEN))
+    jobs = jobs_of(whole)
+    assert "broken" in jobs
+    listed = {(kernel.module, kernel.name): manifest.signature(kernel) for kernel in manifest.needed(jobs)}
+    called = [
+        (module.__name__, name, found.signatures)
+        for module in (bond_kernels, crack_nodes, cut_faces, wall_faces)
+        for name, found in vars(module).items()
+        if getattr(getattr(found, "_cache", None), "kind", "") == "kernel"
+        and found.py_func.__module__ == module.__name__
+        and found.signatures
+    ]
+    assert len(called) > 8
+    for module_name, name, signatures in called:
+        assert listed.get((module_name, name)) in signatures, f"{module_name}:{name}"
+    whole.objects[0].tear = 0.0
+    assert "broken" not in jobs_of(whole), "what cannot break needs none of them"

@@ -132,6 +132,17 @@ def test_frames_are_counted_once_each():
     assert counts == [24, 12, 1, 4, 2]
 
 
+def test_frames_that_are_there_count_as_done_and_tell_no_time():
+    import demo_run
+
+    counted = demo_run.frames_saved("Rendering", 8)
+    lines = ["Fra:- | Starting Blender", "skipping existing frame '1.exr'", "skipping existing frame '2.exr'"]
+    lines += ["skipping existing frame '3.exr'", "Fra:4 | Rendering | Sample 0/8", "Saved: '4.exr'", "Saved: '5.exr'"]
+    words, parts = zip(*filter(None, map(counted, lines)))
+    assert words[-1] == "Rendering, 5 of 8 frames" and words[0] == "Rendering, 1 of 8 frames"
+    assert parts == (0.0, 0.0, 0.0, 0.0, 0.2, 0.4)
+
+
 def test_the_film_asks_for_its_encoder_before_anything_else(tmp_path, capsys, monkeypatch):
     import demo_film
 
