@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 _ROOT = Path("/")
-#: Bytes from which on NumPy asks for huge pages.
-_LARGE = 1 << 22
+#: Pixels of a picture from which on its memory counts for more than the time of first writes: between HD and full HD.
+_LARGE = 1_500_000
 
 
 def total_memory(root: Path = _ROOT) -> float:
@@ -72,23 +72,24 @@ def give_back() -> None:
 
 
 def sparse_zeros(shape: tuple[int, ...]) -> np.ndarray:
-    """Zeros, of which on Linux only those parts take memory that are written, and all of it goes back when they go.
+    """Zeros of a picture, of which on Linux, where it is large, only those parts take memory that are written.
 
-    NumPy asks for huge pages of 2 MiB for large arrays: who writes a part of each row of a picture takes memory for all
-    of it. Here pages have the usual size, whose first write costs more time.
+    All of it goes back when they go. NumPy asks for huge pages of 2 MiB for large arrays: who writes a part of each row
+    of a picture takes memory for all of it. Here pages have the usual size, whose first write costs more time: 4 % of a
+    frame of 800 x 800 pixels.
 
     Parameters
     ----------
     shape : tuple of int
+        Rows, then columns and what a pixel has, in any order.
 
     Returns
     -------
     float32 array
     """
-    size = 4 * math.prod(shape)
-    if sys.platform == "linux" and size >= _LARGE:
+    if sys.platform == "linux" and shape[0] * max(shape[1:], default=0) >= _LARGE:
         with suppress(OSError):  # none left: NumPy says so in its own way
-            pages = mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+            pages = mmap.mmap(-1, 4 * math.prod(shape), mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
             with suppress(OSError):  # a kernel without huge pages
                 pages.madvise(mmap.MADV_NOHUGEPAGE)
             return np.frombuffer(pages, np.float32).reshape(shape)
