@@ -48,6 +48,8 @@ NEWEST_LTS = "5.2"
 ROOM = 3.5
 #: Seconds that Blender may take to say what its operators and properties are.
 REFERENCE_SECONDS = 300
+#: The same to fetch what tests alone need.
+FETCH_SECONDS = 600
 #: Programs of npm that read our files in the tests and write others for us.
 NODE_PACKAGES = ("@adobe/spz@0.2.2", "@playcanvas/splat-transform@2.7.1", "gltf-validator@2.0.0-dev.3.10")
 #: Shared library that Blender needs -> the Debian package that holds it.
@@ -298,8 +300,12 @@ def fetch(folder: Path, stamp: str, packages: Sequence[str], command: list[str],
     if path.exists() and path.read_text(encoding="utf-8") == text:
         return
     print(f"Fetching {what} (once) ...", flush=True)
-    if subprocess.run(command, cwd=folder).returncode:
-        print(f"Could not fetch {what}, see above: tests that need them are skipped", flush=True)
+    try:
+        failed, why = subprocess.run(command, cwd=folder, timeout=FETCH_SECONDS).returncode, "see above"
+    except subprocess.TimeoutExpired:  # npm tries again and again where it trusts no server
+        failed, why = 1, f"not within {FETCH_SECONDS} s"
+    if failed:
+        print(f"Could not fetch {what}, {why}: tests that need them are skipped", flush=True)
         return
     path.write_text(text, encoding="utf-8")
 

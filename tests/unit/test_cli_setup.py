@@ -116,6 +116,14 @@ def test_where_capture_has_no_wheels_it_is_said_and_tried_again(dev, extras, cap
         assert "Could not fetch the libraries of drgs capture" in capfd.readouterr().out
 
 
+def test_what_never_ends_to_be_fetched_is_left_out(dev, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(dev, "FETCH_SECONDS", 1)
+    command = [sys.executable, "-c", "import time; time.sleep(60)"]
+    dev.fetch(tmp_path, "stamp", ["one"], command, "programs")
+    assert "Could not fetch programs, not within 1 s" in capfd.readouterr().out
+    assert not (tmp_path / "stamp").exists()
+
+
 def test_suites_of_the_engine_and_make_env_fetch_the_libraries_of_capture_and_no_demo_waits(dev, plans, monkeypatch):
     asked = []
     monkeypatch.setattr(dev, "ensure_capture", asked.append)
