@@ -223,6 +223,8 @@ def rendered_frame(path: Path) -> np.ndarray | None:
     """Combined, (h, w, 4) linear, of a frame that DR-GS rendered; None of other files."""
     from ..render.film.frame_files import read_checksum, read_frame
 
+    if not path.is_file():  # opening a pipe may never end
+        return None
     try:
         with path.open("rb") as file:
             if file.read(len(_EXR)) != _EXR:
