@@ -203,16 +203,12 @@ def render(
 
 
 def denoised(film: Film, frame: Frame, check: Check, backend: RenderBackend = CPU) -> Array | None:
-    """(h, w, 4, 3) light of the film without noise, by the denoiser of the frame; None without one.
-
-    That of its catchers is denoised in the film itself.
-    """
+    """(h, w, 4, 3) light without noise, None without a denoiser; that of catchers is denoised in the film itself."""
     if frame.settings.denoise != "none":
         smooth_catchers(film.pixels.catcher, film.catchers, check)
     if frame.settings.denoise in QUALITIES:
-        settings = frame.settings
-        light, guides = film.pixels.components, film.guides()
-        return denoise_oidn(light, guides, split_light(frame), check, settings.denoise, settings.threads)
+        given = film.pixels.components, film.guides(), split_light(frame), check
+        return denoise_oidn(*given, frame.settings.denoise, frame.settings.threads)
     if frame.settings.denoise == "svgf":
         return backend.denoise(film.pixels.components, film.pixels.variance, film.guides(), split_light(frame), check)
     return None

@@ -13,6 +13,8 @@ from types import SimpleNamespace
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+#: Modules of tools/ that run before there is any environment.
+OWN = ("dev", "suites", "job_runner", "junit_report", "environments", "steps")
 
 
 @pytest.fixture
@@ -26,11 +28,11 @@ def dev(monkeypatch, tmp_path):
     return module
 
 
-@pytest.mark.parametrize("name", ["dev.py", "suites.py", "job_runner.py", "junit_report.py"])
+@pytest.mark.parametrize("name", [f"{name}.py" for name in OWN])
 def test_scripts_need_the_standard_library_alone(name):
     source = (ROOT / "tools" / name).read_text()
     imported = {line.split()[1].split(".")[0] for line in source.splitlines() if line.startswith(("import ", "from "))}
-    assert imported <= {*sys.stdlib_module_names, "__future__", "suites", "job_runner", "junit_report"}
+    assert imported <= {*sys.stdlib_module_names, "__future__", *OWN}
 
 
 def test_missing_library_is_named_with_its_package(dev, tmp_path):

@@ -183,7 +183,8 @@ def test_balanced_is_another_network_that_takes_noise_away() -> None:
 def test_the_settings_know_every_network_and_the_pipeline_asks_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(QUALITIES) < set(get_args(get_type_hints(RenderSettings)["denoise"]))
     monkeypatch.setattr(pipeline, "denoise_oidn", lambda *given: given[-2:])
-    film = SimpleNamespace(pixels=SimpleNamespace(components=None), guides=lambda: None)
+    pixels = SimpleNamespace(components=None, catcher=None)
+    film = SimpleNamespace(pixels=pixels, guides=lambda: None, catchers=SimpleNamespace(variance=None))
     for name in QUALITIES:
         frame = SimpleNamespace(settings=RenderSettings(denoise=name, threads=3), passes=())  # type: ignore[arg-type]
         assert pipeline.denoised(film, frame, lambda: None) == (name, 3)  # type: ignore[arg-type, comparison-overlap]

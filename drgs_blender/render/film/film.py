@@ -225,12 +225,8 @@ class Film:
         made |= {"Position": seen.position, "Normal": seen.normal, "Albedo": seen.albedo, "Variance": seen.variance}
         made["Vector"] = np.zeros((*seen.coverage.shape, 4), np.float32) if vector is None else vector
         made["Previous Position"] = seen.position if previous is None else previous
-        scalars = {
-            "Depth": seen.depth,
-            "Roughness": seen.roughness,
-            "Metallic": seen.metallic,
-            "Coverage": seen.coverage,
-        }
+        scalars = {"Depth": seen.depth, "Roughness": seen.roughness, "Metallic": seen.metallic}
+        scalars["Coverage"] = seen.coverage
         scalars |= {name: self._number(kind) for name, kind in _NUMBERS.items() if name in names}
         made |= {name: values[..., None] for name, values in scalars.items()}
         if "Combined" in names:
@@ -246,8 +242,6 @@ class Film:
 
     def _shadow(self) -> Array:
         """(h, w) float32 in [0, 1]: how dense the shadows on catchers are."""
-        if not self.pixels.catcher.any():
-            return np.zeros_like(self.pixels.coverage)
         _, light, unshadowed = np.moveaxis(self.pixels.catcher, 2, 0)
         if not unshadowed.any():
             return np.zeros(light.shape, np.float32)
