@@ -151,7 +151,9 @@ class _Run:
         self, steps: Sequence[Step], log: Path, folder: Path, environment: dict[str, str], log_file: IO[str], line: Line
     ) -> None:
         self._steps, self._log, self._folder = list(steps), log, folder
-        self._environment, self._log_file, self._line = os.environ | environment, log_file, line
+        # Unbuffered: what a Python prints stands in the log when it is printed, and before the error that ends it.
+        self._environment = os.environ | {"PYTHONUNBUFFERED": "1"} | environment
+        self._log_file, self._line = log_file, line
         self._lock = threading.Lock()
         self._done: set[str] = set()
         self._changed = threading.Event()
