@@ -28,14 +28,13 @@ from demo_run import (  # noqa: E402
     building,
     check_folder,
     exit_code,
-    first_steps,
     for_blender,
     frame_count,
-    frames_saved,
-    variables,
+    rendering,
+    run_all,
 )
 from demo_shots import FRAMES  # noqa: E402
-from steps import Step, run_steps  # noqa: E402
+from steps import Step  # noqa: E402
 
 
 def steps(out: Path, frames: str) -> list[Step]:
@@ -47,22 +46,15 @@ def steps(out: Path, frames: str) -> list[Step]:
     setting = [environments.blender(), "-P", EXAMPLES / "demo_scene.py", extension, scene]
     scripts = (EXAMPLES / name for name in ("demo_scene.py", "demo_shots.py", "blender_scenes.py"))
     of_scene = (EXAMPLES / "captured", extension, *scripts)
+    render = [*DRGS, "render", scene, "--frames", frames, "--out", pattern, "--denoise", "svgf", "--overwrite"]
+    rendered = rendering("frames", "Rendering", render, 4.0 + 2.2 * count, ("scene",), count)
+    rendered.before = partial(shutil.rmtree, out / "frames", ignore_errors=True)
     return [
         # Those of the simulation first; what is not compiled when it is needed is waited for.
         environments.kernels("kernels", "simulate", "frame", "mesh", "lights", "denoise", "broken", seconds=45.0),
         building(extension),
         Step("scene", "Setting the scene", setting, 20.0, ("extension", *for_blender()), scene, of_scene),
-        Step(
-            "frames",
-            "Starting Blender",
-            [*DRGS, "render", scene, "--frames", frames, "--out", pattern, "--denoise", "svgf", "--overwrite"],
-            4.0 + 2.2 * count,
-            ("scene",),
-            count=frames_saved("Rendering", count),
-            before=partial(shutil.rmtree, out / "frames", ignore_errors=True),
-            measured=True,
-            title="Rendering",
-        ),
+        rendered,
         Step("strip", "Making the strip", strip, 6.0, ("kernels",)),
         Step("sheet", "Making the contact sheet", [engine, __file__, "--out", out, "--sheet"], 2.0, ("frames",)),
     ]
@@ -78,7 +70,7 @@ def run(out: Path, frames: str, before: Sequence[Step] = ()) -> None:
     out = out.resolve()
     chosen = steps(out, frames)
     check_folder("--out", out)
-    seconds = run_steps([*first_steps(before), *chosen], out / "log.txt", ROOT, variables(out))
+    seconds = run_all(chosen, out, before)
     print(f"Done in {seconds:.0f} s. Look at contact-sheet.png, animation.webp and strip.png in {out}")
 
 

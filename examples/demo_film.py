@@ -34,9 +34,9 @@ from demo_pictures import (  # noqa: E402
     to_bytes,
     with_alpha,
 )
-from demo_run import DRGS, EXAMPLES, building, check_folder, exit_code, first_steps, frames_saved, variables  # noqa: E402
+from demo_run import DRGS, EXAMPLES, building, check_folder, exit_code, frames_saved, run_all  # noqa: E402
 from demo_shots import CAPTURED, ROUND, SHOTS, TURN  # noqa: E402
-from steps import Step, StepFailed, run_steps  # noqa: E402
+from steps import Step, StepFailed  # noqa: E402
 
 from drgs_blender.core.color import linear_to_srgb  # noqa: E402
 from drgs_blender.render.film.frame_files import read_frame  # noqa: E402
@@ -250,7 +250,7 @@ def run(out: Path, folder: Path, cut: bool) -> None:
     check_folder("--out", out)
     check_folder("--publish", folder)
     if not cut:
-        run_steps([*first_steps(()), *steps(out)], out / "log.txt", ROOT, variables(out))
+        run_all(steps(out), out)
     if absent := missing(out):
         first = absent[0].relative_to(out)
         raise StepFailed(

@@ -16,7 +16,7 @@ EXAMPLES = ROOT / "examples"
 sys.path.insert(0, str(ROOT / "tools"))
 
 import environments  # noqa: E402
-from steps import Step, StepFailed  # noqa: E402
+from steps import Step, StepFailed, run_steps  # noqa: E402
 
 DRGS = [environments.python_of(environments.ENGINE), "-m", "drgs_blender.cli.main"]
 
@@ -27,7 +27,6 @@ def variables(out: Path) -> dict[str, str]:
         "BLENDER_USER_RESOURCES": str(out / "blender"),
         "DRGS_ENGINE": str(environments.python_of(environments.ENGINE)),
         "DRGS_BLENDER": str(environments.blender()),
-        "PYTHONUNBUFFERED": "1",
     }
 
 
@@ -40,6 +39,16 @@ def first_steps(before: Sequence[Step]) -> list[Step]:
     """The steps `before`; without any, the environments are there, and their steps do nothing."""
     names = (environments.FOR_ENGINE, *for_blender())
     return list(before) or [Step(name, "", [sys.executable, "-c", ""], 0.1) for name in names]
+
+
+def run_all(steps: Sequence[Step], out: Path, before: Sequence[Step] = ()) -> float:
+    """Run the steps of a demo that writes to `out`, after those `before`; the seconds that it took.
+
+    Raises
+    ------
+    StepFailed
+    """
+    return run_steps([*first_steps(before), *steps], out / "log.txt", ROOT, variables(out))
 
 
 def building(extension: Path) -> Step:
@@ -66,6 +75,12 @@ def frames_saved(text: str, count: int) -> Callable[[str], tuple[str, float] | N
         return f"{text}, {done + there} of {count} frames", done / max(count - there, 1)
 
     return counted
+
+
+def rendering(name: str, title: str, command: list[object], seconds: float, after: tuple[str, ...], count: int) -> Step:
+    """The step of a `drgs render` of `count` frames, which first starts Blender."""
+    counted = frames_saved(title, count)
+    return Step(name, "Starting Blender", command, seconds, after, count=counted, measured=True, title=title)
 
 
 def frame_count(text: str, last: int) -> int:

@@ -28,14 +28,13 @@ from demo_run import (  # noqa: E402
     building,
     check_folder,
     exit_code,
-    first_steps,
     for_blender,
     frame_count,
-    frames_saved,
-    variables,
+    rendering,
+    run_all,
 )
 from demo_shots import SIMULATED  # noqa: E402
-from steps import Step, run_steps  # noqa: E402
+from steps import Step  # noqa: E402
 
 SPOT, CAT = EXAMPLES / "spot", EXAMPLES / "cat" / "egyptian_cat.glb"
 #: Of the engine's kernels.
@@ -72,18 +71,7 @@ def steps(out: Path, frames: str) -> list[Step]:
         pattern = out / shot / "####.exr"
         render = [*DRGS, "render", out / f"{shot}.blend", "--frames", frames, "--out", pattern]
         render += ["--samples", "16", "--denoise", "svgf"]
-        found.append(
-            Step(
-                shot,
-                "Starting Blender",
-                render,
-                10.0 * count,
-                (found[-1].name,),
-                count=frames_saved(f"Rendering {shot}", count),
-                measured=True,
-                title=f"Rendering {shot}",
-            )
-        )
+        found.append(rendering(shot, f"Rendering {shot}", render, 10.0 * count, (found[-1].name,), count))
         sheet = [*own, "--sheet", shot]
         found.append(Step(f"{shot}, sheet", f"Making the contact sheet of {shot}", sheet, 2.0, (shot,)))
     return found
@@ -135,7 +123,7 @@ def run(out: Path, frames: str, before: Sequence[Step] = ()) -> None:
     out = out.resolve()
     chosen = steps(out, frames)
     check_folder("--out", out)
-    seconds = run_steps([*first_steps(before), *chosen], out / "log.txt", ROOT, variables(out))
+    seconds = run_all(chosen, out, before)
     print((out / "droop.txt").read_text().rstrip())
     folders = " and ".join(str(out / shot) for shot in SHOTS)
     print(f"Done in {seconds:.0f} s. Look at contact-sheet.png and animation.webp in {folders}")

@@ -32,7 +32,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import job_runner
 import suites
-from environments import STAMP
+from environments import STAMP, environments, python_of
 from suites import Failure
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -176,11 +176,6 @@ def blender_version(text: str) -> str:
     return version
 
 
-def python_of(folder: Path) -> Path:
-    """The interpreter of an environment."""
-    return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
-
-
 def ensure_engine() -> Path:
     """Make ``.venv`` when needed and return its interpreter."""
     return ensure(*about_engine(), "import drgs_blender")
@@ -278,7 +273,7 @@ def ensure_node() -> None:
     folder.mkdir(exist_ok=True)
     quiet = ["--no-audit", "--no-fund", "--no-update-notifier", "--no-progress", "--loglevel=error"]
     command = [npm, "install", "--prefix", str(folder), "--no-save", *quiet, *NODE_PACKAGES]
-    fetch(folder, "drgs-stamp.json", NODE_PACKAGES, command, "the programs of npm that tests compare with")
+    fetch(folder, STAMP, NODE_PACKAGES, command, "the programs of npm that tests compare with")
 
 
 def ensure_capture(engine: Path) -> None:
@@ -381,7 +376,6 @@ def run_env(args: argparse.Namespace) -> int:
 
 def both() -> None:
     """Make both environments, at the same time; return at once where they are there."""
-    from environments import environments
     from steps import StepFailed, run_steps
 
     if not all(is_made(*about) for about in (about_engine()[:2], about_blender(BLENDER)[:2])):
@@ -495,8 +489,6 @@ def run_demo_simulation(args: argparse.Namespace) -> int:
 def with_steps(script: str, rest: Sequence[str]) -> int:
     """Run a script of the examples that takes the environments as steps before its own."""
     sys.path.insert(0, str(ROOT / "examples"))
-    from environments import environments
-
     return int(importlib.import_module(script).main(rest, environments()))
 
 

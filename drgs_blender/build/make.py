@@ -80,30 +80,22 @@ def make_asset(
     )
     report["notes"] += _assumed(file, up)
     scale_mesh(mesh, scale, name)
+    is_chosen = density is not None or max_surfels is not None
+    density = DENSITY if density is None else density
+    max_surfels = MAX_SURFELS if max_surfels is None else max_surfels
     surfels, binding, report["surfels"] = attach(
-        mesh,
-        pretrained,
-        density=DENSITY if density is None else density,
-        detail=detail if detail.any else None,
-        most=MAX_SURFELS if max_surfels is None else max_surfels,
+        mesh, pretrained, density=density, detail=detail if detail.any else None, most=max_surfels
     )
     left = report["surfels"].get("hidden_pieces", 0)
-    if left and (note := _surfel_note(len(surfels), left, max_surfels, density)):
-        report["surfels"]["notes"] = [note]
+    # Where two defaults meet, which the user did not choose, there is nothing to say.
+    if len(surfels) >= max_surfels and (left > 0 or (left < 0 and is_chosen)):
+        report["surfels"]["notes"] = [_surfel_note(len(surfels), left, max_surfels, density)]
     provenance = {"mesh": plain_name(name), "made": "surfels attached to the mesh", "report": report}
     return Asset(surfels, mesh, binding, read_environment_of(environment), provenance)
 
 
-def _surfel_note(count: int, left: int, most: int | None, density: float | None) -> str:
-    """Why `left` surfels of `count` show less than is known of the surface; -1: none was made smaller for it.
-
-    Empty where no limit is the reason, and where two defaults meet, which the user did not choose.
-    """
-    if left < 0 and most is density is None:
-        return ""
-    density, most = DENSITY if density is None else density, MAX_SURFELS if most is None else most
-    if count < most:
-        return ""
+def _surfel_note(count: int, left: int, most: int, density: float) -> str:
+    """Why `left` surfels of `count` show less than is known of the surface; -1: none was made smaller for it."""
     if left < 0:
         return (
             f"no surfels are made smaller for textures and normal maps: --density {density:g} alone makes {count} of "

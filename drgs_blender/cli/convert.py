@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import AssetError, UsageError
+from ..core.file_integrity import EXR
 from ..core.file_types import SPZ_VERSIONS, USD_KERNELS, Held
 from ..core.frame_sequences import frame_path
 from ..formats.axes import UP_AXES
 from ..formats.point_cache import SUFFIXES as POINT_CACHES
-from .convert_sequence import OPTIONS, convert_sequence, is_sequence
+from .convert_sequence import OPTIONS, check_one_file, convert_sequence, is_sequence, refuse_options
 from .frame_range import check_template, parse_frames, requested_frames
 from .output import check_writable, write_preview
 from .pose_file import add_vertex_order, check_vertex_order, in_asset_order, is_point_cache, open_cache, read_poses
@@ -26,8 +27,6 @@ from .relight import finite, positive
 from .sampling import int_range
 
 logger = logging.getLogger(__name__)
-
-_EXR = b"\x76\x2f\x31\x01"
 
 EXAMPLES = """examples:
   drgs convert capture.ply capture.spz
@@ -181,12 +180,8 @@ def convert_poses(args: argparse.Namespace) -> int:
     if not is_point_cache(args.vertices):
         problem = "is written of a point cache"
         raise UsageError(str(args.output), problem, "Give an asset as IN and a .pc2 or .mdd with --vertices")
-    for option in ("kind", "up", "from_up", "env", "colour"):
-        if getattr(args, option):
-            name = {"kind": "as"}.get(option, option).replace("_", "-")
-            raise UsageError(f"--{name}", "does not go with a point cache", "Leave it out")
-    if "#" in args.output.name:
-        raise UsageError(str(args.output), "has all frames, so its name has no number", "Leave out the #")
+    refuse_options(args, ("kind", "up", "from_up", "env", "colour"), "a point cache")
+    check_one_file(args.output)
     check_writable(args.output, (args.input, args.vertices))
     with clock(args, "reading"):
         mesh = read_asset(args.input).mesh
@@ -227,7 +222,7 @@ def rendered_frame(path: Path) -> np.ndarray | None:
         return None
     try:
         with path.open("rb") as file:
-            if file.read(len(_EXR)) != _EXR:
+            if file.read(len(EXR)) != EXR:
                 return None
         read_checksum(path)
     except (OSError, AssetError):  # the readers say what is wrong with it
@@ -240,10 +235,7 @@ def convert_frame(args: argparse.Namespace, combined: np.ndarray) -> None:
     if args.output.suffix.lower() != ".png":
         problem = f"is a rendered frame, and cannot be written as {args.output.suffix or 'a file without an extension'}"
         raise UsageError(str(args.input), problem, "Name OUT .png, or .exr to use it as a light")
-    for option in ("kind", "up", "from_up", "vertices", "env", "colour"):
-        if getattr(args, option):
-            name = {"kind": "as"}.get(option, option).replace("_", "-")
-            raise UsageError(f"--{name}", "does not go with a rendered frame", "Leave it out")
+    refuse_options(args, ("kind", "up", "from_up", "vertices", "env", "colour"), "a rendered frame")
     check_writable(args.output, (args.input,))
     write_preview(args.output, combined)
     height, width = combined.shape[:2]

@@ -16,7 +16,7 @@ from ..core.frame_sequences import frame_path
 from ..formats.writers import find_writer
 from ..ipc.frame_file import SUFFIX, write_frame_file
 from .blender_process import BlenderProcess
-from .convert_sequence import check_one_file, is_sequence
+from .convert_sequence import check_one_file, is_sequence, refuse_options
 from .find_blender import find_blender
 from .frame_range import check_template, parse_frames
 from .output import check_writable
@@ -44,9 +44,7 @@ def evaluated_frames(args: argparse.Namespace) -> Iterator[argparse.Namespace | 
         raise AssetError(str(args.input), "does not exist", "Check the path of the .blend file")
     if not args.frames:
         raise UsageError(str(args.input), "is a scene, whose frames are not said", "Say them: --frames 1-24")
-    for option in ("vertices", "env", "from_up"):
-        if getattr(args, option):
-            raise UsageError(f"--{option.replace('_', '-')}", "does not go with a .blend", "Leave it out")
+    refuse_options(args, ("vertices", "env", "from_up"), "a .blend")
     frames = parse_frames(args.frames)
     check_writable(args.output, (scene,))
     _check_names(args, frames)

@@ -39,6 +39,14 @@ def check_one_file(path: Path) -> None:
         raise UsageError(str(path), "has all frames, so its name has no number", "Leave out the #")
 
 
+def refuse_options(args: argparse.Namespace, options: Sequence[str], what: str) -> None:
+    """Refuse options, by their names in `args`, that do not go with what IN is. Raises UsageError."""
+    for option in options:
+        if getattr(args, option):
+            name = {"kind": "as"}.get(option, option).replace("_", "-")
+            raise UsageError(f"--{name}", f"does not go with {what}", "Leave it out")
+
+
 def convert_sequence(args: argparse.Namespace, frames: Sequence[int] | None) -> None:
     """Write the frames, by default the only one that there is, as samples of one stage, and say what was written."""
     from ..formats.usd_sequence import write_usd_sequence

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import AssetError
+from ..core.file_integrity import EXR
 from ..core.file_types import CAMERAS
 from ..formats.axes import UP_AXES
 
@@ -29,7 +30,6 @@ EXAMPLES = """examples:
 """
 
 _ZIP = b"PK\x03\x04"
-_EXR = b"\x76\x2f\x31\x01"
 #: Items of a list that a person is shown, and values within values, without --all.
 _FEW, _FEW_WITHIN = 16, 2
 #: Lines that a person is shown without --all, lines of a part that is put into running text, and its letters in a line.
@@ -74,7 +74,7 @@ def inspect_file(path: Path, axes: str = "opengl", up: str | None = None) -> dic
         from ..core.asset.container import inspect_asset
 
         return {"kind": "asset", **inspect_asset(path)}
-    if magic == _EXR and (frame := inspect_frame(path) or inspect_layers(path)):
+    if magic == EXR and (frame := inspect_frame(path) or inspect_layers(path)):
         return frame
     from ..ipc.frame_file import SUFFIX
 

@@ -220,9 +220,9 @@ def override(settings: RenderSettings, args: argparse.Namespace) -> RenderSettin
     if args.strategy_samples or args.samples is not None:
         given["strategy_samples"] = args.strategy_samples
     result = replace(settings, **given)
-    if result.subpixel_count > result.sample_count and args.subpixel_samples is None:
-        return replace(result, subpixel_samples=result.sample_count)
     if result.subpixel_count > result.sample_count:
+        if args.subpixel_samples is None:
+            return replace(result, subpixel_samples=result.sample_count)
         problem = f"{result.subpixel_count} is more than the {result.sample_count} samples of a pixel"
         raise UsageError("--subpixel-samples", problem, "Use more samples, or fewer of these")
     return result

@@ -13,7 +13,9 @@ import re
 import struct
 from typing import Any, BinaryIO
 
-_EXR, _PNG, _JPEG, _RIFF = b"\x76\x2f\x31\x01", b"\x89PNG", b"\xff\xd8\xff", b"RIFF"
+#: What an OpenEXR file begins with.
+EXR = b"\x76\x2f\x31\x01"
+_PNG, _JPEG, _RIFF = b"\x89PNG", b"\xff\xd8\xff", b"RIFF"
 _TIFF = {b"II*\0": "<", b"MM\0*": ">"}
 #: Tags of the places and sizes of a TIFF's strips, and of its tiles; how their numbers are stored, by type.
 _TIFF_PIECES, _TIFF_NUMBERS = ((273, 279), (324, 325)), {3: "H", 4: "I"}
@@ -78,7 +80,7 @@ def crashes_blender(file: str | os.PathLike[str] | bytes) -> bool:
     """
     with _opened(file) as stream:
         start = stream.read(4)
-    return start == _EXR and not is_whole(file)
+    return start == EXR and not is_whole(file)
 
 
 def _opened(file: str | os.PathLike[str] | bytes) -> BinaryIO:
@@ -195,4 +197,4 @@ def _is_whole_tiff(file: _Reader) -> bool:
 
 
 #: By the first four bytes.
-_LOOKS = {_EXR: _is_whole_exr, _PNG: _is_whole_png, _RIFF: _is_whole_webp, **dict.fromkeys(_TIFF, _is_whole_tiff)}
+_LOOKS = {EXR: _is_whole_exr, _PNG: _is_whole_png, _RIFF: _is_whole_webp, **dict.fromkeys(_TIFF, _is_whole_tiff)}

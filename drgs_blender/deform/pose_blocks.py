@@ -65,6 +65,31 @@ def _pose(first, last, mesh, by_corner, linear, sign, rest, out):  # type: ignor
 
 
 @inlined
+def _rows(linear):  # type: ignore[no-untyped-def]
+    """The rows of a matrix in registers: within loops that write arrays they would be read again."""
+    a = linear[0, 0], linear[0, 1], linear[0, 2]
+    b = linear[1, 0], linear[1, 1], linear[1, 2]
+    return a, b, (linear[2, 0], linear[2, 1], linear[2, 2])
+
+
+@inlined
+def _transformed_normal(rows, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """`pose._transformed_normal` with the rows of `linear`."""
+    a, b, c = rows
+    ox = a[0] * nx + b[0] * ny + c[0] * nz
+    oy = a[1] * nx + b[1] * ny + c[1] * nz
+    oz = a[2] * nx + b[2] * ny + c[2] * nz
+    length = math.sqrt(ox * ox + oy * oy + oz * oz)
+    length = 1.0 / length if length > 1e-300 else 0.0
+    ox, oy, oz = ox * length, oy * length, oz * length
+    return (
+        a[0] * ox + a[1] * oy + a[2] * oz,
+        b[0] * ox + b[1] * oy + b[2] * oz,
+        c[0] * ox + c[1] * oy + c[2] * oz,
+    )
+
+
+@inlined
 def _gather(s, begin, count, mesh, by_corner, rest):  # type: ignore[no-untyped-def]
     """Write what surfels from `begin` on read into rows of `s`."""
     for j in range(count):
@@ -93,9 +118,7 @@ def _frames(s, squares, count, linear, sign):  # type: ignore[no-untyped-def]
 
     The row 0 of `squares` becomes the squared length of both tangents.
     """
-    l00, l01, l02 = linear[0, 0], linear[0, 1], linear[0, 2]
-    l10, l11, l12 = linear[1, 0], linear[1, 1], linear[1, 2]
-    l20, l21, l22 = linear[2, 0], linear[2, 1], linear[2, 2]
+    rows = _rows(linear)
     for j in range(count):
         ax, ay, az = np.float64(s[0, j]), np.float64(s[1, j]), np.float64(s[2, j])
         ux, uy, uz = s[3, j] - ax, s[4, j] - ay, s[5, j] - az
@@ -123,12 +146,7 @@ def _frames(s, squares, count, linear, sign):  # type: ignore[no-untyped-def]
         tx, ty, tz = tx / length, ty / length, tz / length
         bx, by, bz = sy * tz - sz * ty, sz * tx - sx * tz, sx * ty - sy * tx
 
-        # `_transformed_normal`
-        ox, oy, oz = l00 * nx + l10 * ny + l20 * nz, l01 * nx + l11 * ny + l21 * nz, l02 * nx + l12 * ny + l22 * nz
-        length = math.sqrt(ox * ox + oy * oy + oz * oz)
-        length = 1.0 / length if length > 1e-300 else 0.0
-        ox, oy, oz = ox * length, oy * length, oz * length
-        hx, hy, hz = l00 * ox + l01 * oy + l02 * oz, l10 * ox + l11 * oy + l12 * oz, l20 * ox + l21 * oy + l22 * oz
+        hx, hy, hz = _transformed_normal(rows, nx, ny, nz)
 
         d = np.float64(s[_OFFSET, j])
         p, q, r = s[_OWN, j], s[_OWN + 1, j], s[_OWN + 2, j]
@@ -163,9 +181,7 @@ def _gather_spans(w, squares, wide, begin, spans, mesh, rest):  # type: ignore[n
 @inlined
 def _span_tangents(w, squares, spans, linear, sign):  # type: ignore[no-untyped-def]
     """Write the tangents by spans into the first six rows of `w`, and whether they stretch the surfels less."""
-    l00, l01, l02 = linear[0, 0], linear[0, 1], linear[0, 2]
-    l10, l11, l12 = linear[1, 0], linear[1, 1], linear[1, 2]
-    l20, l21, l22 = linear[2, 0], linear[2, 1], linear[2, 2]
+    rows = _rows(linear)
     for m in range(spans):
         ax, ay, az = np.float64(w[0, m]), np.float64(w[1, m]), np.float64(w[2, m])
         ux, uy, uz = w[3, m] - ax, w[4, m] - ay, w[5, m] - az
@@ -174,11 +190,7 @@ def _span_tangents(w, squares, spans, linear, sign):  # type: ignore[no-untyped-
         length = math.sqrt(nx * nx + ny * ny + nz * nz)
         proper = length > 1e-10 * (ux * ux + uy * uy + uz * uz + vx * vx + vy * vy + vz * vz)
         nx, ny, nz = nx / length, ny / length, nz / length
-        ox, oy, oz = l00 * nx + l10 * ny + l20 * nz, l01 * nx + l11 * ny + l21 * nz, l02 * nx + l12 * ny + l22 * nz
-        length = math.sqrt(ox * ox + oy * oy + oz * oz)
-        length = 1.0 / length if length > 1e-300 else 0.0
-        ox, oy, oz = ox * length, oy * length, oz * length
-        hx, hy, hz = l00 * ox + l01 * oy + l02 * oz, l10 * ox + l11 * oy + l12 * oz, l20 * ox + l21 * oy + l22 * oz
+        hx, hy, hz = _transformed_normal(rows, nx, ny, nz)
         p, q, r = w[_IN_SPAN, m], w[_IN_SPAN + 1, m], w[_IN_SPAN + 2, m]
         a, b, c = w[_IN_SPAN + 3, m], w[_IN_SPAN + 4, m], w[_IN_SPAN + 5, m]
         fx, fy, fz = ux * p + vx * q + hx * r, uy * p + vy * q + hy * r, uz * p + vz * q + hz * r

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..core.asset import Environment
 from ..core.errors import AssetError
+from ..core.file_integrity import EXR
 from ..core.file_types import READ, Kind
 from .drafts import DRAFTS
 from .environment import read_exr_environment, read_hdr_environment, read_picture_environment
@@ -210,7 +211,7 @@ FORMATS: tuple[Format, ...] = (
     Format("Radiance HDR", _magic(b"#?"), read_hdr_environment, "RGBE and XYZE, old and new runs"),
     Format(
         "OpenEXR",
-        _magic(b"\x76\x2f\x31\x01"),
+        _magic(EXR),
         read_exr_environment,
         "lat-long or cube map; any part or layer with RGB, or luminance",
     ),

@@ -70,7 +70,8 @@ def defined(name: str) -> set[str]:
 
 @pytest.mark.parametrize("name", [name for name in SCRIPTS if not in_blender(name)])
 def test_a_script_outside_blender_can_be_imported(name):
-    importlib.import_module(name)
+    there = dir(importlib.import_module(name))
+    assert {word.partition(".")[0] for word in defined(name)} <= set(there)
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
@@ -105,7 +106,7 @@ def test_steps_wait_for_steps_that_come_before_and_run_what_is_there(name, tmp_p
 @pytest.mark.parametrize("name", DEMOS)
 def test_a_folder_that_cannot_be_written_gets_a_line(name, tmp_path, capsys, monkeypatch):
     module = importlib.import_module(name)
-    monkeypatch.setattr(module, "run_steps", lambda *_: pytest.fail("it has begun"))
+    monkeypatch.setattr(module, "run_all", lambda *_: pytest.fail("it has begun"))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     file = tmp_path / "file"
     file.touch()
@@ -148,7 +149,7 @@ def test_the_film_asks_for_its_encoder_before_anything_else(tmp_path, capsys, mo
 
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "av" else find(name))
-    monkeypatch.setattr(demo_film, "run_steps", lambda *_: pytest.fail("it has begun"))
+    monkeypatch.setattr(demo_film, "run_all", lambda *_: pytest.fail("it has begun"))
     assert demo_film.main(["--out", str(tmp_path / "film")]) == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "av" in said and "`make env`" in said

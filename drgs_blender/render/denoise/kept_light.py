@@ -18,8 +18,8 @@ from ..film.motion_vectors import project
 from ..gbuffer.gbuffer import GBuffer
 from ..sampling import F
 from ..shading_points import CATCHER, SECOND, UNLIT
-from .demodulation import NORMAL, PAD, POSITION, SOURCE, WIDTH, Signal
-from .svgf_temporal import SAME_NORMAL, SAME_PLANE
+from .demodulation import PAD, SOURCE, Signal
+from .svgf_temporal import is_same_surface
 
 Array = np.ndarray
 
@@ -93,14 +93,8 @@ def _choose(first, last, keys, numbers, guide, cameras, turn, corner, ages, out)
         yy, c = np.int64(math.floor(py)), np.int64(math.floor(px)) + PAD
         if guide[yy, SOURCE, c] != F(numbers[owner[i]]):
             continue
-        nx, ny, nz = guide[yy, NORMAL, c], guide[yy, NORMAL + 1, c], guide[yy, NORMAL + 2, c]
-        away = (
-            nx * (position[i, 0] - guide[yy, POSITION, c])
-            + ny * (position[i, 1] - guide[yy, POSITION + 1, c])
-            + nz * (position[i, 2] - guide[yy, POSITION + 2, c])
-        )
-        alike = nx * normal[i, 0] + ny * normal[i, 1] + nz * normal[i, 2]
-        if not (abs(away) * guide[yy, WIDTH, c] < F(SAME_PLANE) and alike >= SAME_NORMAL):
+        ox, oy, oz = position[i, 0], position[i, 1], position[i, 2]
+        if not is_same_surface(guide, yy, c, ox, oy, oz, normal[i, 0], normal[i, 1], normal[i, 2]):
             continue
         known = before[yy, c - PAD]
         out[i] = (row + column + turn) % 2 == 0 or known < SETTLED

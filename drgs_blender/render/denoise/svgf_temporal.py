@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import inlined, njit
 from ...compute.threads import ROWS, over_range
 from ..film.motion_vectors import Motion, SceneState
 from ..sampling import ONE, ZERO, F
@@ -201,6 +201,33 @@ def _look_up(y0, y1, guide, spans, vector, expected, other, other_light, out, so
             look_up_pixel(y, x, guide, vector, expected, other, other_light, out, source)
 
 
+@inlined
+def is_same_surface(other, y, c, px, py, pz, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """Whether a pixel of another frame shows a surface.
+
+    Parameters
+    ----------
+    other : (h, GUIDES, w + 2 PAD) float32 array
+        Guide of that frame.
+    y, c : int64
+        Row and padded column of the pixel.
+    px, py, pz, nx, ny, nz : float32
+        Place and normal of the surface, world space.
+
+    Returns
+    -------
+    bool
+    """
+    ox, oy, oz = other[y, NORMAL, c], other[y, NORMAL + 1, c], other[y, NORMAL + 2, c]
+    away = (
+        ox * (px - other[y, POSITION, c])
+        + oy * (py - other[y, POSITION + 1, c])
+        + oz * (pz - other[y, POSITION + 2, c])
+    )
+    alike = ox * nx + oy * ny + oz * nz
+    return abs(away) * other[y, WIDTH, c] < F(SAME_PLANE) and not alike < SAME_NORMAL
+
+
 @njit
 def look_up_pixel(y, x, guide, vector, expected, other, other_light, out, source):  # type: ignore[no-untyped-def]
     """Reprojection of a pixel: the other picture's light, bilinear over those of four pixels that show its surface.
@@ -241,14 +268,8 @@ def look_up_pixel(y, x, guide, vector, expected, other, other_light, out, source
                 continue
             if other[yy, SOURCE, cc] != surface:
                 continue
-            nx, ny, nz = other[yy, NORMAL, cc], other[yy, NORMAL + 1, cc], other[yy, NORMAL + 2, cc]
-            away = (
-                nx * (expected[y, x, 0] - other[yy, POSITION, cc])
-                + ny * (expected[y, x, 1] - other[yy, POSITION + 1, cc])
-                + nz * (expected[y, x, 2] - other[yy, POSITION + 2, cc])
-            )
-            alike = nx * guide[y, NORMAL, c] + ny * guide[y, NORMAL + 1, c] + nz * guide[y, NORMAL + 2, c]
-            if not (abs(away) * other[yy, WIDTH, cc] < F(SAME_PLANE)) or alike < SAME_NORMAL:
+            nx, ny, nz = guide[y, NORMAL, c], guide[y, NORMAL + 1, c], guide[y, NORMAL + 2, c]
+            if not is_same_surface(other, yy, cc, expected[y, x, 0], expected[y, x, 1], expected[y, x, 2], nx, ny, nz):
                 continue
             total += share
             for k in range(planes):

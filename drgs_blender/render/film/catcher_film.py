@@ -31,9 +31,11 @@ class CatcherFilm:
 
     def add(self, buffer: GBuffer, radiance: Radiance) -> None:
         """Take the points of a strip."""
+        if not self._wanted:
+            return
         points = buffer.points
         caught = np.flatnonzero(points.flags & CATCHER)
-        if not (self._wanted and len(caught)):
+        if not len(caught):
             return
         if self.variance is None:
             self.variance, self._weight, self._depth = (np.zeros(self._size) for _ in range(3))
