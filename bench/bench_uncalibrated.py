@@ -150,7 +150,7 @@ def relit(made: Made, folder: Path, sky: Path, samples: int) -> list[str]:
     masks = [view.mask for view in truth.views]
     assert all(mask is not None for mask in masks)
     mask = np.stack(masks)  # type: ignore[arg-type]
-    true = np.stack([view.colour + 1 - a[..., None] for view, a in zip(truth.views, mask)]).clip(0, 1)
+    true = np.stack([view.colour for view in truth.views])  # laid on white by the reader
     scores = relight_scores(linear, alpha, true, mask)
     ours, flip = on_white(linear * np.array(scores["scale"]), alpha), find_flip()
     show = writer(folder)

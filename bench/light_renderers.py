@@ -265,7 +265,8 @@ def denoised(options: argparse.Namespace) -> str:
     parts = [about]
     for name in filters:
         rows = [(case, ours(case, plan, samples, name), cycles(case, plan, spp, True)) for case in chosen(options)]
-        parts.append(f"### Ours + {name.upper()}\n\n{comparison(rows, options.denoised_levels, 'Cycles + OIDN')}")
+        title = name.upper().replace("-BALANCED", ", balanced")
+        parts.append(f"### Ours + {title}\n\n{comparison(rows, options.denoised_levels, 'Cycles + OIDN')}")
     return "\n\n".join(parts)
 
 
