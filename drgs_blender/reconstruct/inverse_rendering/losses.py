@@ -12,6 +12,9 @@ _KNEE, _EXPONENT = 0.03, 0.6
 #: Reflectance of polished metals in their brightest channel (silver .97, gold 1, copper .96, aluminium .92), and the
 #: power of metallic that counts: the half-metals of the first steps must not be pulled, or bright paint becomes metal.
 _POLISHED, _SURELY = 0.95, 6
+#: Brightest channel from which metals are pulled, and from which wholly. The darkest that are common reflect half (iron
+#: .56, titanium .54): what is darker is patina or dirt, and says nothing of the light.
+_PATINA = 0.25, 0.5
 
 
 def log_loss(predicted: Tensor, photographed: Tensor, clipped: Tensor) -> Tensor:
@@ -29,11 +32,13 @@ def metal_albedo_prior(albedo: Tensor, metallic: Tensor) -> Tensor:
 
     Where light is dim, only metal shows how dim: dark metal in a light that is too even looks almost the same.
     Metals that are used polished reflect nine tenths and more of their brightest channel. Gradients scale a colour and
-    leave its hue; what is not surely metal has none.
+    leave its hue; what is not surely metal, or too dark for polished metal, has none.
     """
     known = albedo.detach()
     brightest = known.max(1, keepdim=True).values.clamp(min=1e-3)
-    return (_surely_metal(metallic)[:, None] * (albedo - known * (_POLISHED / brightest)) ** 2).sum(1).mean()
+    low, high = _PATINA
+    weight = _surely_metal(metallic)[:, None] * ((brightest - low) / (high - low)).clamp(0, 1)
+    return (weight * (albedo - known * (_POLISHED / brightest)) ** 2).sum(1).mean()
 
 
 def metal_smoothness_prior(differences: Tensor, metallic: Tensor, likeness: Tensor) -> Tensor:

@@ -55,7 +55,8 @@ class Settings:
     binary_metallic_prior : float
         Weight that pulls metallic to 0 or 1.
     metal_albedo_prior : float
-        Weight that pulls the brightest channel of the albedo of metals towards .95, that of polished metals.
+        Weight that pulls the brightest channel of the albedo of metals towards .95, that of polished metals;
+        less below .5, not at all below .25, where metal is patina or dirt.
     metal_smoothness : float
         How much more than other albedo that of metals is smoothed, in parts of `smoothness`: there, errors of normals
         leave blotches.
