@@ -30,7 +30,7 @@ from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.compare import Posed, compare
 from drgs_blender.evaluate.metrics import mean_psnr, straight
 from drgs_blender.reconstruct import held_out, pipeline
-from drgs_blender.reconstruct.capture.capture import Capture
+from drgs_blender.reconstruct.capture.capture import WHITE, Capture
 from drgs_blender.reconstruct.capture.training_views import background_of, composed
 from drgs_blender.reconstruct.losses.photometric import Photograph, structural_similarity
 from drgs_blender.reconstruct.model.gaussians import Gaussians
@@ -97,8 +97,7 @@ def on_white(gaussians: Gaussians, capture: Capture) -> str:
     for view in capture.testing:
         with torch.no_grad():
             shown.append(gaussians.render(view.camera, torch.ones(3), turn=view.turn).colour.numpy().clip(0, 1))
-        mask = np.ones((1, 1, 1)) if view.mask is None else view.mask[..., None]
-        true.append(view.colour * mask + (1 - mask))
+        true.append(view.laid_on(WHITE, None))
     return f"{mean_psnr(shown, true):.2f}"
 
 

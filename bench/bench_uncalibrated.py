@@ -32,6 +32,7 @@ from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.flip import find_flip
 from drgs_blender.evaluate.metrics import on_white, relight_scores, ssim, straight
 from drgs_blender.evaluate.truth import read_relit
+from drgs_blender.reconstruct.capture.capture import WHITE
 
 FOLDER = OUT / "uncalibrated"
 COLUMNS = (
@@ -150,7 +151,7 @@ def relit(made: Made, folder: Path, sky: Path, samples: int) -> list[str]:
     masks = [view.mask for view in truth.views]
     assert all(mask is not None for mask in masks)
     mask = np.stack(masks)  # type: ignore[arg-type]
-    true = np.stack([view.colour for view in truth.views])  # laid on white by the reader
+    true = np.stack([view.laid_on(WHITE, truth.background) for view in truth.views])
     scores = relight_scores(linear, alpha, true, mask)
     ours, flip = on_white(linear * np.array(scores["scale"]), alpha), find_flip()
     show = writer(folder)

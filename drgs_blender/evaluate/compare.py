@@ -14,7 +14,7 @@ from ..core.errors import UsageError, first_of
 from ..core.frame import Camera, Particles, World
 from ..deform.gmls import bind_points, carry
 from ..deform.sources import MeshSource
-from ..reconstruct.capture.capture import Capture, View
+from ..reconstruct.capture.capture import RGB, WHITE, Capture, View
 from .flip import find_flip
 from .metrics import depth_error, material_scores, mean_psnr, normal_error, on_white, relight_scores, ssim, straight
 from .truth import Truth, TruthSet
@@ -200,14 +200,10 @@ def posed_as(asset: Asset, truth: Truth) -> Posed:
     return Posed(points.astype(np.float32), particles)
 
 
-def _white(view: View, background: tuple[float, float, float] | None) -> tuple[Array, Array]:
-    """((h, w, 3) encoded picture on white, (h, w) mask) of a photograph."""
-    if view.mask is None:
-        return view.colour, np.ones(view.colour.shape[:2], np.float32)
-    mask = view.mask[..., None]
-    if background is None:  # real surroundings: cut out
-        return view.colour * mask + (1 - mask), view.mask
-    return np.clip(view.colour + (1 - np.asarray(background, np.float32)) * (1 - mask), 0, 1), view.mask
+def _white(view: View, background: RGB | None) -> tuple[Array, Array]:
+    """((h, w, 3) encoded picture on white, (h, w) mask) of a photograph; real surroundings are cut out."""
+    mask = np.ones(view.colour.shape[:2], np.float32) if view.mask is None else view.mask
+    return view.laid_on(WHITE, background), mask
 
 
 def _image_metrics(
@@ -222,7 +218,7 @@ def _image_metrics(
 
 
 def _novel(
-    views: list[View], pictures: list[dict[str, Array]], background: tuple[float, float, float] | None,
+    views: list[View], pictures: list[dict[str, Array]], background: RGB | None,
     distances: Distances, show: Show | None,
 ) -> dict[str, Any]:  # fmt: skip
     wanted = [_white(view, background) for view in views]
@@ -247,7 +243,7 @@ def _novel(
 
 def _relit(item: TruthSet, pictures: list[dict[str, Array]], distances: Distances, show: Show | None) -> dict[str, Any]:
     linear, alpha = (np.stack(parts) for parts in zip(*map(straight, pictures)))
-    wanted = [_white(view, (1.0, 1.0, 1.0)) for view in item.views]
+    wanted = [_white(view, item.background) for view in item.views]
     true, mask = (np.stack(parts) for parts in zip(*wanted))
     scores = relight_scores(linear, alpha, true, mask)
     ours = on_white(linear * np.array(scores["scale"]), alpha)

@@ -17,7 +17,7 @@ from ..core.errors import AssetError
 from ..deform.attach import attach
 from ..formats.images import load_image
 from ..formats.registry import read_environment
-from ..reconstruct.capture.capture import View
+from ..reconstruct.capture.capture import RGB, View
 from ..reconstruct.readers import read_capture
 from ..reconstruct.readers.layout import read_json
 from ..reconstruct.readers.photograph_loading import shrink
@@ -45,6 +45,8 @@ class TruthSet:
     maps : list of dict of str to (h, w, c) array
         Passes of each view: Coverage, and of Albedo, Roughness, Metallic, Normal, Depth what is known; empty where
         nothing is.
+    background : tuple of float or None
+        See `Capture`, of the views.
     """
 
     name: str
@@ -53,6 +55,7 @@ class TruthSet:
     posed: bool
     views: list[View]
     maps: list[dict[str, Array]]
+    background: RGB | None
 
 
 @dataclass(slots=True)
@@ -109,9 +112,10 @@ def read_truth(capture: Path) -> Truth | None:
 
 def _read_set(folder: Path, item: dict[str, Any], lights: dict[str, Array]) -> TruthSet:
     name, light = str(item["name"]), str(item["light"])
-    views = read_capture(folder / str(item["cameras"]), turntable="no").views
+    found = read_capture(folder / str(item["cameras"]), turntable="no")
+    views = found.views
     maps = [read_frame(folder / name / f"{view.name}.exr")[0] for view in views] if item["maps"] else []
-    return TruthSet(name, light, lights[light], bool(item["posed"]), views, maps)
+    return TruthSet(name, light, lights[light], bool(item["posed"]), views, maps, found.background)
 
 
 def true_asset(folder: Path, density: float = 140.0) -> Asset:
@@ -150,7 +154,8 @@ def read_relit(
     radiance = read_environment(light).radiance
     found = read_capture(capture, resolution, axes=axes, up=up, light=light.stem, turntable="no")
     views = found.testing or found.views
-    return TruthSet(light.stem, light.stem, radiance, False, views, _tensoir_maps(capture, views))
+    maps = _tensoir_maps(capture, views)
+    return TruthSet(light.stem, light.stem, radiance, False, views, maps, found.background)
 
 
 def _tensoir_maps(capture: Path, views: list[View]) -> list[dict[str, Array]]:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import AssetError
-from ...reconstruct.capture.capture import Capture
+from ...reconstruct.capture.capture import WHITE, Capture
 from ...reconstruct.readers import nero, read_capture
 from ..metrics import fit_scale
 from .bench import Bench, Distance, eight_bits, existing, find_light, mean_of, read_light, shown_on_white, split_counts
@@ -80,8 +80,7 @@ def measure(bench: Bench, root: Path, name: str, lights: Path | None) -> dict[st
     rows = []
     for number, view in bench.views("views", layout, testing):
         ours = shown_on_white(bench.render(view.camera, bench.own_light(), (1.0, 1.0, 1.0)))
-        mask = np.ones_like(view.colour[..., :1]) if view.mask is None else view.mask[..., None]
-        true = view.colour * mask + 1 - mask
+        true = view.laid_on(WHITE, None)
         bench.show("views", number, ours, true)
         rows.append(bench.scores(eight_bits(ours), eight_bits(true), border=True))
     report: dict[str, Any] = {"views": mean_of(rows), "lights": {}}

@@ -5,8 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from ...core.arrays import Array
 from ...core.frame import Camera
+
+RGB = tuple[float, float, float]
+
+#: What pictures with alpha are laid on, sRGB; the published figures are measured on white.
+WHITE: RGB = (1.0, 1.0, 1.0)
 
 
 @dataclass(slots=True)
@@ -34,6 +41,8 @@ class View:
         world.
     linear : bool
         The picture's file holds linear floats (EXR, merged brackets): their scale says nothing.
+    on_white : bool
+        The mask is the picture's own alpha, and `colour` already lies on `WHITE`.
     """
 
     name: str
@@ -45,6 +54,31 @@ class View:
     above_white: Array | None = None
     turn: Array | None = None
     linear: bool = False
+    on_white: bool = False
+
+    def laid_on(self, wanted: RGB, behind: RGB | None) -> Array:
+        """The object on one colour.
+
+        Parameters
+        ----------
+        wanted : (3,) floats
+            sRGB-encoded; colours are mixed as they are encoded.
+        behind : (3,) floats or None
+            What `colour` shows around the object, where that is one colour (`Capture.background`); None: surroundings
+            that are cut away.
+
+        Returns
+        -------
+        (height, width, 3) float32 array
+            In 0..1; `colour` itself where there is no mask.
+        """
+        if self.mask is None:
+            return self.colour
+        behind = WHITE if self.on_white else behind
+        mask, wanted_colour = self.mask[..., None], np.asarray(wanted, np.float32)
+        if behind is None:
+            return self.colour * mask + wanted_colour * (1 - mask)
+        return np.clip(self.colour + (wanted_colour - np.asarray(behind, np.float32)) * (1 - mask), 0, 1)
 
 
 @dataclass(slots=True)
@@ -65,7 +99,7 @@ class Capture:
 
     source: Path
     views: list[View]
-    background: tuple[float, float, float] | None = None
+    background: RGB | None = None
     points: Array | None = None
 
     @property

@@ -80,10 +80,7 @@ def background_of(capture: Capture) -> tuple[float, float, float]:
 
 def composed(view: View, capture: Capture) -> Array:
     """The colour of `view` over `background_of` the capture, (h, w, 3)."""
-    if capture.background is not None or view.mask is None:
-        return view.colour
-    mask = view.mask[..., None]
-    return view.colour * mask + np.asarray(GREY, np.float32) * (1 - mask)
+    return view.colour if capture.background is not None else view.laid_on(GREY, None)
 
 
 def targets(capture: Capture) -> list[list[Target]]:

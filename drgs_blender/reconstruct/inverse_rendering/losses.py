@@ -28,7 +28,7 @@ def log_loss(predicted: Tensor, photographed: Tensor, clipped: Tensor) -> Tensor
 
 
 def metal_albedo_prior(albedo: Tensor, metallic: Tensor) -> Tensor:
-    """Metal albedo prior: mean squared difference of the colours of metals (n, 3), (n,) from polished ones.
+    """Metal albedo prior: squared difference of the colours of metals (n, 3), (n,) from polished ones, weighted.
 
     Where light is dim, only metal shows how dim: dark metal in a light that is too even looks almost the same.
     Metals that are used polished reflect nine tenths and more of their brightest channel. Gradients scale a colour and

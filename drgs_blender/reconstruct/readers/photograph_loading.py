@@ -11,7 +11,7 @@ from scipy.ndimage import binary_erosion, binary_fill_holes, label
 from ...core.color import linear_to_srgb, to_unit
 from ...core.errors import AssetError
 from ...core.frame import Camera
-from ..capture.capture import View
+from ..capture.capture import WHITE, View
 from .exposures import exposed
 from .layout import Layout, Photograph, load_picture
 from .lens import Lens, resample, undistorted
@@ -19,8 +19,6 @@ from .lens import Lens, resample, undistorted
 Array = np.ndarray
 logger = logging.getLogger(__name__)
 
-#: What pictures with alpha are laid on, sRGB; the published figures are measured on white.
-WHITE = (1.0, 1.0, 1.0)
 #: Pixels darker than this everywhere, or that differ no more than this, are no photograph.
 _BLACK, _ALIKE = 0.02, 0.002
 #: Linear values above this are taken for damage.
@@ -105,7 +103,9 @@ def load_photograph(
     mask = None if mask is None else np.ascontiguousarray(mask, np.float32)
     above = None if above is None else np.ascontiguousarray(layers[..., -3:], np.float32)
     linear = stored.dtype.kind == "f"
-    return View(photograph.name, camera, colour, mask, photograph.test, above_white=above, linear=linear)
+    return View(
+        photograph.name, camera, colour, mask, photograph.test, above_white=above, linear=linear, on_white=premultiplied
+    )
 
 
 def _fitting(lens: Lens, width: int, height: int, subject: str) -> Lens:
