@@ -61,9 +61,9 @@ class View:
 
         Parameters
         ----------
-        wanted : (3,) floats
+        wanted : tuple of float
             sRGB-encoded; colours are mixed as they are encoded.
-        behind : (3,) floats or None
+        behind : tuple of float, optional
             What `colour` shows around the object, where that is one colour (`Capture.background`); None: surroundings
             that are cut away.
 
