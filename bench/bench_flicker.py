@@ -1,4 +1,4 @@
-"""Does a sequence under a light that turns flicker? Noisy, denoised one by one, over time, and in a window.
+"""Does a sequence under a light that turns flicker? Noisy, denoised one by one, over time, and in a window; and Cycles.
 
 python bench/bench_flicker.py [--frames 8] [--size 256] [--samples 32] [--reference 1024] [--step 1]
 """
@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 from flicker import flicker
-from judge import environments, foreground, frame_camera, psnr
+from judge import environments, foreground, frame_camera, psnr, run_cycles
 from ours import SESSION, pinhole
-from report import table, write_section
+from report import OUT, table, write_section
 from subjects import asset_path
 
 from drgs_blender.cli import frame_store
@@ -28,10 +28,13 @@ from drgs_blender.render.film.frame_files import read_frame
 
 Array = np.ndarray
 
+FOLDER = OUT / "flicker"
+TRIANGLES = 82000
+
 
 def frames(options: argparse.Namespace, environment: str) -> list[Frame]:
     """The sequence: the world turns about the vertical axis, all else stands still."""
-    path = asset_path("cat", max_triangles=82000)
+    path = asset_path("cat", max_triangles=TRIANGLES)
     key = SESSION.load_asset(path)
     radiance = read_environment(environments() / f"{environment}.exr").radiance
     camera = pinhole(frame_camera(read_asset(path).mesh.vertices, options.size, azimuth=-60, fill=0.66))
@@ -54,6 +57,31 @@ def rendered(sequence: list[Frame], history: str = "", **settings: object) -> li
         changed = replace(frame, settings=replace(frame.settings, **settings), history=history)  # type: ignore[arg-type]
         out.append(SESSION.render(changed)["Combined"][..., :3])
     return out
+
+
+def by_cycles(options: argparse.Namespace, environment: str, samples: int, denoise: bool) -> Array:
+    """(n, h, w, 4) pictures of the same sequence by Cycles, each with noise of its own."""
+    mesh = read_asset(asset_path("cat", max_triangles=TRIANGLES)).mesh
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    arrays = {name: getattr(mesh, name) for name in ("vertices", "faces", "albedo", "roughness", "metallic")}
+    np.savez(FOLDER / "cat.npz", **arrays)
+    shared = {
+        "mesh": str(FOLDER / "cat.npz"), "environment": str(environments() / f"{environment}.exr"), "bounces": 1,
+        "camera": frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.66), "samples": samples,
+        "denoise": denoise,
+    }  # fmt: skip
+    jobs = [
+        shared | {"rotation_z": options.step * k, "seed": k, "out": str(FOLDER / f"{environment}-{samples}-{k}.npy")}
+        for k in range(options.frames)
+    ]
+    run_cycles(jobs, "flicker")
+    return np.stack([np.load(job["out"]) for job in jobs])
+
+
+def row(environment: str, name: str, shown: Array, truth: Array, mask: Array) -> tuple[str, ...]:
+    """Cells: flicker beyond that of the converged sequence, PSNR from the third frame on."""
+    later = [psnr(a, b, m) for a, b, m in zip(shown[2:], truth[2:], mask[2:])]
+    return environment, name, f"{1e3 * (flicker(shown, mask) - flicker(truth, mask)):.2f}", f"{np.mean(later):.2f}"
 
 
 def in_windows(sequence: list[Frame]) -> tuple[list[Array], list[Array], list[Array]]:
@@ -90,7 +118,6 @@ def main() -> None:
         noisy, windows, coverage = in_windows(sequence)
         truth = np.stack(rendered(sequence, samples=options.reference))
         mask = np.stack([foreground(c, 1) for c in coverage])
-        rest = flicker(truth, mask)
         ways: dict[str, list[Array]] = {
             "noisy": noisy,
             "SVGF, each frame alone": rendered(sequence, denoise="svgf"),
@@ -99,15 +126,18 @@ def main() -> None:
         }
         if available():
             ways["OIDN, each frame alone"] = rendered(sequence, denoise="oidn")
-        for name, pictures in ways.items():
-            shown = np.stack(pictures)
-            later = [psnr(a, b, m) for a, b, m in zip(shown[2:], truth[2:], mask[2:])]
-            rows.append((environment, name, f"{1e3 * (flicker(shown, mask) - rest):.2f}", f"{np.mean(later):.2f}"))
+        rows += [row(environment, name, np.stack(pictures), truth, mask) for name, pictures in ways.items()]
+        theirs = by_cycles(options, environment, options.reference, False)
+        mask = np.stack([foreground(picture[..., 3], 1) for picture in theirs])
+        for name, denoise in (("noisy", False), ("OIDN, each frame alone", True)):
+            shown = by_cycles(options, environment, options.samples, denoise)
+            rows.append(row(environment, f"Cycles: {name}", shown, theirs, mask))
     body = (
         f"cat, {options.size}x{options.size}, {options.samples} samples, {options.frames} frames, the world turns "
         f"{options.step:g} degree(s) a frame. Flicker: mean absolute second difference in time of sRGB luminance, less "
         f"that of {options.reference} rays, in thousandths. PSNR: against {options.reference} rays, foreground, sRGB, "
-        "from the third frame on.\n\n" + table(("World", "Denoiser", "Flicker", "PSNR, dB"), rows)
+        "from the third frame on. Cycles: as many samples a pixel, against its own converged sequence.\n\n"
+        + table(("World", "Denoiser", "Flicker", "PSNR, dB"), rows)
     )
     write_section("flicker", "Flicker under a light that turns", body)
 
