@@ -9,13 +9,14 @@ import argparse
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from flicker import flicker
 from judge import environments, foreground, frame_camera, psnr, run_cycles
 from ours import SESSION, pinhole
 from report import OUT, table, write_section
-from subjects import asset_path
+from subjects import asset_path, save_mesh
 
 from drgs_blender.cli import frame_store
 from drgs_blender.cli.main import main as drgs
@@ -59,29 +60,34 @@ def rendered(sequence: list[Frame], history: str = "", **settings: object) -> li
     return out
 
 
-def by_cycles(options: argparse.Namespace, environment: str, samples: int, denoise: bool) -> Array:
-    """(n, h, w, 4) pictures of the same sequence by Cycles, each with noise of its own."""
-    mesh = read_asset(asset_path("cat", max_triangles=TRIANGLES)).mesh
+def jobs_of(options: argparse.Namespace, environment: str) -> list[dict[str, Any]]:
+    """The same sequence for Cycles, each frame with noise of its own."""
+    mesh, npz = read_asset(asset_path("cat", max_triangles=TRIANGLES)).mesh, FOLDER / "cat.npz"
     FOLDER.mkdir(parents=True, exist_ok=True)
-    arrays = {name: getattr(mesh, name) for name in ("vertices", "faces", "albedo", "roughness", "metallic")}
-    np.savez(FOLDER / "cat.npz", **arrays)
+    save_mesh(npz, mesh)
     shared = {
-        "mesh": str(FOLDER / "cat.npz"), "environment": str(environments() / f"{environment}.exr"), "bounces": 1,
-        "camera": frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.66), "samples": samples,
-        "denoise": denoise,
+        "mesh": str(npz), "environment": str(environments() / f"{environment}.exr"), "bounces": 1,
+        "camera": frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.66),
     }  # fmt: skip
-    jobs = [
-        shared | {"rotation_z": options.step * k, "seed": k, "out": str(FOLDER / f"{environment}-{samples}-{k}.npy")}
+    return [
+        shared | {"rotation_z": options.step * k, "seed": k, "out": str(FOLDER / f"{environment}-{k}.npy")}
         for k in range(options.frames)
     ]
-    run_cycles(jobs, "flicker")
+
+
+def by_cycles(jobs: list[dict[str, Any]], samples: int, denoise: bool = False) -> Array:
+    """(n, h, w, 4) pictures of `jobs_of` a sequence."""
+    run_cycles([job | {"samples": samples, "denoise": denoise} for job in jobs], "flicker")
     return np.stack([np.load(job["out"]) for job in jobs])
 
 
-def row(environment: str, name: str, shown: Array, truth: Array, mask: Array) -> tuple[str, ...]:
-    """Cells: flicker beyond that of the converged sequence, PSNR from the third frame on."""
-    later = [psnr(a, b, m) for a, b, m in zip(shown[2:], truth[2:], mask[2:])]
-    return environment, name, f"{1e3 * (flicker(shown, mask) - flicker(truth, mask)):.2f}", f"{np.mean(later):.2f}"
+def rows_of(environment: str, ways: dict[str, Array], truth: Array, mask: Array) -> list[tuple[str, ...]]:
+    """Cells of each way: flicker beyond that of the converged sequence, PSNR from the third frame on."""
+    rest, rows = flicker(truth, mask), []
+    for name, shown in ways.items():
+        later = [psnr(a, b, m) for a, b, m in zip(shown[2:], truth[2:], mask[2:])]
+        rows.append((environment, name, f"{1e3 * (flicker(shown, mask) - rest):.2f}", f"{np.mean(later):.2f}"))
+    return rows
 
 
 def in_windows(sequence: list[Frame]) -> tuple[list[Array], list[Array], list[Array]]:
@@ -112,7 +118,7 @@ def main() -> None:
     parser.add_argument("--reference", type=int, default=1024)
     parser.add_argument("--step", type=float, default=1.0, help="degrees a frame")
     options = parser.parse_args()
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for environment in ("city", "studio"):
         sequence = frames(options, environment)
         noisy, windows, coverage = in_windows(sequence)
@@ -126,12 +132,15 @@ def main() -> None:
         }
         if available():
             ways["OIDN, each frame alone"] = rendered(sequence, denoise="oidn")
-        rows += [row(environment, name, np.stack(pictures), truth, mask) for name, pictures in ways.items()]
-        theirs = by_cycles(options, environment, options.reference, False)
+        rows += rows_of(environment, {name: np.stack(pictures) for name, pictures in ways.items()}, truth, mask)
+        jobs = jobs_of(options, environment)
+        theirs = by_cycles(jobs, options.reference)
         mask = np.stack([foreground(picture[..., 3], 1) for picture in theirs])
-        for name, denoise in (("noisy", False), ("OIDN, each frame alone", True)):
-            shown = by_cycles(options, environment, options.samples, denoise)
-            rows.append(row(environment, f"Cycles: {name}", shown, theirs, mask))
+        cycles = {
+            "Cycles: noisy": by_cycles(jobs, options.samples),
+            "Cycles: OIDN, each frame alone": by_cycles(jobs, options.samples, denoise=True),
+        }
+        rows += rows_of(environment, cycles, theirs, mask)
     body = (
         f"cat, {options.size}x{options.size}, {options.samples} samples, {options.frames} frames, the world turns "
         f"{options.step:g} degree(s) a frame. Flicker: mean absolute second difference in time of sRGB luminance, less "

@@ -12,7 +12,7 @@ import numpy as np
 from judge import environments, frame_camera, run_cycles
 from ours import relight
 from report import OUT, table, write_section
-from subjects import asset_path
+from subjects import asset_path, save_mesh
 
 from drgs_blender.core.asset.container import read_asset
 
@@ -29,7 +29,7 @@ def main() -> None:
     surfels = len(read_asset(path).surfels)
     camera = frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.66)
     npz = OUT / f"{options.asset}.npz"
-    np.savez(npz, **{k: getattr(mesh, k) for k in ("vertices", "faces", "albedo", "roughness", "metallic")})
+    save_mesh(npz, mesh)
     environment = environments() / "city.exr"
     job = {
         "mesh": str(npz), "environment": str(environment), "camera": camera, "samples": 32, "bounces": 1,

@@ -16,11 +16,12 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from bench_capture import overlap, true_cameras
+from bench_evaluate import similarity as ssim_and_flip
 from PIL import Image
 from report import OUT, ROOT, processor_seconds, store_row, table, write_section
 
@@ -29,10 +30,9 @@ from drgs_blender.cli.evaluate import compared_passes, writer
 from drgs_blender.cli.find_blender import find_blender
 from drgs_blender.core.frame import ObjectState, RenderSettings, World
 from drgs_blender.engine.session import Session
+from drgs_blender.evaluate.compare import score_relit
 from drgs_blender.evaluate.flip import find_flip
-from drgs_blender.evaluate.metrics import on_white, relight_scores, ssim, straight
 from drgs_blender.evaluate.truth import read_relit
-from drgs_blender.reconstruct.capture.capture import WHITE
 
 FOLDER = OUT / "uncalibrated"
 COLUMNS = (
@@ -147,20 +147,10 @@ def relit(made: Made, folder: Path, sky: Path, samples: int) -> list[str]:
     key = session.load_asset(made.asset)
     state, settings = ObjectState(made.asset.stem, key, made.placed), RenderSettings(samples, bounces=3)
     pictures = [compared_passes(session, state, view.camera, World(truth.radiance), settings) for view in truth.views]
-    linear, alpha = (np.stack(parts) for parts in zip(*map(straight, pictures)))
-    masks = [view.mask for view in truth.views]
-    assert all(mask is not None for mask in masks)
-    mask = np.stack(masks)  # type: ignore[arg-type]
-    true = np.stack([view.laid_on(WHITE, truth.background) for view in truth.views])
-    scores = relight_scores(linear, alpha, true, mask)
-    ours, flip = on_white(linear * np.array(scores["scale"]), alpha), find_flip()
-    show = writer(folder)
-    for k, (a, b) in enumerate(zip(ours, true)):
-        show(f"relit-{made.asset.stem}", k, a, b)
-    alike = np.mean([ssim(a, b) for a, b in zip(ours, true)])
-    apart = "-" if flip is None else f"{np.mean([flip(a, b) for a, b in zip(ours, true)]):.4f}"
-    raw, scaled = (scores[kind]["foreground"] for kind in ("raw", "scaled"))  # type: ignore[index]
-    return [f"{raw:.2f} / {scaled:.2f}", f"{alike:.4f} / {apart}"]
+    named = replace(truth, name=f"relit-{made.asset.stem}")
+    scores = score_relit(named, pictures, {"flip": find_flip()}, writer(folder))
+    raw, scaled = (scores[kind]["foreground"] for kind in ("raw", "scaled"))
+    return [f"{raw:.2f} / {scaled:.2f}", ssim_and_flip([scores])]
 
 
 def main() -> None:

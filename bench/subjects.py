@@ -74,6 +74,11 @@ def spread_materials(mesh: Mesh) -> dict[str, np.ndarray]:
     }
 
 
+def save_mesh(path: Path, mesh: Mesh) -> None:
+    """Write what Cycles' jobs take of a mesh as .npz."""
+    np.savez(path, **{name: getattr(mesh, name) for name in ("vertices", "faces", "albedo", "roughness", "metallic")})
+
+
 def spread_asset(name: str) -> tuple[Path, Path]:
     """(.drgs, .npz) of an example with spread materials, for our engine and for Cycles."""
     folder = asset_path(name).parent

@@ -121,7 +121,7 @@ def compare(
         for item in truth.sets:
             pose = moved if item.posed else None
             pictures = [render(view, item.radiance, pose, item.name) for view in item.views]
-            entry = _relit(item, pictures, distances, show)
+            entry = score_relit(item, pictures, distances, show)
             entry["training_light"] = item.light == truth.training_light
             report["lights"].append(entry)
             if item.maps:
@@ -241,7 +241,25 @@ def _novel(
     }
 
 
-def _relit(item: TruthSet, pictures: list[dict[str, Array]], distances: Distances, show: Show | None) -> dict[str, Any]:
+def score_relit(
+    item: TruthSet, pictures: list[dict[str, Array]], distances: Distances, show: Show | None
+) -> dict[str, Any]:
+    """Score pictures of an asset under the light of a set.
+
+    Parameters
+    ----------
+    item : TruthSet
+    pictures : list of dict
+        Passes of its views, in their order.
+    distances : dict of str to callable or None
+        Measures of two pictures on white, by name; None: not computed.
+    show : callable, optional
+
+    Returns
+    -------
+    dict
+        One entry of "lights" of `compare`: `metrics.relight_scores`, and of scaled pictures "ssim" and the distances.
+    """
     linear, alpha = (np.stack(parts) for parts in zip(*map(straight, pictures)))
     wanted = [_white(view, item.background) for view in item.views]
     true, mask = (np.stack(parts) for parts in zip(*wanted))

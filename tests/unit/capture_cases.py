@@ -86,7 +86,14 @@ def write(capture: Capture, folder: Path) -> None:
     for view in capture.views:
         rgba = np.concatenate([view.colour / np.maximum(view.mask[..., None], 1e-6), view.mask[..., None]], -1)
         Image.fromarray((rgba.clip(0, 1) * 255).astype(np.uint8)).save(folder / f"{view.name}.png")
-        frames.append({"file_path": view.name, "transform_matrix": view.camera.matrix_world.tolist()})
+        frames.append({"file_path": view.name})
+    write_cameras(capture, folder, frames)
+
+
+def write_cameras(capture: Capture, folder: Path, about: list[dict[str, str]]) -> None:
+    """Write `transforms.json`, with the files that it says of each view."""
+    matrices = [view.camera.matrix_world.tolist() for view in capture.views]
+    frames = [files | {"transform_matrix": matrix} for files, matrix in zip(about, matrices, strict=True)]
     camera = capture.views[0].camera
     angle = 2 * np.arctan(0.5 * camera.width / camera.fx)
     (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import capture_cases
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from drgs_blender.evaluate.compare import _relit
+from drgs_blender.evaluate.compare import score_relit
 from drgs_blender.evaluate.truth import read_relit
 from drgs_blender.formats.exr import write_exr_picture
 from drgs_blender.reconstruct.capture.capture import WHITE, Capture, View
@@ -26,11 +25,8 @@ def written(capture: Capture, folder: Path, behind: np.ndarray | None) -> None:
         pixels = view.colour + (1 - view.mask[..., None]) * behind
         for name, values in ((view.name, pixels), (f"{view.name}-mask", view.mask)):
             Image.fromarray((values.clip(0, 1) * 255 + 0.5).astype(np.uint8)).save(folder / f"{name}.png")
-        about = {"file_path": f"{view.name}.png", "mask_path": f"{view.name}-mask.png"}
-        frames.append(about | {"transform_matrix": view.camera.matrix_world.tolist()})
-    camera = capture.views[0].camera
-    angle = 2 * np.arctan(0.5 * camera.width / camera.fx)
-    (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+        frames.append({"file_path": f"{view.name}.png", "mask_path": f"{view.name}-mask.png"})
+    capture_cases.write_cameras(capture, folder, frames)
 
 
 def backdrop(kind: str) -> np.ndarray | None:
@@ -48,7 +44,7 @@ def test_truth_is_laid_on_white_once(tmp_path, kind):
     assert len(truth.views) == len(capture.views)
     shown = []
     nothing = {"Combined": np.zeros((48, 48, 4), np.float32)}
-    _relit(truth, [nothing] * 6, {}, lambda name, number, ours, true: shown.append(true))
+    score_relit(truth, [nothing] * 6, {}, lambda name, number, ours, true: shown.append(true))
     for picture, view in zip(shown, capture.views, strict=True):
         mask = view.mask[..., None]
         half = (view.mask > 0.3) & (view.mask < 0.7)

@@ -20,7 +20,7 @@ from ...geometry.normals import unit
 from ..losses.photometric import Photograph
 from ..meshing.crops import box_of, cut
 from ..meshing.visual_hull import silhouettes
-from .capture import Capture, View
+from .capture import RGB, Capture, View
 
 #: Pixels of all views up to which what SSIM knows of photographs beforehand is kept: 24 bytes each.
 MAX_CACHED_PIXELS = 30_000_000
@@ -70,7 +70,7 @@ class Target:
         return torch.from_numpy(known.colour) if isinstance(known, Photograph) else known
 
 
-def background_of(capture: Capture) -> tuple[float, float, float]:
+def background_of(capture: Capture) -> RGB:
     """Background colour behind the surfels."""
     if capture.background is not None:
         return capture.background

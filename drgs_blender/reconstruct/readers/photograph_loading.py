@@ -11,7 +11,7 @@ from scipy.ndimage import binary_erosion, binary_fill_holes, label
 from ...core.color import linear_to_srgb, to_unit
 from ...core.errors import AssetError
 from ...core.frame import Camera
-from ..capture.capture import WHITE, View
+from ..capture.capture import RGB, WHITE, View
 from .exposures import exposed
 from .layout import Layout, Photograph, load_picture
 from .lens import Lens, resample, undistorted
@@ -158,7 +158,7 @@ def shrink(layers: Array, width: int, height: int) -> Array:
     return np.stack(channels, axis=-1)
 
 
-def find_background(views: list[View]) -> tuple[float, float, float] | None:
+def find_background(views: list[View]) -> RGB | None:
     """The one colour outside of all masks; None where the surroundings are real, or there are none."""
     outside = [view.colour[view.mask < 0.004] for view in views if view.mask is not None]
     if len(outside) < len(views) or not outside:
