@@ -38,7 +38,7 @@ class DRGS_OT_bind_to_cage(DrgsOperator, selection.ObjectMode, bpy.types.Operato
             refused = bind_to_cage(context, objects, cage)
         except UsageError:
             if not cages:
-                bpy.data.meshes.remove(cage.data)
+                selection.remove_with_mesh(cage)
             raise
         for name, reason in refused.items():
             self.report({"INFO"}, f'Surface Deform cannot bind "{name}" to "{cage.name}" ({reason}); nodes carry it')
@@ -167,7 +167,7 @@ def new_cage(context: bpy.types.Context, objects: list[bpy.types.Object], faces:
             )
         thin_out(context, cage, faces, 1e-4 * size)
     except UsageError:
-        bpy.data.meshes.remove(cage.data)
+        selection.remove_with_mesh(cage)
         raise
     return cage
 

@@ -11,6 +11,7 @@ from bpy.props import BoolProperty, StringProperty
 
 from ..addon import assets, blend_paths, splat_attributes
 from ..drgs_blender.core.errors import UsageError, first_of
+from . import selection
 from .bind_rig import armature_over, bind_to_rig, rest_pose
 from .engine_command import CommandOperator
 from .import_asset import import_assets
@@ -174,7 +175,7 @@ def _alone_at_rest(context: bpy.types.Context, obj: bpy.types.Object) -> Iterato
         context.view_layer.objects.active = alone
         yield alone
     finally:
-        bpy.data.meshes.remove(mesh)  # and the object
+        selection.remove_with_mesh(alone)
         for other in selected:
             other.select_set(True)
         context.view_layer.objects.active = active

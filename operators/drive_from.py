@@ -65,7 +65,7 @@ class DRGS_OT_drive_from(DrgsOperator, selection.ObjectMode, bpy.types.Operator)
             left = drive(context, objects, carrier if made is None else made)
         except UsageError:
             if made is not None:
-                bpy.data.meshes.remove(made.data)  # and the object
+                selection.remove_with_mesh(made)
             raise
         for obj, share in left.items():
             if share > _FAR:

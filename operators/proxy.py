@@ -117,7 +117,7 @@ def hull_of(context: bpy.types.Context, obj: bpy.types.Object, faces: int) -> tu
         thin_out(context, made, faces, 1e-4 * side)
         found = mesh_arrays.read_vertices(made.data).astype(np.float64), mesh_arrays.loop_triangles(made.data)
     finally:
-        bpy.data.meshes.remove(made.data)  # and the object
+        selection.remove_with_mesh(made)
     if not len(found[1]):
         raise UsageError(f'Object "{obj.name}"', "has surfels in one place only", "Select a mesh of your own too")
     return found

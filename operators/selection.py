@@ -130,6 +130,13 @@ def select_only(context: bpy.types.Context, objects: Iterable[bpy.types.Object],
     context.view_layer.objects.active = active
 
 
+def remove_with_mesh(obj: bpy.types.Object) -> None:
+    """Remove an object, then its mesh: Blender 4.2 has crashed where the mesh was taken from under its object."""
+    mesh = obj.data
+    bpy.data.objects.remove(obj)
+    bpy.data.meshes.remove(mesh)
+
+
 def of_type(objects: Iterable[bpy.types.Object], kind: str) -> Iterator[bpy.types.Object]:
     """The `objects` of a type that are no DR-GS objects."""
     return (o for o in objects if o.type == kind and not assets.is_drgs(o))
