@@ -92,6 +92,10 @@ def composed(folder: Path, cameras: str, masks: str) -> Path:
     (capture / "masks").mkdir(parents=True, exist_ok=True)
     data, known = cameras_of(folder, cameras)
     data["frames"] = []
+    bands = {}
+    if masks == "found":
+        frames = json.loads((made / "transforms.json").read_text())["frames"]
+        bands = {Path(frame["file_path"]).stem: frame.get("mask_band", 0) for frame in frames}
     for name, camera in known.items():
         mask_file = (folder / "truth" if masks == "true" else made / "masks") / f"{Path(name).stem}.png"
         if mask_file.is_file():
@@ -102,7 +106,7 @@ def composed(folder: Path, cameras: str, masks: str) -> Path:
                 coverage.save(capture / "masks" / mask_file.name)
             lens = {"w": width, "h": height, "cx": width / 2, "cy": height / 2}
             files = {"file_path": name, "mask_path": f"masks/{mask_file.name}"}
-            data["frames"].append(lens | camera | files)
+            data["frames"].append(lens | camera | files | {"mask_band": bands.get(Path(name).stem, 0)})
     if cameras == "found":
         shutil.copy(made / data["ply_file_path"], capture)
     (capture / "transforms.json").write_text(json.dumps(data))

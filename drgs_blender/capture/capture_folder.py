@@ -192,6 +192,8 @@ def write_capture(
             drawn = Pillow.fromarray(np.asarray(decode_mask(picture.mask) * 255 + 0.5, np.uint8))
             replace_by(target, partial(drawn.save, format="PNG"))
             frame["mask_path"] = f"masks/{target.name}"
+            if picture.mask_band:
+                frame["mask_band"] = round(picture.mask_band, 2)
         frames.append(frame)
         if picture.notes:
             notes[picture.path.name] = "; ".join(picture.notes)

@@ -63,6 +63,8 @@ class Picture:
         Stem, unique in the input.
     mask : Path, optional
         File of its mask.
+    mask_band : float
+        See `reconstruct.capture.View`; pixels of `size`.
     exif : Metadata
     size : tuple of int
         Width and height, pixels, upright.
@@ -85,6 +87,7 @@ class Picture:
     alpha: bool = True
     merged: tuple[str, ...] = ()
     behind: Array | None = None
+    mask_band: float = 0.0
 
     @property
     def lens(self) -> tuple[int, int, str]:

@@ -44,6 +44,8 @@ def fingerprint(capture: Capture, **settings: Any) -> str:
         digest.update(np.asarray(camera.matrix_world, np.float64).tobytes())
         digest.update(np.array([camera.fx, camera.fy, camera.cx, camera.cy]).tobytes())
         digest.update(np.ascontiguousarray(view.colour).data)
+        if view.mask_band:
+            digest.update(f"mask_band {view.mask_band}".encode())
         for name in ("mask", "normals", "above_white", "turn"):
             if (layer := getattr(view, name)) is not None:
                 digest.update(name.encode())

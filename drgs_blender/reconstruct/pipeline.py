@@ -202,10 +202,11 @@ def reconstruct(
 
 
 def mesh_of(gaussians: Gaussians, capture: Capture, region: Region, resolution: int = MOST) -> tuple[Mesh, dict]:
-    """Mesh of surfels as the training views see them (`depth_fusion.fuse`), with the outlines of their masks."""
+    """Mesh of surfels as the training views see them (`depth_fusion.fuse`), with the outlines of exact masks."""
     cameras = [view.camera for view in capture.training]
     mesh, report = fuse(gaussians, cameras, region, resolution)
-    if (masks := silhouettes(capture)) is not None:
+    exact = not any(view.mask_band for view in capture.training)
+    if exact and (masks := silhouettes(capture)) is not None:
         mesh.vertices = fill_silhouettes(mesh, cameras, masks)
     return mesh, report
 

@@ -137,6 +137,7 @@ def test_masks_of_a_ball_on_a_pattern(cv2, tmp_path, points):
     assert not any(fit.doubtful for fit in masked.fits) and (tmp_path / "sheet.png").is_file()
     scores = [iou(np.asarray(Image.open(pictures[v.name].mask)) > 127, mask) for v, mask in zip(views, true)]
     assert np.mean(scores) > 0.92 and min(scores) > 0.85
+    assert {picture.mask_band for picture in pictures.values()} == {1.0}  # learned as finely as photographed
     first = {name: picture.mask.read_bytes() for name, picture in pictures.items()}
     run(tmp_path, "auto", found, pictures)
     assert first == {name: picture.mask.read_bytes() for name, picture in pictures.items()}
@@ -348,6 +349,7 @@ def test_specks_and_pinholes_are_no_part_of_a_mask():
 class Captures:
     """Captures of the ball in a world whose Z is not up, and stand-ins of what makes their masks."""
 
+    band = 1.5
     turned = np.array([[0, 0, 1.0, 0], [1, 0, 0, 0], [0, 1, 0, 3], [0, 0, 0, 1]])
 
     def __init__(self, folder, monkeypatch):
@@ -408,6 +410,7 @@ def test_masks_of_a_capture_are_made_only_where_it_has_none(captures, caplog):
     made = captures.mask(captures.make(), "auto")
     assert np.allclose(made[1], 0.2) and not made[0].any() and len(captures.asked) == 1
     assert not captures.sheet.exists()  # of another run
+    assert all(view.mask_band == 0 for view in given.views)
     # upright, on the ground
     level = np.stack([view.matrix for view in captures.asked[0]])
     np.testing.assert_allclose(level[:, 2, 2], [view.matrix[2, 2] for view in captures.views], atol=1e-2)

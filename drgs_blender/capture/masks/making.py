@@ -57,6 +57,8 @@ class Found:
         What is learned, what of it is the object, and where that is.
     photographed : list of MaskView
         The parts in the size at which they were photographed, at most that of masks.
+    band : float
+        Pixels of the views by which outlines may be wrong: one pixel of what is learned, and no less than one.
     """
 
     windows: dict[int, tuple[int, int, int, int]]
@@ -67,6 +69,7 @@ class Found:
     cut: Cut
     box: ObjectBox
     photographed: list[MaskView] = field(default_factory=list)
+    band: float = 1.0
 
     def whole(self, view: int, shape: tuple[int, int], size: tuple[int, int]) -> Array:
         """(h, w) uint8: the mask of a whole picture of `size` (w, h), whose view has the `shape` (h, w)."""
@@ -191,7 +194,7 @@ def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
     """
     prepare_kernels(("reconstruct",), lambda _, part: tell(PHASE, 0.2 * part), cancelled)
     matrices = np.stack([view.matrix for view in views])
-    box, object_surfels = find_box(points, matrices), None
+    box, object_surfels, band = find_box(points, matrices), None, 1.0
     for step, effort in enumerate(EFFORTS):
         windows = {k: window for k, view in enumerate(views) if (window := box.window(view)) is not None}
         if len(windows) < _FEWEST_VIEWS:
@@ -199,7 +202,9 @@ def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
         parts = [views[k].cropped(window, PART) for k, window in windows.items()]
         told = lambda phase, part, step=step: tell(phase, 0.2 + 0.7 * (step + part) / len(EFFORTS))  # noqa: E731
         shown = np.median([max(right - left, bottom - top) for left, top, right, bottom in windows.values()])
-        scene = learn_scene(cv2, parts, box, effort.fitting(float(shown)), object_surfels, told, cancelled)
+        fitting = effort.fitting(float(shown))
+        scene = learn_scene(cv2, parts, box, fitting, object_surfels, told, cancelled)
+        band = max(1.0, float(shown) / fitting.size)
         cut = cut_object(scene, box)
         if cut.surfels.sum() < _FEWEST_SURFELS:
             raise NoMasks("no object is found on the ground")
@@ -209,7 +214,7 @@ def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
     masks = [_without_ground(cv2, shown, k, mask, scene, cut, box) for k, mask in enumerate(masks)]
     if not any(mask.any() for mask in masks):
         raise NoMasks("what is learned of the object covers half of no pixel")
-    return Found(windows, parts, masks, Hull(cv2, parts, masks, box), scene, cut, box, shown)
+    return Found(windows, parts, masks, Hull(cv2, parts, masks, box), scene, cut, box, shown, band)
 
 
 def without_specks(mask: Array) -> Array:

@@ -94,6 +94,7 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
     for k, view in enumerate(capture.training):
         height, width = view.colour.shape[:2]
         view.mask = made.whole(k, (height, width), (width, height)).astype(np.float32) / 255
+        view.mask_band = made.band
     for view in capture.testing:
         if view.mask is None:
             view.mask = made.seen_by(cv2, _mask_view(view, found.matrices[view.name])).astype(np.float32) / 255

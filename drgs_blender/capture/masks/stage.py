@@ -89,7 +89,9 @@ def mode_on_ground(mode: str, given: Path | None, ground: str) -> tuple[str, str
 
 def make_or_check(mode: str, found: Registration, by_file: dict[str, Picture], copies: Path, work: Path, sheet: Path,
                   given: Path | None, subject: str, tell: Tell, cancelled: Callable[[], bool]) -> Masked:  # fmt: skip
-    """Make masks where there are none, or check those that are given; `Picture.mask` is set to what is made.
+    """Make masks where there are none, or check those that are given.
+
+    `Picture.mask` and `Picture.mask_band` are set to what is made.
 
     Parameters
     ----------
@@ -176,6 +178,8 @@ def _learned(cv2: Any, views: list[MaskView], pictures: list[Picture], sheet: Pa
     made, fits = make_masks(cv2, views, found.points, sheet, subject, tell, cancelled)
     if made is None:
         return None, fits
+    for view, picture in zip(views, pictures, strict=True):
+        picture.mask_band = made.band * max(1.0, max(picture.size) / max(view.shape))
     return (made.whole(k, view.shape, pictures[k].size) for k, view in enumerate(views)), fits
 
 

@@ -30,6 +30,9 @@ class View:
         sRGB-encoded in 0..1 as photographed, top row first.
     mask : (height, width) float32 array, optional
         In 0..1, the object's coverage of the pixel; None without a mask.
+    mask_band : float
+        Pixels on either side of the mask's outline where it may be wrong and decides nothing (the unknown part of a
+        trimap); 0: it is exact, as drawn ones are.
     test : bool
         Left out of training.
     normals : (height, width, 3) float32 array, optional
@@ -55,6 +58,7 @@ class View:
     turn: Array | None = None
     linear: bool = False
     on_white: bool = False
+    mask_band: float = 0.0
 
     def laid_on(self, wanted: RGB, behind: RGB | None) -> Array:
         """The object on one colour.

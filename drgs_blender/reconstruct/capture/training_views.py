@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from ...core.arrays import Array
@@ -53,6 +54,9 @@ class Target:
     share : float
         Pixels of the crop in parts of the whole view's. Means over the crop count as much: a pixel of each view counts
         the same.
+    unknown : (h, w) bool tensor or None
+        Where the mask may be wrong, `View.mask_band`: neither it nor the photograph teaches anything there. None:
+        nowhere.
     """
 
     camera: Camera
@@ -62,6 +66,7 @@ class Target:
     normals: Tensor | None = None
     turn: Array | None = None
     share: float = 1.0
+    unknown: Tensor | None = None
 
     @property
     def colour(self) -> Tensor:
@@ -114,7 +119,17 @@ def full_targets(capture: Capture) -> list[Target]:
         normals = None if view.normals is None else view.normals[y0:y1, x0:x1]
         found.append(_target(camera, colour, mask, normals, keep, share))
         found[-1].turn = view.turn
+        if mask is not None and view.mask_band:
+            found[-1].unknown = torch.from_numpy(near_outline(mask, view.mask_band))
     return found
+
+
+def near_outline(mask: Array, band: float) -> Array:
+    """(h, w) bool: `band` pixels on either side of the outline of `mask`."""
+    inside = mask > 0.5
+    if inside.all() or not inside.any():
+        return np.zeros(mask.shape, bool)
+    return distance_transform_edt(inside) + distance_transform_edt(~inside) <= band
 
 
 def half_target(target: Target) -> Target:
@@ -126,6 +141,8 @@ def half_target(target: Target) -> Target:
     keep = photograph.kept is not None
     made = _target(halved(target.camera), half_size(photograph.colour), mask, normals, keep, target.share)
     made.turn = target.turn
+    if target.unknown is not None:
+        made.unknown = torch.from_numpy(half_size(target.unknown.numpy()[..., None].astype(np.float32))[..., 0] > 0)
     if target.background is not None:
         made.background = torch.from_numpy(half_size(target.background.numpy()))
     return made

@@ -59,9 +59,9 @@ class WarpLearningBackend(LearningBackend):
         self.device = self.launcher.place
 
     def bring(self, target: Target) -> Target:
-        known = target.mask, target.background, target.normals
-        mask, behind, normals = (None if one is None else one.to(self.device) for one in known)
-        return replace(target, photograph=target.colour.to(self.device), mask=mask, background=behind, normals=normals)
+        names = ("mask", "background", "normals", "unknown")
+        there = {name: one.to(self.device) for name in names if (one := getattr(target, name)) is not None}
+        return replace(target, photograph=target.colour.to(self.device), **there)
 
     def attributes(
         self, parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, reflections: bool

@@ -13,6 +13,7 @@ from ...core.arrays import Array
 from ..backend import LearningBackend
 from ..capture.training_views import Target, pixel_rays
 from ..losses.patches import Pair
+from ..losses.photometric import Photograph
 from ..model.attributes import TINT
 from ..model.gaussians import Gaussians, RenderedView
 from ..model.raster import GradientStatistics, Maps
@@ -137,16 +138,17 @@ class Learner:
             schedule.distortion / self._radius**2 if shaped else 0.0,
             schedule.consistency if shaped else 0.0,
         )
+        photograph, mask = _taught(rendered, target)
         counts, depth = _importance(maps.features), maps.depth
         if schedule.median and shaped:
             depth = torch.lerp(depth, _weighted_median(maps), schedule.median)
         shape = self._backend.shape_loss(
-            maps.alpha, depth, maps.distortion, rendered.normal, target.mask, rays, counts, weights
+            maps.alpha, depth, maps.distortion, rendered.normal, mask, rays, counts, weights
         )
         if target.normals is not None and part < schedule.normal_prior_until:
             weight = schedule.normal_prior * (1 - part / schedule.normal_prior_until)
             shape = shape + weight * _disagreement(rendered, target.normals)
-        return self._backend.difference(rendered.colour, target.photograph) + shape
+        return self._backend.difference(rendered.colour, photograph) + shape
 
     def _patch_loss(self, rendered: RenderedView, target: Target, rays: Tensor, beside: Target) -> Tensor:
         """Consistency of patches with those of the view `beside`."""
@@ -209,6 +211,17 @@ def _disagreement(rendered: RenderedView, normals: Tensor) -> Tensor:
     """Mean of 1 - cosine between the surfels' normals and those given (h, w, 3), as far as pixels are covered."""
     known = (normals != 0).any(-1)
     return torch.where(known, rendered.maps.alpha - (rendered.normal * normals).sum(-1), 0.0).mean()
+
+
+def _taught(rendered: RenderedView, target: Target) -> tuple[Photograph | Tensor, Tensor | None]:
+    """Photograph and mask that a rendered view is compared with: what it shows itself where the mask may be wrong."""
+    if target.unknown is None or target.mask is None:
+        return target.photograph, target.mask
+    colour = torch.where(target.unknown[..., None], rendered.colour.detach(), target.colour)
+    mask = torch.where(target.unknown, rendered.maps.alpha.detach(), target.mask)
+    if isinstance(target.photograph, Photograph):
+        return Photograph.of(colour.numpy(), keep=False), mask
+    return colour, mask
 
 
 def _grey(target: Target) -> Tensor:

@@ -59,6 +59,8 @@ class Photograph:
         File.
     test : bool
         A test view of the capture: not used in training.
+    mask_band : float
+        `View.mask_band`, pixels of `lens`.
     exposure : float, optional
         Exposure value, stops; larger lets in less light. None: not known, or of no account.
     """
@@ -70,6 +72,7 @@ class Photograph:
     mask: Path | None = None
     test: bool = False
     exposure: float | None = None
+    mask_band: float = 0.0
 
 
 @dataclass(slots=True)

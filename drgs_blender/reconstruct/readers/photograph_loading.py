@@ -103,9 +103,13 @@ def load_photograph(
     mask = None if mask is None else np.ascontiguousarray(mask, np.float32)
     above = None if above is None else np.ascontiguousarray(layers[..., -3:], np.float32)
     linear = stored.dtype.kind == "f"
+    band = photograph.mask_band
+    if mask is not None and band:  # never less than a pixel of what is learned from
+        band = max(1.0, band * max(width, height) / max(photograph.lens.width, photograph.lens.height))
     return View(
-        photograph.name, camera, colour, mask, photograph.test, above_white=above, linear=linear, on_white=premultiplied
-    )
+        photograph.name, camera, colour, mask, photograph.test, above_white=above, linear=linear,
+        on_white=premultiplied, mask_band=0.0 if mask is None else band,
+    )  # fmt: skip
 
 
 def _fitting(lens: Lens, width: int, height: int, subject: str) -> Lens:

@@ -124,7 +124,10 @@ def _read_file(path: Path, test: bool, prefix: bool) -> tuple[list[Photograph], 
         matrix = rigid(frame.get("transform_matrix"), subject)
         tidy = Path(name).with_suffix("") if Path(name).suffix in PICTURES else Path(name)
         label = tidy.as_posix().removeprefix("./") if prefix else tidy.name
-        photographs.append(Photograph(label, image, matrix, lens, mask, test or name in left_out, _exposure(frame)))
+        photographs.append(
+            Photograph(label, image, matrix, lens, mask, test or name in left_out, _number(frame, "exposure_value"),
+                       max(_number(frame, "mask_band") or 0.0, 0.0))
+        )  # fmt: skip
         if not _OWN & frame.keys():
             alike.append(photographs[-1])
     complain_of_missing(str(path), missing, len(frames))
@@ -164,9 +167,9 @@ def _mask(path: Path, frame: dict[str, Any], image: Path, name: str) -> Path | N
     return mask
 
 
-def _exposure(frame: dict[str, Any]) -> float | None:
-    """The exposure value that `drgs capture` has from EXIF."""
-    value = frame.get("exposure_value")
+def _number(frame: dict[str, Any], key: str) -> float | None:
+    """A number that `drgs capture` has written: "exposure_value" from EXIF, or "mask_band"."""
+    value = frame.get(key)
     known = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     return float(value) if known else None  # type: ignore[arg-type]
 
