@@ -137,7 +137,8 @@ def test_masks_of_a_ball_on_a_pattern(cv2, tmp_path, points):
     assert not any(fit.doubtful for fit in masked.fits) and (tmp_path / "sheet.png").is_file()
     scores = [iou(np.asarray(Image.open(pictures[v.name].mask)) > 127, mask) for v, mask in zip(views, true)]
     assert np.mean(scores) > 0.92 and min(scores) > 0.85
-    assert {picture.mask_band for picture in pictures.values()} == {1.0}  # learned as finely as photographed
+    (band,) = {picture.mask_band for picture in pictures.values()}
+    assert 1 <= band < 1.5, "learned almost as finely as photographed"
     first = {name: picture.mask.read_bytes() for name, picture in pictures.items()}
     run(tmp_path, "auto", found, pictures)
     assert first == {name: picture.mask.read_bytes() for name, picture in pictures.items()}
