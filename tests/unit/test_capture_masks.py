@@ -201,6 +201,28 @@ def test_the_object_is_what_stands_on_the_ground_and_is_connected():
     )
 
 
+def test_walls_go_on_to_the_ground_and_the_ground_beside_them_is_none_of_the_object():
+    pytest.importorskip("torch")
+    from drgs_blender.capture.masks.object_surfels import cut_object
+    from drgs_blender.reconstruct.model.gaussians import Gaussians
+
+    ground = strewn([-0.6, -0.6, 0], [0.6, 0.6, 0], 6000)
+    ground[:, 2] += np.random.default_rng(8).normal(scale=2e-3, size=len(ground))
+    wall = strewn([0.1, -0.1, 0], [0.1, 0.1, 0.4], 8000)
+    post = strewn([0.4, 0.4, 0], [0.4, 0.42, 0.005], 50)  # as low as the ground is uneven, and apart
+    places = np.concatenate([ground, wall, post])
+    normals = np.repeat([[0.0, 0, 1], [1, 0, 0.1], [1, 0, 0]], (len(ground), len(wall), len(post)), axis=0)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    scene = Gaussians.on_surface(places, normals, np.full_like(places, 0.5), 0.006, 0)
+    box = ObjectBox(np.array([-0.25, -0.25, 0]), np.array([0.25, 0.25, 0.5]), np.zeros((0, 3)))
+    cut = cut_object(scene, box)
+    flat, upright, apart = np.split(cut.surfels, [len(ground), len(ground) + len(wall)])
+    low = wall[:, 2] < 3 * cut.noise * 0.5
+    assert low.sum() > 30 and upright[low].mean() > 0.95 and upright[~low].mean() > 0.98
+    beside = (np.abs(ground[:, 0] - 0.1) > 0.03) | (np.abs(ground[:, 1]) > 0.12)  # heights are means of neighbours
+    assert not flat[beside].any() and not apart.any()
+
+
 def test_a_scene_without_surfels_of_its_own_has_no_object_and_a_flat_object_has_a_box():
     pytest.importorskip("torch")
     from drgs_blender.capture.masks.object_surfels import Cut, box_around, cut_object
@@ -554,3 +576,19 @@ def test_ground_that_a_mask_took_for_the_foot_of_the_object_is_told_by_neighbour
         assert not high.any()  # what is learned high above it is no ground
     assert taken > 500 and wrong < 0.03 * kept
     assert told < 0.03 * taken if plain else told > 0.5 * taken
+
+
+def test_the_lower_edge_of_a_mask_stays_as_no_plane_lies_between_it_and_the_ground(cv2):
+    from drgs_blender.capture.masks.ground_contact import _ABOVE, shows_ground
+
+    views, true = scene(16)
+    box = ObjectBox(MIDDLE - 1.3 * RADIUS, MIDDLE + 1.3 * RADIUS, np.zeros((0, 3)))
+    size = float((box.high - box.low).max())
+    foot = np.array([*MIDDLE[:2], 0.0])
+    for k, (view, mask) in enumerate(zip(views, true, strict=True)):
+        ground = beside(view, mask)
+        found = shows_ground(cv2, views, k, ground, np.full(view.shape, 0.01, np.float32), box) > 0.5
+        (_, low), (_, high) = view.project(np.stack([foot, MIDDLE * [1, 1, 0] + [0, 0, _ABOVE[0] * size]]))[0]
+        rows = math.ceil(low - high)
+        edge = ground & ~np.vstack([ground[rows:], np.zeros((rows, ground.shape[1]), bool)])
+        assert found.any() and found[edge].mean() < 0.3  # as a mean over 3 x 3 pixels

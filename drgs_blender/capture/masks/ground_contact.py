@@ -2,11 +2,13 @@
 
 What is learned of the object holds bits of ground where it lies in the object's shadow and few photographs see it, as
 between feet. These pixels look alike in neighbouring photographs when they are projected to the ground, and differ when
-they are projected to a plane above it (Collins 1996); the object's own do not.
+they are projected to a plane above it (Collins 1996); the object's own do not. The lowest of these are nearer to the
+ground than to any such plane: the lower edge of the mask stays.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -79,9 +81,24 @@ def shows_ground(cv2: Any, views: Sequence[MaskView], which: int, mask: Array, h
 
     at_ground = difference(0.0)
     above = np.min([difference(part * size) for part in _ABOVE], axis=0)
-    is_ground = asked[part] & (at_ground < np.where(at_ground < _AGREE, _BETTER, _CLEARLY) * above)
+    above_foot = _above_foot(view, mask, box)[part]
+    is_ground = asked[part] & above_foot & (at_ground < np.where(at_ground < _AGREE, _BETTER, _CLEARLY) * above)
     shown[part] = cv2.boxFilter(is_ground.astype(np.float32), -1, (3, 3))
     return shown
+
+
+def _above_foot(view: MaskView, mask: Array, box: ObjectBox) -> Array:
+    """(h, w) bool: pixels of the mask that are farther from its lower edge than the lowest plane is from the ground."""
+    foot, size = [*(box.low + box.high)[:2] / 2, 0.0], float((box.high - box.low).max())
+    seen, _ = view.project(np.array([foot, np.add(foot, [0.0, 0.0, _ABOVE[0] * size])]))
+    rise = np.nan_to_num(seen[0, 1] - seen[1, 1], nan=0.0)
+    down = min(max(math.ceil(abs(rise)), 1), len(mask) - 1) * (1 if rise >= 0 else -1)
+    lower = np.zeros_like(mask)
+    if down > 0:
+        lower[:-down] = mask[down:]
+    else:  # the camera is held upside down
+        lower[-down:] = mask[:down]
+    return mask & lower
 
 
 def _neighbours(views: Sequence[MaskView], which: int, box: ObjectBox) -> list[MaskView]:

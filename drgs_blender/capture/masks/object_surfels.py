@@ -20,6 +20,9 @@ _NEIGHBOURS = 6
 _AROUND, _THICK = 1.5, 0.08
 #: Least height of the object in parts of the box's largest side, and in deviations of the ground.
 _LEAST, _DEVIATIONS = 0.006, 3.0
+#: What is lower is the object's foot where it is steep: largest part of its normal that is vertical, how far it lies
+#: from the object's lowest part and how low it may be, and how high that part is, in parts of the least height.
+_STEEP, _FOOT, _FOOT_BELOW = 0.5, 2.0, 2.0
 #: Fainter surfels are nobody's; larger ones, in parts of the box's largest side, are what is behind.
 _FAINT, _LARGEST = 0.1, 0.3
 #: Cells along the box's largest side in which parts are connected; margin beyond the box, in parts of that side.
@@ -66,14 +69,28 @@ def cut_object(scene: Gaussians, box: ObjectBox) -> Cut:
     weight = opacity * deviations.prod(axis=1)
     height = np.full(len(centre), -np.inf)
     height[seen], noise = _heights(centre[seen], weight[seen], middle, size)
-    above = height > max(_LEAST * size, _DEVIATIONS * noise)
+    least = max(_LEAST * size, _DEVIATIONS * noise)
+    above = height > least
     low, high = box.low - _BEYOND * size, box.high + _BEYOND * size
     near = above & (centre >= [*low[:2], -np.inf]).all(axis=1) & (centre <= high).all(axis=1)
     kept = np.zeros(len(centre), bool)
     if near.any():
         away = flat[near] / (size / 2)
         kept[near] = _connected(centre[near], weight[near] * np.exp(-4 * away**2), size / _CELLS)
+    kept |= _foot(scene, kept, seen, height, least)
     return Cut(kept, noise / size)
+
+
+def _foot(scene: Gaussians, kept: Array, seen: Array, height: Array, least: float) -> Array:
+    """(n,) bool: the surfels of walls that go on below the least height; ground is flat."""
+    centre, foot = scene.centres().detach().numpy().astype(np.float64)[:, :2], np.zeros(len(kept), bool)
+    lowest = kept & (height < _FOOT * least)
+    steep = np.abs(scene.frames()[2][:, 2]) <= _STEEP
+    asked = np.flatnonzero(seen & ~kept & steep & (height <= least) & (height > -_FOOT_BELOW * least))
+    if lowest.any() and len(asked):
+        away, _ = cKDTree(centre[lowest]).query(centre[asked])
+        foot[asked[away < _FOOT * least]] = True
+    return foot
 
 
 def _heights(places: Array, weight: Array, middle: Array, size: float) -> tuple[Array, float]:
