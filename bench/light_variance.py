@@ -60,8 +60,9 @@ class Series:
 
     @property
     def second_per_sample(self) -> float:
-        """Processor seconds of one sample more of all pixels, by least squares over the counts."""
-        return float(np.polyfit(self.counts, [n.seconds for n in self.noise], 1)[0])
+        """Processor seconds of one sample more of all pixels, between the largest count and about a quarter of it."""
+        k = max((k for k, count in enumerate(self.counts) if 4 * count <= self.counts[-1]), default=-2)
+        return (self.noise[-1].seconds - self.noise[k].seconds) / (self.counts[-1] - self.counts[k])
 
     def time_to(self, error: float) -> float:
         """Processor seconds of sampling alone until the untrimmed relative error is `error`: log over log, linear."""

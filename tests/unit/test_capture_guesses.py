@@ -349,3 +349,18 @@ def test_other_masks_or_scale_keep_the_work_that_was_done(tmp_path):
     given = pipeline.pictures.find_pictures(tmp_path)
     keys = {pipeline.work_key(given, pipeline.Settings(**more)) for more in ({}, {"distance": 2.0}, {"masks": "auto"})}
     assert len(keys) == 1 and pipeline.work_key(given, pipeline.Settings(size=800)) not in keys
+
+
+def test_the_folder_says_how_wrong_outlines_of_masks_may_be(tmp_path):
+    found = registration(ring(6), np.zeros((0, 3)))
+    found.errors, found.observations = dict.fromkeys(found.matrices, 0.1), dict.fromkeys(found.matrices, 9)
+    pictures = {}
+    for k, file in enumerate(found.matrices):
+        for name, mode in ((f"{k}.png", "RGB"), (f"{k}-mask.png", "L")):
+            texture(k, 800, 600).convert(mode).save(tmp_path / name)
+        mask, band = (None, 0.0) if k == 0 else (tmp_path / f"{k}-mask.png", float(k - 1))
+        pictures[file] = Picture(tmp_path / f"{k}.png", f"{k}", mask=mask, mask_band=band, size=(800, 600))
+    (tmp_path / "out").mkdir()
+    capture_folder.write_capture(tmp_path / "out", pictures, found, [], {}, {})
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    assert [frame.get("mask_band") for frame in frames] == [None, None, 1.0, 2.0, 3.0, 4.0]

@@ -16,7 +16,7 @@ from capture_cases import balls  # noqa: E402
 
 from drgs_blender.reconstruct import checkpoint  # noqa: E402
 from drgs_blender.reconstruct.backend import CPU, LearningBackend  # noqa: E402
-from drgs_blender.reconstruct.capture.training_views import GREY, Target, full_targets, half_target  # noqa: E402
+from drgs_blender.reconstruct.capture.training_views import GREY, Target, full_targets, half_target, near_outline  # noqa: E402
 from drgs_blender.reconstruct.losses.photometric import Photograph  # noqa: E402
 from drgs_blender.reconstruct.meshing.depth_fusion import fuse  # noqa: E402
 from drgs_blender.reconstruct.meshing.visual_hull import find_region  # noqa: E402
@@ -64,6 +64,18 @@ def test_the_band_is_as_wide_as_said_on_either_side_of_the_outline():
     h, w = half.unknown.shape
     fours = unknown[: 2 * h, : 2 * w].reshape(h, 2, w, 2).any(axis=(1, 3))
     np.testing.assert_array_equal(half.unknown.numpy(), fours)
+
+
+def test_parts_that_are_no_wider_than_the_band_teach():
+    """Else nothing would be known of them in any view."""
+    mask = np.zeros((40, 60), np.float32)
+    mask[5:25, 5:25] = 1  # a block with a bar, and a bar of its own
+    mask[12:16, 25:50] = 1
+    mask[30:34, 5:50] = 1
+    unknown = near_outline(mask, BAND)
+    assert not unknown[12:16, 30:50].any() and not unknown[30:34, 5:50].any()
+    assert unknown[10:12, 30:50].all() and unknown[34:36, 5:50].all()
+    assert unknown[5:7, 8:22].all() and not unknown[8:22, 8:22].any()
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])

@@ -91,14 +91,11 @@ def _above_foot(view: MaskView, mask: Array, box: ObjectBox) -> Array:
     """(h, w) bool: pixels of the mask that are farther from its lower edge than the lowest plane is from the ground."""
     foot, size = [*(box.low + box.high)[:2] / 2, 0.0], float((box.high - box.low).max())
     seen, _ = view.project(np.array([foot, np.add(foot, [0.0, 0.0, _ABOVE[0] * size])]))
-    rise = np.nan_to_num(seen[0, 1] - seen[1, 1], nan=0.0)
-    down = min(max(math.ceil(abs(rise)), 1), len(mask) - 1) * (1 if rise >= 0 else -1)
-    lower = np.zeros_like(mask)
-    if down > 0:
-        lower[:-down] = mask[down:]
-    else:  # the camera is held upside down
-        lower[-down:] = mask[:down]
-    return mask & lower
+    down = np.nan_to_num(seen[0] - seen[1])  # in the picture, x and y
+    x, y = (int(math.copysign(math.ceil(abs(d) - 0.5), d)) for d in down)
+    padded = np.pad(mask, ((abs(y), abs(y)), (abs(x), abs(x))))
+    height, width = mask.shape
+    return mask & padded[abs(y) + y : abs(y) + y + height, abs(x) + x : abs(x) + x + width]
 
 
 def _neighbours(views: Sequence[MaskView], which: int, box: ObjectBox) -> list[MaskView]:

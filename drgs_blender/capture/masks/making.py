@@ -57,8 +57,8 @@ class Found:
         What is learned, what of it is the object, and where that is.
     photographed : list of MaskView
         The parts in the size at which they were photographed, at most that of masks.
-    band : float
-        Pixels of the views by which outlines may be wrong: one pixel of what is learned, and no less than one.
+    finest : int
+        Pixels of a window's longer side in which it is learned.
     """
 
     windows: dict[int, tuple[int, int, int, int]]
@@ -69,13 +69,18 @@ class Found:
     cut: Cut
     box: ObjectBox
     photographed: list[MaskView] = field(default_factory=list)
-    band: float = 1.0
+    finest: int = PART
 
     def whole(self, view: int, shape: tuple[int, int], size: tuple[int, int]) -> Array:
         """(h, w) uint8: the mask of a whole picture of `size` (w, h), whose view has the `shape` (h, w)."""
         if view not in self.windows:
             return np.zeros(size[::-1], np.uint8)
         return _drawn(self.masks[list(self.windows).index(view)], self.windows[view], shape, size)
+
+    def band(self, view: int) -> float:
+        """Pixels of a view by which outlines may be wrong: one pixel of what is learned, and no less than one."""
+        left, top, right, bottom = self.windows.get(view, (0, 0, 0, 0))
+        return max(1.0, max(right - left, bottom - top) / self.finest)
 
     def seen_by(self, cv2: Any, view: MaskView) -> Array:
         """(h, w) uint8: the mask of a view that was not learned from."""
@@ -194,7 +199,7 @@ def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
     """
     prepare_kernels(("reconstruct",), lambda _, part: tell(PHASE, 0.2 * part), cancelled)
     matrices = np.stack([view.matrix for view in views])
-    box, object_surfels, band = find_box(points, matrices), None, 1.0
+    box, object_surfels, finest = find_box(points, matrices), None, PART
     for step, effort in enumerate(EFFORTS):
         windows = {k: window for k, view in enumerate(views) if (window := box.window(view)) is not None}
         if len(windows) < _FEWEST_VIEWS:
@@ -203,8 +208,8 @@ def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
         told = lambda phase, part, step=step: tell(phase, 0.2 + 0.7 * (step + part) / len(EFFORTS))  # noqa: E731
         shown = np.median([max(right - left, bottom - top) for left, top, right, bottom in windows.values()])
         fitting = effort.fitting(float(shown))
+        finest = fitting.size
         scene = learn_scene(cv2, parts, box, fitting, object_surfels, told, cancelled)
-        band = max(1.0, float(shown) / fitting.size)
         cut = cut_object(scene, box)
         if cut.surfels.sum() < _FEWEST_SURFELS:
             raise NoMasks("no object is found on the ground")
@@ -214,7 +219,7 @@ def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
     masks = [_without_ground(cv2, shown, k, mask, scene, cut, box) for k, mask in enumerate(masks)]
     if not any(mask.any() for mask in masks):
         raise NoMasks("what is learned of the object covers half of no pixel")
-    return Found(windows, parts, masks, Hull(cv2, parts, masks, box), scene, cut, box, shown, band)
+    return Found(windows, parts, masks, Hull(cv2, parts, masks, box), scene, cut, box, shown, finest)
 
 
 def without_specks(mask: Array) -> Array:

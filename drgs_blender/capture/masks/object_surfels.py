@@ -1,4 +1,4 @@
-"""The surfels of a learned scene that are the object's: above the ground, in the box, and connected."""
+"""The surfels of a learned scene that are the object's: above the ground, in the box, connected, and their foot."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ _LEAST, _DEVIATIONS = 0.006, 3.0
 #: What is lower is the object's foot where it is steep: largest part of its normal that is vertical, how far it lies
 #: from the object's lowest part and how low it may be, and how high that part is, in parts of the least height.
 _STEEP, _FOOT, _FOOT_BELOW = 0.5, 2.0, 2.0
+#: The least height in parts of the box's largest side, at most, for that: rough ground has steep surfels of its own.
+_MOST_FOOT = 0.02
 #: Fainter surfels are nobody's; larger ones, in parts of the box's largest side, are what is behind.
 _FAINT, _LARGEST = 0.1, 0.3
 #: Cells along the box's largest side in which parts are connected; margin beyond the box, in parts of that side.
@@ -77,7 +79,7 @@ def cut_object(scene: Gaussians, box: ObjectBox) -> Cut:
     if near.any():
         away = flat[near] / (size / 2)
         kept[near] = _connected(centre[near], weight[near] * np.exp(-4 * away**2), size / _CELLS)
-    kept |= _foot(scene, kept, seen, height, least)
+    kept |= _foot(scene, kept, seen, height, min(least, _MOST_FOOT * size))
     return Cut(kept, noise / size)
 
 

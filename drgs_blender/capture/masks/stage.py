@@ -178,8 +178,8 @@ def _learned(cv2: Any, views: list[MaskView], pictures: list[Picture], sheet: Pa
     made, fits = make_masks(cv2, views, found.points, sheet, subject, tell, cancelled)
     if made is None:
         return None, fits
-    for view, picture in zip(views, pictures, strict=True):
-        picture.mask_band = made.band * max(1.0, max(picture.size) / max(view.shape))
+    for k, (view, picture) in enumerate(zip(views, pictures, strict=True)):
+        picture.mask_band = made.band(k) * max(1.0, max(picture.size) / max(view.shape))
     return (made.whole(k, view.shape, pictures[k].size) for k, view in enumerate(views)), fits
 
 

@@ -31,8 +31,8 @@ class View:
     mask : (height, width) float32 array, optional
         In 0..1, the object's coverage of the pixel; None without a mask.
     mask_band : float
-        Pixels on either side of the mask's outline where it may be wrong and decides nothing (the unknown part of a
-        trimap); 0: it is exact, as drawn ones are.
+        Pixels on either side of the mask's outline where it may be wrong and teaches surfels nothing (the unknown part
+        of a trimap); 0: it is exact, as drawn ones are.
     test : bool
         Left out of training.
     normals : (height, width, 3) float32 array, optional

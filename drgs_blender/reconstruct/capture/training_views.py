@@ -55,8 +55,8 @@ class Target:
         Pixels of the crop in parts of the whole view's. Means over the crop count as much: a pixel of each view counts
         the same.
     unknown : (h, w) bool tensor or None
-        Where the mask may be wrong, `View.mask_band`: neither it nor the photograph teaches anything there. None:
-        nowhere.
+        Where the mask may be wrong, `near_outline` of `View.mask_band`: neither it nor the photograph teaches anything
+        there. None: nowhere.
     """
 
     camera: Camera
@@ -117,7 +117,7 @@ def full_targets(capture: Capture) -> list[Target]:
         if mask is not None:
             mask = np.ascontiguousarray(mask[y0:y1, x0:x1], np.float32)
         normals = None if view.normals is None else view.normals[y0:y1, x0:x1]
-        found.append(_target(camera, colour, mask, normals, keep, share))
+        found.append(_target(camera, colour, mask, normals, keep and not view.mask_band, share))
         found[-1].turn = view.turn
         if mask is not None and view.mask_band:
             found[-1].unknown = torch.from_numpy(near_outline(mask, view.mask_band))
@@ -125,11 +125,14 @@ def full_targets(capture: Capture) -> list[Target]:
 
 
 def near_outline(mask: Array, band: float) -> Array:
-    """(h, w) bool: `band` pixels on either side of the outline of `mask`."""
+    """(h, w) bool: `band` pixels on either side of the outline of `mask`; outside alone of parts that have no more."""
     inside = mask > 0.5
     if inside.all() or not inside.any():
         return np.zeros(mask.shape, bool)
-    return distance_transform_edt(inside) + distance_transform_edt(~inside) <= band
+    depth = distance_transform_edt(inside)
+    core = depth > band
+    thick = distance_transform_edt(~core) <= band + 1 if core.any() else core
+    return np.where(inside, (depth <= band) & thick, distance_transform_edt(~inside) <= band)
 
 
 def half_target(target: Target) -> Target:

@@ -160,6 +160,8 @@ class Learner:
         median, greys = rendered.maps.median, (_grey(target), _grey(beside))
         pair, spread = Pair.of(target.camera, beside.camera), self._schedule.patches_spread
         counts = torch.ones_like(median)
+        if target.unknown is not None:
+            counts = counts.masked_fill(target.unknown, 0.0)
         return backend.patch_loss(median, rendered.normal, counts, rays, greys, behind, pair, spread)
 
     def densify(self, budget: int) -> None:
@@ -231,7 +233,10 @@ def _grey(target: Target) -> Tensor:
 
 def _squared_error(rendered: RenderedView, target: Target) -> float:
     """Mean over the picture that the view is cut from."""
-    return target.share * float((rendered.colour.detach().clamp(0, 1) - target.colour).square().mean())
+    squared = (rendered.colour.detach().clamp(0, 1) - target.colour).square()
+    if target.unknown is not None:
+        squared = squared.masked_fill(target.unknown[..., None], 0.0)
+    return target.share * float(squared.mean())
 
 
 def _importance(features: Tensor) -> Tensor:
