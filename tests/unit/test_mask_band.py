@@ -15,7 +15,7 @@ pytest.importorskip("skimage")
 from capture_cases import balls  # noqa: E402
 
 from drgs_blender.reconstruct import checkpoint  # noqa: E402
-from drgs_blender.reconstruct.backend import CPU, LearningBackend  # noqa: E402
+from drgs_blender.reconstruct.backend import CPU  # noqa: E402
 from drgs_blender.reconstruct.capture.training_views import GREY, Target, full_targets, half_target, near_outline  # noqa: E402
 from drgs_blender.reconstruct.losses.photometric import Photograph  # noqa: E402
 from drgs_blender.reconstruct.meshing.depth_fusion import fuse  # noqa: E402
@@ -34,11 +34,13 @@ def with_band(band: float, size: int = SIDE):
     return replace(capture, views=[replace(view, mask_band=band) for view in capture.views])
 
 
-def gradients(target: Target, surfels, radius: float, backend: LearningBackend = CPU) -> dict[str, torch.Tensor]:
-    learner = Learner(surfels, Schedule(), radius, torch.tensor(GREY), backend)
+def gradients(target: Target, surfels, radius: float, beside: Target | None = None) -> dict[str, torch.Tensor]:
+    """Of a step's parameters, and the error of the picture as "error"."""
+    learner = Learner(surfels, Schedule(patches=0.0 if beside is None else 1.0), radius, torch.tensor(GREY), CPU)
     learner.optimiser.step = learner.light.step = lambda parameters, rates: None  # type: ignore[method-assign]
-    learner.step(target, 0.5)
-    return {name: value.grad for name, value in learner.gaussians.parameters.items() if value.grad is not None}
+    learner.step(target, 0.5, beside)
+    found = {name: value.grad for name, value in learner.gaussians.parameters.items() if value.grad is not None}
+    return found | {"error": torch.tensor(learner.error)}
 
 
 def other_photograph(target: Target, where: torch.Tensor) -> Target:
@@ -90,12 +92,13 @@ def test_what_photograph_and_mask_are_within_the_band_teaches_nothing():
     capture = with_band(BAND)
     region = find_region(capture)
     surfels = on_hull(capture, region, 3000, 2)
-    target = full_targets(capture)[0]
+    target, near, *_ = full_targets(capture)
     assert target.unknown is not None
-    known = gradients(target, surfels, region.radius)
-    other = gradients(other_photograph(target, target.unknown), surfels, region.radius)
-    for name, value in known.items():
-        np.testing.assert_array_equal(value, other[name], name)
+    for beside in (near, None):
+        known = gradients(target, surfels, region.radius, beside)
+        other = gradients(other_photograph(target, target.unknown), surfels, region.radius, beside)
+        for name, value in known.items():
+            np.testing.assert_array_equal(value, other[name], name)
     # beside the band they do, and without one everywhere
     for changed in (
         other_photograph(target, torch.roll(target.unknown, 9, 1) & ~target.unknown),

@@ -12,7 +12,7 @@ from torch import Tensor
 from ...core.arrays import Array
 from ..backend import LearningBackend
 from ..capture.training_views import Target, pixel_rays
-from ..losses.patches import Pair
+from ..losses.patches import REACH, Pair
 from ..losses.photometric import Photograph
 from ..model.attributes import TINT
 from ..model.gaussians import Gaussians, RenderedView
@@ -160,8 +160,9 @@ class Learner:
         median, greys = rendered.maps.median, (_grey(target), _grey(beside))
         pair, spread = Pair.of(target.camera, beside.camera), self._schedule.patches_spread
         counts = torch.ones_like(median)
-        if target.unknown is not None:
-            counts = counts.masked_fill(target.unknown, 0.0)
+        if target.unknown is not None:  # and patches that show it
+            shown = torch.nn.functional.max_pool2d(target.unknown[None].float(), 2 * REACH + 1, 1, REACH)[0]
+            counts = counts - shown
         return backend.patch_loss(median, rendered.normal, counts, rays, greys, behind, pair, spread)
 
     def densify(self, budget: int) -> None:
