@@ -94,8 +94,8 @@ def composed(folder: Path, cameras: str, masks: str) -> Path:
     data["frames"] = []
     bands = {}
     if masks == "found":
-        frames = json.loads((made / "transforms.json").read_text())["frames"]
-        bands = {Path(frame["file_path"]).stem: frame.get("mask_band", 0) for frame in frames}
+        frames = cameras_of(folder, "found")[1]
+        bands = {Path(name).stem: frame.get("mask_band", 0) for name, frame in frames.items()}
     for name, camera in known.items():
         mask_file = (folder / "truth" if masks == "true" else made / "masks") / f"{Path(name).stem}.png"
         if mask_file.is_file():

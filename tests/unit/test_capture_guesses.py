@@ -183,10 +183,16 @@ def test_cameras_held_in_all_ways_do_not_say_what_is_up():
     assert found.guessed["up"].startswith("nothing")
 
 
-def written_capture(tmp_path, alignment: Alignment, bright: int = 0):
-    """A capture folder of six pictures whose world is `alignment`; some are EXR, brighter than white."""
+def six_cameras():
+    """Registration of six pictures, as the report needs it."""
     found = registration(ring(6), np.zeros((0, 3)))
     found.errors, found.observations = dict.fromkeys(found.matrices, 0.1), dict.fromkeys(found.matrices, 9)
+    return found
+
+
+def written_capture(tmp_path, alignment: Alignment, bright: int = 0):
+    """A capture folder of six pictures whose world is `alignment`; some are EXR, brighter than white."""
+    found = six_cameras()
     pictures = {}
     for k, file in enumerate(found.matrices):
         path = tmp_path / f"{file}.{'exr' if k < bright else 'png'}"
@@ -352,8 +358,7 @@ def test_other_masks_or_scale_keep_the_work_that_was_done(tmp_path):
 
 
 def test_the_folder_says_how_wrong_outlines_of_masks_may_be(tmp_path):
-    found = registration(ring(6), np.zeros((0, 3)))
-    found.errors, found.observations = dict.fromkeys(found.matrices, 0.1), dict.fromkeys(found.matrices, 9)
+    found = six_cameras()
     pictures = {}
     for k, file in enumerate(found.matrices):
         for name, mode in ((f"{k}.png", "RGB"), (f"{k}-mask.png", "L")):

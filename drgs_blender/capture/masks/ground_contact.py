@@ -89,8 +89,8 @@ def shows_ground(cv2: Any, views: Sequence[MaskView], which: int, mask: Array, h
 
 def _above_foot(view: MaskView, mask: Array, box: ObjectBox) -> Array:
     """(h, w) bool: pixels of the mask that are farther from its lower edge than the lowest plane is from the ground."""
-    foot, size = [*(box.low + box.high)[:2] / 2, 0.0], float((box.high - box.low).max())
-    seen, _ = view.project(np.array([foot, np.add(foot, [0.0, 0.0, _ABOVE[0] * size])]))
+    foot, size = _foot(box), float((box.high - box.low).max())
+    seen, _ = view.project(np.stack([foot, foot + np.array([0.0, 0.0, _ABOVE[0] * size])]))
     down = np.nan_to_num(seen[0] - seen[1])  # in the picture, x and y
     x, y = (int(math.copysign(math.ceil(abs(d) - 0.5), d)) for d in down)
     padded = np.pad(mask, ((abs(y), abs(y)), (abs(x), abs(x))))
@@ -98,10 +98,14 @@ def _above_foot(view: MaskView, mask: Array, box: ObjectBox) -> Array:
     return mask & padded[abs(y) + y : abs(y) + y + height, abs(x) + x : abs(x) + x + width]
 
 
+def _foot(box: ObjectBox) -> Array:
+    """(3,) place on the ground below the middle of the box."""
+    return np.array([*(box.low + box.high)[:2] / 2, 0.0])
+
+
 def _neighbours(views: Sequence[MaskView], which: int, box: ObjectBox) -> list[MaskView]:
     """The views that see the foot of the object from nearly the same side."""
-    foot = np.array([*(box.low + box.high)[:2] / 2, 0.0])
-    towards = np.array([view.centre - foot for view in views])
+    towards = np.array([view.centre - _foot(box) for view in views])
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     order = np.argsort(-(towards @ towards[which]), kind="stable")
     return [views[k] for k in order if k != which][:_NEAR]

@@ -199,7 +199,7 @@ def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
     """
     prepare_kernels(("reconstruct",), lambda _, part: tell(PHASE, 0.2 * part), cancelled)
     matrices = np.stack([view.matrix for view in views])
-    box, object_surfels, finest = find_box(points, matrices), None, PART
+    box, object_surfels = find_box(points, matrices), None
     for step, effort in enumerate(EFFORTS):
         windows = {k: window for k, view in enumerate(views) if (window := box.window(view)) is not None}
         if len(windows) < _FEWEST_VIEWS:
@@ -208,7 +208,6 @@ def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
         told = lambda phase, part, step=step: tell(phase, 0.2 + 0.7 * (step + part) / len(EFFORTS))  # noqa: E731
         shown = np.median([max(right - left, bottom - top) for left, top, right, bottom in windows.values()])
         fitting = effort.fitting(float(shown))
-        finest = fitting.size
         scene = learn_scene(cv2, parts, box, fitting, object_surfels, told, cancelled)
         cut = cut_object(scene, box)
         if cut.surfels.sum() < _FEWEST_SURFELS:
@@ -219,7 +218,7 @@ def find_masks(cv2: Any, views: Sequence[MaskView], points: Array, tell: Tell,
     masks = [_without_ground(cv2, shown, k, mask, scene, cut, box) for k, mask in enumerate(masks)]
     if not any(mask.any() for mask in masks):
         raise NoMasks("what is learned of the object covers half of no pixel")
-    return Found(windows, parts, masks, Hull(cv2, parts, masks, box), scene, cut, box, shown, finest)
+    return Found(windows, parts, masks, Hull(cv2, parts, masks, box), scene, cut, box, shown, fitting.size)
 
 
 def without_specks(mask: Array) -> Array:

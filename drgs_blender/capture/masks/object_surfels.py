@@ -79,18 +79,21 @@ def cut_object(scene: Gaussians, box: ObjectBox) -> Cut:
     if near.any():
         away = flat[near] / (size / 2)
         kept[near] = _connected(centre[near], weight[near] * np.exp(-4 * away**2), size / _CELLS)
-    kept |= _foot(scene, kept, seen, height, min(least, _MOST_FOOT * size))
+    kept |= _foot(centre[:, :2], scene.frames()[2], kept, seen, height, min(least, _MOST_FOOT * size))
     return Cut(kept, noise / size)
 
 
-def _foot(scene: Gaussians, kept: Array, seen: Array, height: Array, least: float) -> Array:
-    """(n,) bool: the surfels of walls that go on below the least height; ground is flat."""
-    centre, foot = scene.centres().detach().numpy().astype(np.float64)[:, :2], np.zeros(len(kept), bool)
+def _foot(places: Array, normals: Array, kept: Array, seen: Array, height: Array, least: float) -> Array:
+    """(n,) bool: the surfels of walls, seen from above at `places` (n, 2), that go on below the least height.
+
+    Ground is flat.
+    """
+    foot = np.zeros(len(kept), bool)
     lowest = kept & (height < _FOOT * least)
-    steep = np.abs(scene.frames()[2][:, 2]) <= _STEEP
+    steep = np.abs(normals[:, 2]) <= _STEEP
     asked = np.flatnonzero(seen & ~kept & steep & (height <= least) & (height > -_FOOT_BELOW * least))
     if lowest.any() and len(asked):
-        away, _ = cKDTree(centre[lowest]).query(centre[asked])
+        away, _ = cKDTree(places[lowest]).query(places[asked])
         foot[asked[away < _FOOT * least]] = True
     return foot
 

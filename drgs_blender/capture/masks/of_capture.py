@@ -59,7 +59,7 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
     sheet.unlink(missing_ok=True)  # of another run
     if mode == "none":
         for view in capture.views:
-            view.mask, view.mask_band = None, 0.0
+            view.set_mask(None)
         capture.background = None
         return
     subject = str(capture.source)
@@ -93,11 +93,10 @@ def mask_capture(capture: Capture, mode: str, sheet: Path, tell: Tell, cancelled
         return
     for k, view in enumerate(capture.training):
         height, width = view.colour.shape[:2]
-        view.mask = made.whole(k, (height, width), (width, height)).astype(np.float32) / 255
-        view.mask_band = made.band(k)
+        view.set_mask(made.whole(k, (height, width), (width, height)).astype(np.float32) / 255, made.band(k))
     for view in capture.testing:
         if view.mask is None:
-            view.mask = made.seen_by(cv2, _mask_view(view, found.matrices[view.name])).astype(np.float32) / 255
+            view.set_mask(made.seen_by(cv2, _mask_view(view, found.matrices[view.name])).astype(np.float32) / 255)
 
 
 def _check_given(capture: Capture, sheet: Path, subject: str) -> None:
@@ -128,7 +127,7 @@ def _by_model(model: SegmentationModel, capture: Capture, cv2: Any, sheet: Path,
     if masks is None:
         return
     for view, mask in zip(capture.views, masks, strict=True):
-        view.mask, view.mask_band = mask.astype(np.float32) / 255, 0.0
+        view.set_mask(mask.astype(np.float32) / 255)
 
 
 def _to_ground(found: Registration, source: Path) -> str | None:

@@ -60,6 +60,10 @@ class View:
     on_white: bool = False
     mask_band: float = 0.0
 
+    def set_mask(self, mask: Array | None, band: float = 0.0) -> None:
+        """Replace the mask, and the band that the last one had."""
+        self.mask, self.mask_band = mask, band
+
     def laid_on(self, wanted: RGB, behind: RGB | None) -> Array:
         """The object on one colour.
 

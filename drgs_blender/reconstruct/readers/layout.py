@@ -59,10 +59,10 @@ class Photograph:
         File.
     test : bool
         A test view of the capture: not used in training.
-    mask_band : float
-        `View.mask_band`, pixels of `lens`.
     exposure : float, optional
         Exposure value, stops; larger lets in less light. None: not known, or of no account.
+    mask_band : float
+        `View.mask_band`, pixels of `lens`.
     """
 
     name: str

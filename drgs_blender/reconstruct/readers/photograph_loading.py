@@ -183,7 +183,7 @@ def cut_out(views: list[View]) -> bool:
     if not masks or any(mask is None for mask in masks):
         return False
     for view, mask in zip(views, masks):
-        view.mask = mask
+        view.set_mask(mask)
     return True
 
 

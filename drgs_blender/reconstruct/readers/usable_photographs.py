@@ -39,7 +39,7 @@ def usable(developed: Sequence[tuple[Photograph, View | None]], subject: str) ->
     pairs = _without_blank(developed, subject)
     if all(view.mask is None or view.mask.min() >= 1 for _, view in pairs):  # an alpha channel that says nothing
         for _, view in pairs:
-            view.mask, view.mask_band = None, 0.0
+            view.set_mask(None)
     left_out = [*_unmasked(pairs, False, subject), *_unmasked(pairs, True, subject), *_empty(pairs, subject)]
     pairs = [pair for pair in pairs if not any(pair is other for other in left_out)]
     if turned := [photograph.image for photograph, _ in pairs if turned_by_exif(photograph.image)]:
@@ -82,7 +82,7 @@ def _unmasked(pairs: list[Pair], test: bool, subject: str) -> list[Pair]:
     if fewer:
         return without
     for _, view in group:
-        view.mask, view.mask_band = None, 0.0
+        view.set_mask(None)
     return []
 
 
