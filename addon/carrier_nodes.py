@@ -31,6 +31,13 @@ SOURCE = "DR-GS Cage"
 NAME = "DR-GS Carrier"
 #: Attribute of the carrier within the tree: `carrier_weights.normals_of`.
 _NORMAL = "drgs_carrier_normal"
+#: Begins the names of the groups that add three points; a dot hides them from menus.
+_GROUP = ".DR-GS Carrier Points"
+#: Their inputs; the output is "Place" with the points added.
+_SOCKETS = (
+    ("Geometry", "Geometry"),
+    *((name, "Vector") for name in ("Place", "Indices", "Weights", "Normals")),
+)
 
 
 def carrier_of(modifier: bpy.types.Modifier) -> bpy.types.Object | None:
@@ -180,13 +187,12 @@ def tree_of(carrier: bpy.types.Object) -> bpy.types.NodeTree:
         tree.links.new(given, next(s for s in store.inputs if s.enabled and s.name == socket))
     store.inputs["Name"].default_value = _NORMAL
     shape = store.outputs["Geometry"]
-    values = build.out("GeometryNodeInputPosition"), build.attribute(_NORMAL, "FLOAT_VECTOR")
     geometry = tree.nodes.new("NodeGroupInput").outputs[0]
     for suffix in ("", RENDERED):
         moved = tree.nodes.new("GeometryNodeSetPosition")
         tree.links.new(geometry, moved.inputs["Geometry"])
         tree.links.new(_same(build, counts, COUNT + suffix), moved.inputs["Selection"])
-        tree.links.new(_place(build, shape, values, suffix), moved.inputs["Position"])
+        tree.links.new(_place(build, shape, suffix), moved.inputs["Position"])
         geometry = moved.outputs["Geometry"]
     tree.links.new(geometry, tree.nodes.new("NodeGroupOutput").inputs[0])
     return tree
@@ -201,20 +207,33 @@ def _same(build: Builder, counts: list[bpy.types.NodeSocket], name: str) -> bpy.
     return build.out("FunctionNodeBooleanMath", either, some, operation="AND")
 
 
-def _place(
-    build: Builder, shape: bpy.types.NodeSocket, values: tuple[bpy.types.NodeSocket, ...], suffix: str
-) -> bpy.types.NodeSocket:
+def _place(build: Builder, shape: bpy.types.NodeSocket, suffix: str) -> bpy.types.NodeSocket:
     """The sum of where the points of each vertex are now, and of their normals."""
     total = build.attribute(LEFT + suffix, "FLOAT_VECTOR")
+    group = _group()
     for i in range(THREES):
-        indices, *weights = (
-            build.parts(build.attribute(name.format(i) + suffix, "FLOAT_VECTOR"))
-            for name in (INDICES, WEIGHTS, NORMALS)
-        )
-        for value, weight in zip(values, weights):
-            for index, share in zip(indices, weight):
-                found = build.out(
-                    "GeometryNodeSampleIndex", shape, value, index, data_type="FLOAT_VECTOR", domain="POINT"
-                )
-                total = build.vector("ADD", total, build.scaled(found, share))
+        named = (build.attribute(name.format(i) + suffix, "FLOAT_VECTOR") for name in (INDICES, WEIGHTS, NORMALS))
+        total = build.out("GeometryNodeGroup", shape, total, *named, node_tree=group)
     return total
+
+
+def _group() -> bpy.types.NodeTree:
+    """The nodes that add three points of a carrier to a place; one for all trees, as each node slows their making."""
+    for known in bpy.data.node_groups:
+        if known.library is None and known.name.startswith(_GROUP) and known.get(_GROUP) == len(_SOCKETS):
+            return known
+    tree = bpy.data.node_groups.new(_GROUP, "GeometryNodeTree")
+    tree[_GROUP] = len(_SOCKETS)
+    for name, kind in _SOCKETS:
+        tree.interface.new_socket(name, in_out="INPUT", socket_type=f"NodeSocket{kind}")
+    tree.interface.new_socket("Place", in_out="OUTPUT", socket_type="NodeSocketVector")
+    build = Builder(tree)
+    shape, total, *given = list(tree.nodes.new("NodeGroupInput").outputs)[: len(_SOCKETS)]
+    indices, *weights = map(build.parts, given)
+    values = build.out("GeometryNodeInputPosition"), build.attribute(_NORMAL, "FLOAT_VECTOR")
+    for value, weight in zip(values, weights):
+        for index, share in zip(indices, weight):
+            found = build.out("GeometryNodeSampleIndex", shape, value, index, data_type="FLOAT_VECTOR", domain="POINT")
+            total = build.vector("ADD", total, build.scaled(found, share))
+    tree.links.new(total, tree.nodes.new("NodeGroupOutput").inputs[0])
+    return tree
