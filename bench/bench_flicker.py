@@ -1,11 +1,12 @@
 """Does a sequence under a light that turns flicker? Noisy, denoised one by one, over time, and in a window; and Cycles.
 
-python bench/bench_flicker.py [--frames 8] [--size 256] [--samples 32] [--reference 1024] [--step 1]
+python bench/bench_flicker.py [--frames 8] [--size 256] [--samples 32] [--reference 1024] [--steps 1 4]
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +34,7 @@ FOLDER = OUT / "flicker"
 TRIANGLES = 82000
 
 
-def frames(options: argparse.Namespace, environment: str) -> list[Frame]:
+def frames(options: argparse.Namespace, step: float, environment: str) -> list[Frame]:
     """The sequence: the world turns about the vertical axis, all else stands still."""
     path = asset_path("cat", max_triangles=TRIANGLES)
     key = SESSION.load_asset(path)
@@ -42,7 +43,7 @@ def frames(options: argparse.Namespace, environment: str) -> list[Frame]:
     settings = RenderSettings(options.samples, film_transparent=True, subpixel_samples=4)
     out = []
     for number in range(options.frames):
-        a = np.radians(options.step * number)
+        a = np.radians(step * number)
         turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
         world = World(radiance, turn)
         out.append(
@@ -60,7 +61,7 @@ def rendered(sequence: list[Frame], history: str = "", **settings: object) -> li
     return out
 
 
-def jobs_of(options: argparse.Namespace, environment: str) -> list[dict[str, Any]]:
+def jobs_of(options: argparse.Namespace, step: float, environment: str) -> list[dict[str, Any]]:
     """The same sequence for Cycles, each frame with noise of its own."""
     mesh, npz = read_asset(asset_path("cat", max_triangles=TRIANGLES)).mesh, FOLDER / "cat.npz"
     FOLDER.mkdir(parents=True, exist_ok=True)
@@ -70,7 +71,7 @@ def jobs_of(options: argparse.Namespace, environment: str) -> list[dict[str, Any
         "camera": frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.66),
     }  # fmt: skip
     return [
-        shared | {"rotation_z": options.step * k, "seed": k, "out": str(FOLDER / f"{environment}-{k}.npy")}
+        shared | {"rotation_z": step * k, "seed": k, "out": str(FOLDER / f"{environment}-{step:g}-{k}.npy")}
         for k in range(options.frames)
     ]
 
@@ -81,12 +82,14 @@ def by_cycles(jobs: list[dict[str, Any]], samples: int, denoise: bool = False) -
     return np.stack([np.load(job["out"]) for job in jobs])
 
 
-def rows_of(environment: str, ways: dict[str, Array], truth: Array, mask: Array) -> list[tuple[str, ...]]:
+def rows_of(step: float, environment: str, ways: dict[str, Array], truth: Array, mask: Array) -> list[tuple[str, ...]]:
     """Cells of each way: flicker beyond that of the converged sequence, PSNR from the third frame on."""
     rest, rows = flicker(truth, mask), []
     for name, shown in ways.items():
         later = [psnr(a, b, m) for a, b, m in zip(shown[2:], truth[2:], mask[2:])]
-        rows.append((environment, name, f"{1e3 * (flicker(shown, mask) - rest):.2f}", f"{np.mean(later):.2f}"))
+        rows.append(
+            (f"{step:g}", environment, name, f"{1e3 * (flicker(shown, mask) - rest):.2f}", f"{np.mean(later):.2f}")
+        )
     return rows
 
 
@@ -110,43 +113,49 @@ def in_windows(sequence: list[Frame]) -> tuple[list[Array], list[Array], list[Ar
     return pictures, found, coverage
 
 
+def compared(options: argparse.Namespace, step: float, environment: str) -> list[tuple[str, ...]]:
+    """Rows of one sequence, ours and those of Cycles."""
+    sequence = frames(options, step, environment)
+    noisy, windows, coverage = in_windows(sequence)
+    truth = np.stack(rendered(sequence, samples=options.reference))
+    mask = np.stack([foreground(c, 1) for c in coverage])
+    ways: dict[str, list[Array]] = {
+        "noisy": noisy,
+        "SVGF, each frame alone": rendered(sequence, denoise="svgf"),
+        "SVGF, over time": rendered(sequence, f"{environment} {step}", denoise="svgf"),
+        "SVGF, window of 5": windows,
+    }
+    if available():
+        ways["OIDN, each frame alone"] = rendered(sequence, denoise="oidn")
+    stacks = {name: np.stack(pictures) for name, pictures in ways.items()}
+    rows = rows_of(step, environment, stacks, truth, mask)
+    jobs = jobs_of(options, step, environment)
+    theirs = by_cycles(jobs, options.reference)
+    mask = np.stack([foreground(picture[..., 3], 1) for picture in theirs])
+    cycles = {
+        "Cycles: noisy": by_cycles(jobs, options.samples),
+        "Cycles: OIDN, each frame alone": by_cycles(jobs, options.samples, denoise=True),
+    }
+    return rows + rows_of(step, environment, cycles, theirs, mask)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--samples", type=int, default=32)
     parser.add_argument("--reference", type=int, default=1024)
-    parser.add_argument("--step", type=float, default=1.0, help="degrees a frame")
+    parser.add_argument("--steps", type=float, nargs="+", default=[1.0, 4.0], help="degrees a frame")
     options = parser.parse_args()
     rows: list[tuple[str, ...]] = []
-    for environment in ("city", "studio"):
-        sequence = frames(options, environment)
-        noisy, windows, coverage = in_windows(sequence)
-        truth = np.stack(rendered(sequence, samples=options.reference))
-        mask = np.stack([foreground(c, 1) for c in coverage])
-        ways: dict[str, list[Array]] = {
-            "noisy": noisy,
-            "SVGF, each frame alone": rendered(sequence, denoise="svgf"),
-            "SVGF, over time": rendered(sequence, environment, denoise="svgf"),
-            "SVGF, window of 5": windows,
-        }
-        if available():
-            ways["OIDN, each frame alone"] = rendered(sequence, denoise="oidn")
-        rows += rows_of(environment, {name: np.stack(pictures) for name, pictures in ways.items()}, truth, mask)
-        jobs = jobs_of(options, environment)
-        theirs = by_cycles(jobs, options.reference)
-        mask = np.stack([foreground(picture[..., 3], 1) for picture in theirs])
-        cycles = {
-            "Cycles: noisy": by_cycles(jobs, options.samples),
-            "Cycles: OIDN, each frame alone": by_cycles(jobs, options.samples, denoise=True),
-        }
-        rows += rows_of(environment, cycles, theirs, mask)
+    for step, environment in itertools.product(options.steps, ("city", "studio")):
+        rows += compared(options, step, environment)
     body = (
         f"cat, {options.size}x{options.size}, {options.samples} samples, {options.frames} frames, the world turns "
-        f"{options.step:g} degree(s) a frame. Flicker: mean absolute second difference in time of sRGB luminance, less "
-        f"that of {options.reference} rays, in thousandths. PSNR: against {options.reference} rays, foreground, sRGB, "
-        "from the third frame on. Cycles: as many samples a pixel, against its own converged sequence.\n\n"
-        + table(("World", "Denoiser", "Flicker", "PSNR, dB"), rows)
+        "by the degrees of the first column per frame. Flicker: mean absolute second difference in time of sRGB "
+        f"luminance, less that of {options.reference} rays, in thousandths. PSNR: against {options.reference} rays, "
+        "foreground, sRGB, from the third frame on. Cycles: as many samples a pixel, against its own converged "
+        "sequence.\n\n" + table(("Degrees", "World", "Denoiser", "Flicker", "PSNR, dB"), rows)
     )
     write_section("flicker", "Flicker under a light that turns", body)
 

@@ -1,6 +1,7 @@
 """What light costs: time to equal quality against Cycles and Mitsuba, what makes the time, and what it buys.
 
-python bench/bench_light.py [--part equal-psnr mitsuba denoised relmse cost memory efficiency cases ablation] ...
+python bench/bench_light.py [--part equal-psnr mitsuba denoised relmse cost memory efficiency cases denoisers
+    ablation] ...
 
 Each part writes its own section. Everything runs on two processors, as far as the system allows that to be set.
 """
@@ -12,6 +13,7 @@ import os
 
 import light_ablation
 import light_cost
+import light_denoisers
 import light_efficiency
 import light_renderers
 import light_variance
@@ -28,6 +30,7 @@ PARTS = {
     "memory": ("Light: memory of a large frame", light_cost.memory),
     "efficiency": ("Light: what denoiser, MIS and mesh bring", light_efficiency.efficiency),
     "cases": ("Light: noise of single cases", light_variance.variance),
+    "denoisers": ("Light: denoisers by samples", light_denoisers.denoisers),
     "ablation": ("Light: inter-reflection, shadows and reflections", light_ablation.ablation),
 }
 

@@ -49,7 +49,9 @@ def wall(**changes: object) -> Guides:
     return Guides(**{k: np.array(v, np.float32) for k, v in arrays.items()})
 
 
-def light_of(diffuse: np.ndarray, guides: Guides, noise: float = 0.0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def light_of(
+    diffuse: np.ndarray, guides: Guides, noise: float | np.ndarray = 0.0, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Components and variance of irradiance (h, w) on the guides' surfaces, relative noise of the given deviation."""
     rng = np.random.default_rng(seed)
     value = diffuse * (1 + noise * rng.normal(size=(H, W)))

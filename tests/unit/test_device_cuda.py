@@ -23,7 +23,7 @@ from drgs_blender.compute.warp.kernels import Launcher
 from drgs_blender.deform.gpu import gmls
 from drgs_blender.deform.gpu import mesh_driven as deformation
 from drgs_blender.deform.gpu.mesh_driven import Deformer
-from drgs_blender.render.gpu import attach, bvhs, camera_hits, denoise, integrate, raster, splats
+from drgs_blender.render.gpu import attach, bvhs, camera_hits, integrate, raster, splats, svgf_kernels
 from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 from drgs_blender.simulation.gpu import cells, steps
 
@@ -56,7 +56,7 @@ def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
     history = None
     for picture in pictures(2):
         _, history = device.denoise_next(picture, history, True, False, nothing)
-    wanted = raster.BLEND, attach.ATTACH, *denoise.KERNELS
+    wanted = raster.BLEND, attach.ATTACH, *svgf_kernels.KERNELS
     wanted += deformation.WEIGH, deformation.SUM, deformation.POSE
     wanted += bvhs.PLACE, camera_hits.TRACE, camera_hits.SHADE
     wanted += splats.PROJECT, splats.KEY, splats.FIND, splats.GATHER, splats.LIST

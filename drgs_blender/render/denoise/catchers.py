@@ -1,8 +1,8 @@
 """Shadows on catchers without noise: both sums of light that they are the quotient of are filtered alike.
 
 Where nothing throws a shadow both have the same samples, so their quotient is exactly 1, however noisy they are. It
-stays 1 since the filter is linear, with one set of weights for both; what denoises the rest of a picture may be
-neither. A filter of the quotient would weigh dark samples as much as bright ones, and be wrong on average.
+stays 1 since each pixel is a sum of pixels with one set of weights for both; what denoises the rest of a picture may
+be no such sum. A filter of the quotient would weigh dark samples as much as bright ones, and be wrong on average.
 """
 
 from __future__ import annotations

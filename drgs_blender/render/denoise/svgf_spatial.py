@@ -24,9 +24,9 @@ from collections.abc import Callable
 import numpy as np
 
 from ...compute.jit import inlined, njit
-from ...compute.threads import ROWS, get_num_threads, over_range
+from ...compute.threads import ROWS, over_range
 from ...core.color import LUMINANCE as REC709
-from ...core.memory import sparse_zeros
+from .bands import filter_in_place
 from .demodulation import (
     CERTAINTY,
     LEVELS,
@@ -46,6 +46,7 @@ from .demodulation import (
     demodulate,
     modulate,
 )
+from .svgf_residual import restore
 
 Array = np.ndarray
 
@@ -59,8 +60,8 @@ SIGMA_ROUGHNESS = 0.1
 TAPS, FEW_TAPS = np.array([1, 4, 6, 4, 1], np.float32) / 16, np.array([1, 2, 1], np.float32) / 4
 NORMAL_POWER, ROUGH_NORMAL_POWER = 128.0, 32.0
 FIREFLY = 3.0
-#: Fewest rows of a band that is filtered at once.
-_BAND = 96
+#: Rows above and below its own among which a firefly is looked for.
+_FIREFLIES = 2
 
 
 def denoise(
@@ -91,15 +92,23 @@ def _smooth_light(
     components: Array, variance: Array, guides: Guides, split: bool, check: Callable[[], None]
 ) -> Signal:  # fmt: skip
     """All of `denoise` but the last step, before which its arrays are gone."""
-    signal = prepare(components, variance, guides, split)
+    smoothed = smooth(prepare(components, variance, guides, split), check, overwrite=True)
     check()
-    return smooth(signal, check, overwrite=True)
+
+    def noisy(first: int, last: int) -> Signal:
+        """Made once more, as a copy would be as large as the picture of light."""
+        low, high = max(first - _FIREFLIES, 0), last + _FIREFLIES
+        near = Guides(*(array[low:high] for array in guides))
+        signal, rows = prepare(components[low:high], variance[low:high], near, split), slice(first - low, last - low)
+        return Signal(signal.guide[rows], signal.light[rows], signal.spans[rows])
+
+    return restore(smoothed, noisy)
 
 
 def prepare(components: Array, variance: Array, guides: Guides, split: bool = True) -> Signal:
     """Light to be filtered: demodulated, its fireflies clamped; parameters as of `denoise`."""
     signal = demodulate(components, variance, guides, split)
-    _filter_in_place(_clamp_fireflies, 2, signal)
+    filter_in_place(_clamp_fireflies, _FIREFLIES, signal)
     return signal
 
 
@@ -130,50 +139,8 @@ def smooth(
     for level in range(levels):
         check()
         over_range(_weigh, len(light), sigma_of(level), signal.guide, signal.spans, light, fewest=ROWS)
-        _filter_in_place(_a_trous, len(taps) // 2 << level, smoothed, 1 << level, taps)
+        filter_in_place(_a_trous, len(taps) // 2 << level, smoothed, 1 << level, taps)
     return smoothed
-
-
-def _filter_in_place(kernel: Callable[..., None], reach: int, signal: Signal, *arguments: object) -> None:
-    """Write what a kernel makes of light over it, in bands of rows: a second picture of light would double the memory.
-
-    A band is written when the next one, which reads of its rows, has been made.
-
-    Parameters
-    ----------
-    kernel : callable
-        ``kernel(first, last, *arguments, guide, spans, light, out)``.
-    reach : int
-        Rows above and below its own that the kernel reads.
-    signal : Signal
-    *arguments : int
-    """
-    guide, light, spans = signal.guide, signal.light, signal.spans
-    height = max(_BAND, reach, 4 * ROWS * get_num_threads())
-    buffers = [sparse_zeros((min(height + reach, len(light)), *light.shape[1:])) for _ in range(2)]
-    made: list[tuple[int, Array]] = []  # of the band before: its first row and what is to be written from there on
-    for y0 in range(0, len(light), height):
-        y1 = min(y0 + height, len(light))
-        low = max(y0 - reach, 0)
-        near, out = slice(low, y1 + reach), buffers[y0 // height % 2]
-
-        def work(first: int, last: int, *given: object, shift: int = y0 - low) -> None:
-            kernel(first + shift, last + shift, *given)
-
-        over_range(work, y1 - y0, *arguments, guide[near], spans[near], light[near], out, fewest=ROWS)
-        made.append((y0, out[y0 - low : y1 - low]))
-        if len(made) == 2:
-            _write_rows(*made.pop(0), signal)
-    for rows in made:
-        _write_rows(*rows, signal)
-
-
-def _write_rows(first: int, rows: Array, signal: Signal) -> None:
-    """Write what is covered of some rows over a signal's light, but for the planes that `_weigh` makes."""
-    for y, row in enumerate(rows, first):
-        columns = slice(signal.spans[y, 0] + PAD, signal.spans[y, 1] + PAD)
-        for planes in (slice(CERTAINTY), slice(LIGHT, None)):
-            signal.light[y, planes, columns] = row[planes, columns]
 
 
 def sigma_of(level: int) -> np.float32:

@@ -40,6 +40,7 @@ from .demodulation import (
     Signal,
     modulate,
 )
+from .svgf_residual import restore, rows_of
 from .svgf_spatial import FEW_TAPS, TAPS, prepare, smooth
 
 Array = np.ndarray
@@ -138,7 +139,8 @@ def denoise_next(
         signal = accumulate(past, signal, picture.motion, still)
         if turned:
             levels, taps = TURNED_LEVELS, FEW_TAPS
-    return modulate(smooth(signal, check, levels=levels, taps=taps), picture.guides), signal
+    smoothed = restore(smooth(signal, check, levels=levels, taps=taps), rows_of(signal))
+    return modulate(smoothed, picture.guides), signal
 
 
 def least_gain(still: bool) -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 from ...compute.jit import inlined, njit
 from ...compute.threads import ROWS, over_range
 from .demodulation import LIGHT, LUMINANCE, PAD, SOURCE, SURFACE, VARIANCE, Signal, modulate
+from .svgf_residual import restore, rows_of
 from .svgf_spatial import prepare, smooth
 from .svgf_temporal import BIAS, CHANGES, NOW, SAME_PLANE, NoisyPicture, find_change, warp
 
@@ -85,7 +86,8 @@ def window(
         )
     guide = signal.guide.copy()
     over_range(_divide, len(total), signal.spans, weights, guide, total, fewest=ROWS)
-    return modulate(smooth(Signal(guide, total, signal.spans), check), picture.guides)
+    gathered = Signal(guide, total, signal.spans)
+    return modulate(restore(smooth(gathered, check), rows_of(gathered)), picture.guides)
 
 
 def _neighbours(pictures: Sequence[NoisyPicture | None]) -> Iterator[tuple[int, NoisyPicture, Array, Array]]:

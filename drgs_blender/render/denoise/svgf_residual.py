@@ -1,0 +1,172 @@
+"""What smoothing took away that is no noise, given back: the best mixture of noisy and smoothed light.
+
+Nothing guides the spatial filter along what a surface reflects. It blurs sharp reflections, and light of a bright,
+noisy pixel leaks into dark ones beside it, whose own samples know better: the more samples there are, the more of the
+error is this. Of all mixtures n + w (s - n) of the noisy light n and the smoothed s, the one of the least squared error
+takes w = E[(n - t)(n - s)] / E[(n - s)^2], t being the true light. The denominator is measured around each pixel. The
+numerator is the variance of n less its covariance with s, by the pixel's own weight in the filter; and at most as much
+of n - s as differs from pixel to pixel, since noise does, and what leaks or is blurred is often wider. Where smoothing
+is right, all of the difference is noise: w is 1. James and Stein ("Estimation with quadratic loss", 1961) shrink an
+estimate to a known target alike.
+
+Differences are taken relative to the light, as they are seen beside the light around them. All of these are estimates:
+above all, the integrator's variance does not know what stratification gains, so that with hundreds of samples noisy
+light can still be a little better than the mixture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ...compute.jit import njit
+from ...compute.threads import ROWS, over_range
+from ...core.memory import sparse_zeros
+from .demodulation import LIGHT, LUMINANCE, PAD, SOURCE, SURFACE, TILE, VARIANCE, Signal
+
+Array = np.ndarray
+
+#: The difference is measured over (2 R + 1)^2 pixels.
+MEASURED = 4
+#: Rows above and below its own that a pixel depends on.
+REACH = MEASURED + 1
+#: Differences are relative to the light of the pixel and this part of the light around it.
+AROUND = 0.3
+#: Planes of what `_compare` finds, two lobes each: squared difference, its part that differs from pixel to pixel, and
+#: the variance that smoothing took away; all relative.
+DIFFERENCE, APART, NOISE, TERMS = 0, 2, 4, 6
+#: Rows that are compared at once: their memory is small beside a picture.
+_BAND = 128
+
+
+def restore(smoothed: Signal, noisy: Callable[[int, int], Signal]) -> Signal:
+    """Mix noisy light into smoothed light where that lacks more than noise.
+
+    Parameters
+    ----------
+    smoothed : Signal
+        Its light is changed, but for the planes before ``LIGHT``.
+    noisy : callable
+        Rows from the first to the last + 1 -> the light before it was smoothed, with its guide.
+
+    Returns
+    -------
+    Signal
+        `smoothed`.
+    """
+    light, spans = smoothed.light, smoothed.spans
+    height = len(light)
+    for y0 in range(0, height, _BAND):
+        y1 = min(y0 + _BAND, height)
+        low, high = max(y0 - REACH, 0), min(y1 + REACH, height)
+        before = noisy(low, high)
+        terms = sparse_zeros((high - low, TERMS, light.shape[2]))
+        near = before.guide, spans[low:high], before.light, light[low:high]
+        over_range(_compare, high - low, *near, terms, fewest=ROWS)
+
+        def work(first: int, last: int, *given: object, shift: int = y0 - low) -> None:
+            _mix(first + shift, last + shift, *given)
+
+        over_range(work, y1 - y0, *near, terms, fewest=ROWS)
+    return smoothed
+
+
+def rows_of(signal: Signal) -> Callable[[int, int], Signal]:
+    """What `restore` takes, of a signal that smoothing has left as it was."""
+    return lambda low, high: Signal(signal.guide[low:high], signal.light[low:high], signal.spans[low:high])
+
+
+@njit
+def _compare(y0, y1, guide, spans, light, smoothed, terms):  # type: ignore[no-untyped-def]
+    """Terms of each pixel, from 3 x 3 of its surface."""
+    h = len(light)
+    zero, one, tiny, around = np.float32(0.0), np.float32(1.0), np.float32(1e-8), np.float32(AROUND)
+    near = np.empty((5, TILE + 2), np.float32)
+    own = np.empty(TILE, np.float32)
+    sums = np.empty((5, TILE), np.float32)
+    for y in range(y0, y1):
+        for x0 in range(spans[y, 0] + PAD, spans[y, 1] + PAD, TILE):
+            n = min(TILE, spans[y, 1] + PAD - x0)
+            for i in range(n):
+                own[i] = guide[y, SURFACE, x0 + i]
+            for k in range(5):
+                for i in range(n):
+                    sums[k, i] = zero
+            for yy in range(max(y - 1, 0), min(y + 2, h)):
+                for i in range(n + 2):
+                    near[0, i] = guide[yy, SOURCE, x0 - 1 + i]
+                for lobe in range(2):
+                    for i in range(n + 2):
+                        after = smoothed[yy, LUMINANCE + lobe, x0 - 1 + i]
+                        near[1 + 2 * lobe, i] = light[yy, LUMINANCE + lobe, x0 - 1 + i] - after
+                        near[2 + 2 * lobe, i] = abs(after)
+                for dx in range(3):
+                    off = np.uint64(dx)
+                    for i in range(np.uint64(n)):
+                        same = one if near[0, i + off] == own[i] else zero
+                        sums[0, i] += same
+                        for k in range(1, 5):
+                            sums[k, i] += same * near[k, i + off]
+            for lobe in range(2):
+                for i in range(n):
+                    x, count = x0 + i, max(sums[0, i], one)
+                    inverse = one / (
+                        abs(smoothed[y, LUMINANCE + lobe, x]) + around * sums[2 + 2 * lobe, i] / count + tiny
+                    )
+                    difference = (light[y, LUMINANCE + lobe, x] - smoothed[y, LUMINANCE + lobe, x]) * inverse
+                    mean = sums[1 + 2 * lobe, i] / count * inverse
+                    variance = light[y, VARIANCE + lobe, x]
+                    # where variances are alike, the sum of squared weights, whose root is no less than the pixel's own
+                    # weight; beside noisier light it is more, and 1 at most
+                    weights = min(smoothed[y, VARIANCE + lobe, x] / max(variance, np.float32(1e-30)), one)
+                    # the mean of `count` independent numbers has their variance over `count`; one alone says nothing
+                    apart = difference * difference
+                    if count > one:
+                        apart = (apart - mean * mean) * (count / (count - one))
+                    terms[y, DIFFERENCE + lobe, x] = difference * difference
+                    terms[y, APART + lobe, x] = apart
+                    terms[y, NOISE + lobe, x] = variance * (one - np.sqrt(weights)) * inverse * inverse
+
+
+@njit
+def _mix(y0, y1, guide, spans, light, smoothed, terms):  # type: ignore[no-untyped-def]
+    """Mix the light of each pixel, by the terms around it."""
+    h, planes = light.shape[:2]
+    zero, one = np.float32(0.0), np.float32(1.0)
+    width = (planes - LIGHT) // 2
+    near = np.empty((1 + TERMS, TILE + 2 * MEASURED), np.float32)
+    own = np.empty(TILE, np.float32)
+    sums = np.empty((TERMS, TILE), np.float32)
+    for y in range(y0, y1):
+        for x0 in range(spans[y, 0] + PAD, spans[y, 1] + PAD, TILE):
+            n = min(TILE, spans[y, 1] + PAD - x0)
+            for i in range(n):
+                own[i] = guide[y, SURFACE, x0 + i]
+            for k in range(TERMS):
+                for i in range(n):
+                    sums[k, i] = zero
+            start, reach = x0 - MEASURED, n + 2 * MEASURED
+            for yy in range(max(y - MEASURED, 0), min(y + MEASURED + 1, h)):
+                for i in range(reach):
+                    near[TERMS, i] = guide[yy, SOURCE, start + i]
+                for k in range(TERMS):
+                    for i in range(reach):
+                        near[k, i] = terms[yy, k, start + i]
+                for dx in range(2 * MEASURED + 1):
+                    off = np.uint64(dx)
+                    for i in range(np.uint64(n)):
+                        same = one if near[TERMS, i + off] == own[i] else zero
+                        for k in range(TERMS):
+                            sums[k, i] += same * near[k, i + off]
+            for lobe in range(2):
+                for i in range(n):
+                    noise = max(min(sums[APART + lobe, i], sums[NOISE + lobe, i]), zero)
+                    # a pixel without a number has nothing to give
+                    usable = guide[y, SOURCE, x0 + i] == own[i]
+                    whole = sums[DIFFERENCE + lobe, i]
+                    sums[DIFFERENCE + lobe, i] = one - noise / whole if usable and noise < whole else zero
+                for k in range(LIGHT + lobe * width, LIGHT + (lobe + 1) * width):
+                    for i in range(n):
+                        after = smoothed[y, k, x0 + i]
+                        smoothed[y, k, x0 + i] = after + sums[DIFFERENCE + lobe, i] * (light[y, k, x0 + i] - after)
