@@ -4,14 +4,14 @@ Nothing guides the spatial filter along what a surface reflects. It blurs sharp 
 noisy pixel leaks into dark ones beside it, whose own samples know better: the more samples there are, the more of the
 error is this. Of all mixtures n + w (s - n) of the noisy light n and the smoothed s, the one of the least squared error
 takes w = E[(n - t)(n - s)] / E[(n - s)^2], t being the true light. The denominator is measured around each pixel. The
-numerator is the variance of n less its covariance with s, by the pixel's own weight in the filter; and at most as much
-of n - s as differs from pixel to pixel, since noise does, and what leaks or is blurred is often wider. Where smoothing
-is right, all of the difference is noise: w is 1. James and Stein ("Estimation with quadratic loss", 1961) shrink an
-estimate to a known target alike.
+numerator is the variance of n less its covariance with s, by the pixel's own weight in the filter; and at most what
+n - s has not in common with neighbouring pixels, as noise is independent there, and what leaks or is blurred is often
+wider. Where smoothing is right, all of the difference is noise: w is 1. James and Stein ("Estimation with quadratic
+loss", 1961) shrink an estimate to a known target alike.
 
-Differences are taken relative to the light, as they are seen beside the light around them. All of these are estimates:
-above all, the integrator's variance does not know what stratification gains, so that with hundreds of samples noisy
-light can still be a little better than the mixture.
+Differences are taken relative to the light, as they are seen beside the light around them, and to the pixel's noise,
+so that few pixels do not decide for all. All of these are estimates: above all, the integrator's variance does not know
+what stratification gains, so that with hundreds of samples noisy light can still be a little better than the mixture.
 """
 
 from __future__ import annotations
@@ -29,13 +29,14 @@ Array = np.ndarray
 
 #: The difference is measured over (2 R + 1)^2 pixels.
 MEASURED = 4
-#: Rows above and below its own that a pixel depends on.
-REACH = MEASURED + 1
-#: Differences are relative to the light of the pixel and this part of the light around it.
+#: Rows above and below its own that a pixel depends on: those, one for pairs, one for the light around.
+REACH = MEASURED + 2
+#: Differences are relative to the light of the pixel, this part of the light around it, and its noise.
 AROUND = 0.3
-#: Planes of what `_compare` finds, two lobes each: squared difference, its part that differs from pixel to pixel, and
-#: the variance that smoothing took away; all relative.
-DIFFERENCE, APART, NOISE, TERMS = 0, 2, 4, 6
+#: Planes of what `_compare` finds, two lobes each: the difference and the variance that smoothing took away, relative.
+DIFFERENCE, NOISE, TERMS = 0, 2, 4
+#: What is summed around a pixel: pixels and pairs of neighbours; of two lobes squares and products of pairs, and noise.
+PIXELS, PAIRS, SQUARES, PRODUCTS, TAKEN, SUMS = 0, 1, 2, 4, 6, 8
 #: Rows that are compared at once: their memory is small beside a picture.
 _BAND = 128
 
@@ -79,54 +80,44 @@ def rows_of(signal: Signal) -> Callable[[int, int], Signal]:
 
 @njit
 def _compare(y0, y1, guide, spans, light, smoothed, terms):  # type: ignore[no-untyped-def]
-    """Terms of each pixel, from 3 x 3 of its surface."""
+    """Terms of each pixel, relative to the light of 3 x 3 of its surface."""
     h = len(light)
     zero, one, tiny, around = np.float32(0.0), np.float32(1.0), np.float32(1e-8), np.float32(AROUND)
-    near = np.empty((5, TILE + 2), np.float32)
+    near = np.empty((3, TILE + 2), np.float32)
     own = np.empty(TILE, np.float32)
-    sums = np.empty((5, TILE), np.float32)
+    sums = np.empty((3, TILE), np.float32)
     for y in range(y0, y1):
         for x0 in range(spans[y, 0] + PAD, spans[y, 1] + PAD, TILE):
             n = min(TILE, spans[y, 1] + PAD - x0)
             for i in range(n):
                 own[i] = guide[y, SURFACE, x0 + i]
-            for k in range(5):
+            for k in range(3):
                 for i in range(n):
                     sums[k, i] = zero
             for yy in range(max(y - 1, 0), min(y + 2, h)):
                 for i in range(n + 2):
                     near[0, i] = guide[yy, SOURCE, x0 - 1 + i]
-                for lobe in range(2):
-                    for i in range(n + 2):
-                        after = smoothed[yy, LUMINANCE + lobe, x0 - 1 + i]
-                        near[1 + 2 * lobe, i] = light[yy, LUMINANCE + lobe, x0 - 1 + i] - after
-                        near[2 + 2 * lobe, i] = abs(after)
+                    near[1, i] = abs(smoothed[yy, LUMINANCE, x0 - 1 + i])
+                    near[2, i] = abs(smoothed[yy, LUMINANCE + 1, x0 - 1 + i])
                 for dx in range(3):
                     off = np.uint64(dx)
                     for i in range(np.uint64(n)):
                         same = one if near[0, i + off] == own[i] else zero
                         sums[0, i] += same
-                        for k in range(1, 5):
-                            sums[k, i] += same * near[k, i + off]
+                        sums[1, i] += same * near[1, i + off]
+                        sums[2, i] += same * near[2, i + off]
             for lobe in range(2):
                 for i in range(n):
-                    x, count = x0 + i, max(sums[0, i], one)
-                    inverse = one / (
-                        abs(smoothed[y, LUMINANCE + lobe, x]) + around * sums[2 + 2 * lobe, i] / count + tiny
-                    )
-                    difference = (light[y, LUMINANCE + lobe, x] - smoothed[y, LUMINANCE + lobe, x]) * inverse
-                    mean = sums[1 + 2 * lobe, i] / count * inverse
+                    x = x0 + i
+                    before, after = light[y, LUMINANCE + lobe, x], smoothed[y, LUMINANCE + lobe, x]
                     variance = light[y, VARIANCE + lobe, x]
+                    level = abs(after) + around * sums[1 + lobe, i] / max(sums[0, i], one) + tiny
+                    square = level * level + variance
                     # where variances are alike, the sum of squared weights, whose root is no less than the pixel's own
                     # weight; beside noisier light it is more, and 1 at most
                     weights = min(smoothed[y, VARIANCE + lobe, x] / max(variance, np.float32(1e-30)), one)
-                    # the mean of `count` independent numbers has their variance over `count`; one alone says nothing
-                    apart = difference * difference
-                    if count > one:
-                        apart = (apart - mean * mean) * (count / (count - one))
-                    terms[y, DIFFERENCE + lobe, x] = difference * difference
-                    terms[y, APART + lobe, x] = apart
-                    terms[y, NOISE + lobe, x] = variance * (one - np.sqrt(weights)) * inverse * inverse
+                    terms[y, DIFFERENCE + lobe, x] = (before - after) / np.sqrt(square)
+                    terms[y, NOISE + lobe, x] = variance * (one - np.sqrt(weights)) / square
 
 
 @njit
@@ -135,38 +126,51 @@ def _mix(y0, y1, guide, spans, light, smoothed, terms):  # type: ignore[no-untyp
     h, planes = light.shape[:2]
     zero, one = np.float32(0.0), np.float32(1.0)
     width = (planes - LIGHT) // 2
-    near = np.empty((1 + TERMS, TILE + 2 * MEASURED), np.float32)
+    near = np.empty((1 + SUMS, TILE + 2 * MEASURED), np.float32)
     own = np.empty(TILE, np.float32)
-    sums = np.empty((TERMS, TILE), np.float32)
+    sums = np.empty((SUMS, TILE), np.float32)
     for y in range(y0, y1):
         for x0 in range(spans[y, 0] + PAD, spans[y, 1] + PAD, TILE):
             n = min(TILE, spans[y, 1] + PAD - x0)
             for i in range(n):
                 own[i] = guide[y, SURFACE, x0 + i]
-            for k in range(TERMS):
+            for k in range(SUMS):
                 for i in range(n):
                     sums[k, i] = zero
             start, reach = x0 - MEASURED, n + 2 * MEASURED
             for yy in range(max(y - MEASURED, 0), min(y + MEASURED + 1, h)):
+                below, beneath = min(yy + 1, h - 1), one if yy + 1 < h else zero
                 for i in range(reach):
-                    near[TERMS, i] = guide[yy, SOURCE, start + i]
-                for k in range(TERMS):
-                    for i in range(reach):
-                        near[k, i] = terms[yy, k, start + i]
+                    x = start + i
+                    source = guide[yy, SOURCE, x]
+                    right = one if source == guide[yy, SOURCE, x + 1] else zero
+                    down = beneath if source == guide[below, SOURCE, x] else zero
+                    near[SUMS, i] = source
+                    near[PIXELS, i] = one
+                    near[PAIRS, i] = right + down
+                    for lobe in range(2):
+                        difference = terms[yy, DIFFERENCE + lobe, x]
+                        others = right * terms[yy, DIFFERENCE + lobe, x + 1]
+                        others += down * terms[below, DIFFERENCE + lobe, x]
+                        near[SQUARES + lobe, i] = difference * difference
+                        near[PRODUCTS + lobe, i] = difference * others
+                        near[TAKEN + lobe, i] = terms[yy, NOISE + lobe, x]
                 for dx in range(2 * MEASURED + 1):
                     off = np.uint64(dx)
                     for i in range(np.uint64(n)):
-                        same = one if near[TERMS, i + off] == own[i] else zero
-                        for k in range(TERMS):
+                        same = one if near[SUMS, i + off] == own[i] else zero
+                        for k in range(SUMS):
                             sums[k, i] += same * near[k, i + off]
             for lobe in range(2):
                 for i in range(n):
-                    noise = max(min(sums[APART + lobe, i], sums[NOISE + lobe, i]), zero)
+                    whole = sums[SQUARES + lobe, i]
+                    # of noise, neighbours have nothing in common
+                    common = sums[PRODUCTS + lobe, i] * (sums[PIXELS, i] / max(sums[PAIRS, i], one))
+                    noise = max(min(whole - common, sums[TAKEN + lobe, i]), zero)
                     # a pixel without a number has nothing to give
                     usable = guide[y, SOURCE, x0 + i] == own[i]
-                    whole = sums[DIFFERENCE + lobe, i]
-                    sums[DIFFERENCE + lobe, i] = one - noise / whole if usable and noise < whole else zero
+                    sums[SQUARES + lobe, i] = one - noise / whole if usable and noise < whole else zero
                 for k in range(LIGHT + lobe * width, LIGHT + (lobe + 1) * width):
                     for i in range(n):
                         after = smoothed[y, k, x0 + i]
-                        smoothed[y, k, x0 + i] = after + sums[DIFFERENCE + lobe, i] * (light[y, k, x0 + i] - after)
+                        smoothed[y, k, x0 + i] = after + sums[SQUARES + lobe, i] * (light[y, k, x0 + i] - after)

@@ -29,7 +29,18 @@ from ..denoise.demodulation import (
     modulate_pixel,
     planes_of,
 )
-from ..denoise.svgf_residual import APART, AROUND, DIFFERENCE, MEASURED, NOISE, TERMS
+from ..denoise.svgf_residual import (
+    AROUND,
+    DIFFERENCE,
+    MEASURED,
+    NOISE,
+    PAIRS,
+    PIXELS,
+    PRODUCTS,
+    SQUARES,
+    SUMS,
+    TAKEN,
+)
 from ..denoise.svgf_spatial import (
     FIREFLY,
     NORMAL_POWER,
@@ -286,32 +297,22 @@ def residual_pixels(
         if x < spans[y, 0] or x >= spans[y, 1]:
             continue
         c = x + PAD
-        found, removed_d, around_d, removed_g, around_g = ZERO, ZERO, ZERO, ZERO, ZERO
+        found, around_d, around_g = ZERO, ZERO, ZERO
         for yy in range(max(y - 1, 0), min(y + 2, h)):
             for dx in range(3):
                 j = c + dx - 1
                 if guide[yy, SOURCE, j] == guide[y, SURFACE, c]:
-                    after_d, after_g = smoothed[yy, LUMINANCE, j], smoothed[yy, LUMINANCE + 1, j]
                     found += ONE
-                    removed_d += light[yy, LUMINANCE, j] - after_d
-                    around_d += abs(after_d)
-                    removed_g += light[yy, LUMINANCE + 1, j] - after_g
-                    around_g += abs(after_g)
-        count = max(found, ONE)
+                    around_d += abs(smoothed[yy, LUMINANCE, j])
+                    around_g += abs(smoothed[yy, LUMINANCE + 1, j])
         for lobe in range(2):
-            removed, around = (removed_d, around_d) if lobe == 0 else (removed_g, around_g)
-            after = smoothed[y, LUMINANCE + lobe, c]
-            inverse = ONE / (abs(after) + F(AROUND) * around / count + F(1e-8))
-            difference = (light[y, LUMINANCE + lobe, c] - after) * inverse
-            mean = removed / count * inverse
+            before, after = light[y, LUMINANCE + lobe, c], smoothed[y, LUMINANCE + lobe, c]
             variance = light[y, VARIANCE + lobe, c]
+            level = abs(after) + F(AROUND) * (around_d if lobe == 0 else around_g) / max(found, ONE) + F(1e-8)
+            square = level * level + variance
             weights = min(smoothed[y, VARIANCE + lobe, c] / max(variance, F(1e-30)), ONE)
-            apart = difference * difference
-            if count > ONE:
-                apart = (apart - mean * mean) * (count / (count - ONE))
-            terms[y, DIFFERENCE + lobe, c] = difference * difference
-            terms[y, APART + lobe, c] = apart
-            terms[y, NOISE + lobe, c] = variance * (ONE - F(math.sqrt(weights))) * inverse * inverse
+            terms[y, DIFFERENCE + lobe, c] = (before - after) / F(math.sqrt(square))
+            terms[y, NOISE + lobe, c] = variance * (ONE - F(math.sqrt(weights))) / square
 
 
 def restore_pixels(
@@ -329,16 +330,29 @@ def restore_pixels(
         c = x + PAD
         if guide[y, SOURCE, c] != guide[y, SURFACE, c]:
             continue
-        for k in range(TERMS):
+        for k in range(SUMS):
             sums[k] = ZERO
         for yy in range(max(y - MEASURED, 0), min(y + MEASURED + 1, h)):
+            below = min(yy + 1, h - 1)
             for dx in range(2 * MEASURED + 1):
                 j = c + dx - MEASURED
-                if guide[yy, SOURCE, j] == guide[y, SURFACE, c]:
-                    for k in range(TERMS):
-                        sums[k] += terms[yy, k, j]
+                if guide[yy, SOURCE, j] != guide[y, SURFACE, c]:
+                    continue
+                right = ONE if guide[yy, SOURCE, j + 1] == guide[y, SURFACE, c] else ZERO
+                down = ONE if yy + 1 < h and guide[below, SOURCE, j] == guide[y, SURFACE, c] else ZERO
+                sums[PIXELS] += ONE
+                sums[PAIRS] += right + down
+                for lobe in range(2):
+                    difference = terms[yy, DIFFERENCE + lobe, j]
+                    others = right * terms[yy, DIFFERENCE + lobe, j + 1]
+                    others += down * terms[below, DIFFERENCE + lobe, j]
+                    sums[SQUARES + lobe] += difference * difference
+                    sums[PRODUCTS + lobe] += difference * others
+                    sums[TAKEN + lobe] += terms[yy, NOISE + lobe, j]
         for lobe in range(2):
-            noise, whole = max(min(sums[APART + lobe], sums[NOISE + lobe]), ZERO), sums[DIFFERENCE + lobe]
+            whole = sums[SQUARES + lobe]
+            common = sums[PRODUCTS + lobe] * (sums[PIXELS] / max(sums[PAIRS], ONE))
+            noise = max(min(whole - common, sums[TAKEN + lobe]), ZERO)
             share = ONE - noise / whole if noise < whole else ZERO
             for k in range(LIGHT + lobe * width, LIGHT + (lobe + 1) * width):
                 after = smoothed[y, k, c]
@@ -366,5 +380,5 @@ COMPARE = WarpKernel(compare_pixels, (ScratchArray("float32", (CHANGES,)),), {})
 WEIGH, MODULATE = WarpKernel(weigh_pixels, (), {}), WarpKernel(modulate_pixels, (), {})
 A_TROUS = WarpKernel(a_trous_pixels, (ScratchArray("float32", (_PLANES,)),), {})
 RESIDUAL = WarpKernel(residual_pixels, (), {})
-RESTORE = WarpKernel(restore_pixels, (ScratchArray("float32", (TERMS,)),), {})
+RESTORE = WarpKernel(restore_pixels, (ScratchArray("float32", (SUMS,)),), {})
 KERNELS = (SPAN, DEMODULATE, CLAMP, LOOK_UP, COMPARE, MIX, WEIGH, A_TROUS, RESIDUAL, RESTORE, MODULATE)
