@@ -38,7 +38,7 @@ DIFFERENCE, NOISE, TERMS = 0, 2, 4
 #: What is summed around a pixel: pixels and pairs of neighbours; of two lobes squares and products of pairs, and noise.
 PIXELS, PAIRS, SQUARES, PRODUCTS, TAKEN, SUMS = 0, 1, 2, 4, 6, 8
 #: Rows that are compared at once: their memory is small beside a picture.
-_BAND = 128
+_BAND = 32
 
 
 def restore(smoothed: Signal, noisy: Callable[[int, int], Signal]) -> Signal:
