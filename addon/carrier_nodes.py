@@ -31,7 +31,7 @@ SOURCE = "DR-GS Cage"
 NAME = "DR-GS Carrier"
 #: Attribute of the carrier within the tree: `carrier_weights.normals_of`.
 _NORMAL = "drgs_carrier_normal"
-#: Begins the names of the groups that add three points; a dot hides them from menus.
+#: Name of the group that adds three points, and its property, by which it is found; a dot hides it from menus.
 _GROUP = ".DR-GS Carrier Points"
 #: Their inputs; the output is "Place" with the points added.
 _SOCKETS = (
@@ -188,11 +188,12 @@ def tree_of(carrier: bpy.types.Object) -> bpy.types.NodeTree:
     store.inputs["Name"].default_value = _NORMAL
     shape = store.outputs["Geometry"]
     geometry = tree.nodes.new("NodeGroupInput").outputs[0]
+    group = _group()
     for suffix in ("", RENDERED):
         moved = tree.nodes.new("GeometryNodeSetPosition")
         tree.links.new(geometry, moved.inputs["Geometry"])
         tree.links.new(_same(build, counts, COUNT + suffix), moved.inputs["Selection"])
-        tree.links.new(_place(build, shape, suffix), moved.inputs["Position"])
+        tree.links.new(_place(build, group, shape, suffix), moved.inputs["Position"])
         geometry = moved.outputs["Geometry"]
     tree.links.new(geometry, tree.nodes.new("NodeGroupOutput").inputs[0])
     return tree
@@ -207,10 +208,9 @@ def _same(build: Builder, counts: list[bpy.types.NodeSocket], name: str) -> bpy.
     return build.out("FunctionNodeBooleanMath", either, some, operation="AND")
 
 
-def _place(build: Builder, shape: bpy.types.NodeSocket, suffix: str) -> bpy.types.NodeSocket:
+def _place(build: Builder, group: bpy.types.NodeTree, shape: bpy.types.NodeSocket, suffix: str) -> bpy.types.NodeSocket:
     """The sum of where the points of each vertex are now, and of their normals."""
     total = build.attribute(LEFT + suffix, "FLOAT_VECTOR")
-    group = _group()
     for i in range(THREES):
         named = (build.attribute(name.format(i) + suffix, "FLOAT_VECTOR") for name in (INDICES, WEIGHTS, NORMALS))
         total = build.out("GeometryNodeGroup", shape, total, *named, node_tree=group)
@@ -220,7 +220,7 @@ def _place(build: Builder, shape: bpy.types.NodeSocket, suffix: str) -> bpy.type
 def _group() -> bpy.types.NodeTree:
     """The nodes that add three points of a carrier to a place; one for all trees, as each node slows their making."""
     for known in bpy.data.node_groups:
-        if known.library is None and known.name.startswith(_GROUP) and known.get(_GROUP) == len(_SOCKETS):
+        if known.library is None and known.get(_GROUP) == len(_SOCKETS):
             return known
     tree = bpy.data.node_groups.new(_GROUP, "GeometryNodeTree")
     tree[_GROUP] = len(_SOCKETS)

@@ -34,7 +34,7 @@ SECONDS = float(os.environ.get("DRGS_TEST_SECONDS", "3"))
 WAITING = 4.0
 SHARED_SECONDS = 10.0
 #: So many times the limit is no noise of the machine.
-FAILS = 4.0
+FAILS = 2.0
 #: Seconds that `loop` takes on the processor for which the limits are meant (2 GHz, of a server).
 LOOP_SECONDS = 0.015
 

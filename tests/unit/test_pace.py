@@ -54,8 +54,8 @@ def test_a_test_that_computes_for_long_fails_unless_it_is_marked(outcome) -> Non
     assert outcome(text)[0] == {"passed": 3}
 
 
-def test_the_limit_is_three_seconds() -> None:
-    assert pace.SECONDS == 3.0 or "DRGS_TEST_SECONDS" in os.environ
+def test_the_limit_is_three_seconds_and_twice_that_is_no_chance() -> None:
+    assert pace.FAILS == 2.0 and (pace.SECONDS == 3.0 or "DRGS_TEST_SECONDS" in os.environ)
 
 
 def test_a_test_that_takes_a_little_too_long_is_named(outcome) -> None:
