@@ -82,14 +82,12 @@ def by_cycles(jobs: list[dict[str, Any]], samples: int, denoise: bool = False) -
     return np.stack([np.load(job["out"]) for job in jobs])
 
 
-def rows_of(step: float, environment: str, ways: dict[str, Array], truth: Array, mask: Array) -> list[tuple[str, ...]]:
+def rows_of(ways: dict[str, Array], truth: Array, mask: Array) -> list[tuple[str, ...]]:
     """Cells of each way: flicker beyond that of the converged sequence, PSNR from the third frame on."""
     rest, rows = flicker(truth, mask), []
     for name, shown in ways.items():
         later = [psnr(a, b, m) for a, b, m in zip(shown[2:], truth[2:], mask[2:])]
-        rows.append(
-            (f"{step:g}", environment, name, f"{1e3 * (flicker(shown, mask) - rest):.2f}", f"{np.mean(later):.2f}")
-        )
+        rows.append((name, f"{1e3 * (flicker(shown, mask) - rest):.2f}", f"{np.mean(later):.2f}"))
     return rows
 
 
@@ -127,8 +125,7 @@ def compared(options: argparse.Namespace, step: float, environment: str) -> list
     }
     if available():
         ways["OIDN, each frame alone"] = rendered(sequence, denoise="oidn")
-    stacks = {name: np.stack(pictures) for name, pictures in ways.items()}
-    rows = rows_of(step, environment, stacks, truth, mask)
+    rows = rows_of({name: np.stack(pictures) for name, pictures in ways.items()}, truth, mask)
     jobs = jobs_of(options, step, environment)
     theirs = by_cycles(jobs, options.reference)
     mask = np.stack([foreground(picture[..., 3], 1) for picture in theirs])
@@ -136,7 +133,7 @@ def compared(options: argparse.Namespace, step: float, environment: str) -> list
         "Cycles: noisy": by_cycles(jobs, options.samples),
         "Cycles: OIDN, each frame alone": by_cycles(jobs, options.samples, denoise=True),
     }
-    return rows + rows_of(step, environment, cycles, theirs, mask)
+    return [(f"{step:g}", environment, *row) for row in rows + rows_of(cycles, theirs, mask)]
 
 
 def main() -> None:

@@ -14,10 +14,15 @@ from drgs_blender.render.denoise.svgf_spatial import denoise
 INSIDE = np.s_[6:-6, 6:-6]
 
 
-def reflected(size: int = 2) -> np.ndarray:
-    """Light of a scene that a surface mirrors: spots of `size` pixels, of which no guide knows."""
-    coarse = np.random.default_rng(5).random((H // size + 1, W // size + 1))
-    return 1.0 + 0.5 * (np.repeat(np.repeat(coarse, size, axis=0), size, axis=1)[:H, :W] - 0.5)
+def filter_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From here on, nothing is given back."""
+    monkeypatch.setattr(svgf_spatial, "restore", lambda smoothed, noisy: smoothed)
+
+
+def reflected() -> np.ndarray:
+    """Light of a scene that a surface mirrors: spots of 2 pixels, of which no guide knows."""
+    coarse = np.random.default_rng(5).random((H // 2, W // 2))
+    return 1.0 + 0.5 * (np.repeat(np.repeat(coarse, 2, axis=0), 2, axis=1) - 0.5)
 
 
 def error(found: np.ndarray, true: np.ndarray) -> float:
@@ -81,7 +86,7 @@ def test_bright_light_does_not_leak_into_dark(noise: float, part: float, monkeyp
     picture, variance = light_of(light, guides, noisy, seed=1)
     found = error(denoise(picture, variance, guides), true)
     assert found < error(picture, true) or noise > 0.2
-    monkeypatch.setattr(svgf_spatial, "restore", lambda smoothed, noisy: smoothed)
+    filter_alone(monkeypatch)
     assert found < part * error(denoise(picture, variance, guides), true)
 
 
@@ -90,7 +95,7 @@ def test_even_light_stays_smooth(monkeypatch: pytest.MonkeyPatch) -> None:
     true, _ = light_of(np.ones((H, W)), guides)
     picture, variance = light_of(np.ones((H, W)), guides, 0.3, seed=2)
     found = error(denoise(picture, variance, guides), true)
-    monkeypatch.setattr(svgf_spatial, "restore", lambda smoothed, noisy: smoothed)
+    filter_alone(monkeypatch)
     assert found < 1.15 * error(denoise(picture, variance, guides), true)
 
 
@@ -109,7 +114,7 @@ def test_a_pixel_without_a_number_stays_smoothed(monkeypatch: pytest.MonkeyPatch
     holes = [20, 20], [21, 25]
     picture[holes] = np.nan
     found = denoise(picture, variance, guides)[holes]
-    monkeypatch.setattr(svgf_spatial, "restore", lambda smoothed, noisy: smoothed)
+    filter_alone(monkeypatch)
     np.testing.assert_array_equal(found, denoise(picture, variance, guides)[holes])
 
 
@@ -127,7 +132,6 @@ def test_diffuse_and_glossy_light_do_not_know_of_each_other() -> None:
 @pytest.mark.parametrize("way", ["lattice", "leaves"])
 def test_pixels_without_neighbours_stay_smooth(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """As of leaves, and of what is seen through a fence."""
-    guides = wall()
     seen = np.zeros((H, W), bool)
     if way == "lattice":
         seen[::2, ::2] = True
@@ -141,7 +145,7 @@ def test_pixels_without_neighbours_stay_smooth(way: str, monkeypatch: pytest.Mon
         return float(np.sqrt(np.mean((denoise(picture, variance, guides)[seen] / true[seen].clip(1e-9) - 1) ** 2)))
 
     found = missed()
-    monkeypatch.setattr(svgf_spatial, "restore", lambda smoothed, noisy: smoothed)
+    filter_alone(monkeypatch)
     assert found < 1.1 * missed()
 
 

@@ -16,6 +16,15 @@ Array = np.ndarray
 _BAND = 96
 
 
+def over_rows(kernel: Callable[..., None], first: int, last: int, *arguments: object) -> None:
+    """`over_range` of a kernel from row `first` to `last` - 1 of its arrays, whose other rows it only reads."""
+
+    def work(begin: int, end: int, *given: object) -> None:
+        kernel(first + begin, first + end, *given)
+
+    over_range(work, last - first, *arguments, fewest=ROWS)
+
+
 def filter_in_place(kernel: Callable[..., None], reach: int, signal: Signal, *arguments: object) -> None:
     """Write what a kernel makes of light over it, in bands of rows: a second picture of light would double the memory.
 
@@ -39,10 +48,7 @@ def filter_in_place(kernel: Callable[..., None], reach: int, signal: Signal, *ar
         low = max(y0 - reach, 0)
         near, out = slice(low, y1 + reach), buffers[y0 // height % 2]
 
-        def work(first: int, last: int, *given: object, shift: int = y0 - low) -> None:
-            kernel(first + shift, last + shift, *given)
-
-        over_range(work, y1 - y0, *arguments, guide[near], spans[near], light[near], out, fewest=ROWS)
+        over_rows(kernel, y0 - low, y1 - low, *arguments, guide[near], spans[near], light[near], out)
         made.append((y0, out[y0 - low : y1 - low]))
         if len(made) == 2:
             _write_rows(*made.pop(0), signal)

@@ -16,13 +16,16 @@ what stratification gains, so that with hundreds of samples noisy light can stil
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import inlined, njit
 from ...compute.threads import ROWS, over_range
 from ...core.memory import sparse_zeros
+from ..sampling import ONE, ZERO, F
+from .bands import over_rows
 from .demodulation import LIGHT, LUMINANCE, PAD, SOURCE, SURFACE, TILE, VARIANCE, Signal
 
 Array = np.ndarray
@@ -66,10 +69,7 @@ def restore(smoothed: Signal, noisy: Callable[[int, int], Signal]) -> Signal:
         near = before.guide, spans[low:high], before.light, light[low:high]
         over_range(_compare, high - low, *near, terms, fewest=ROWS)
 
-        def work(first: int, last: int, *given: object, shift: int = y0 - low) -> None:
-            _mix(first + shift, last + shift, *given)
-
-        over_range(work, y1 - y0, *near, terms, fewest=ROWS)
+        over_rows(_mix, y0 - low, y1 - low, *near, terms)
     return smoothed
 
 
@@ -82,7 +82,7 @@ def rows_of(signal: Signal) -> Callable[[int, int], Signal]:
 def _compare(y0, y1, guide, spans, light, smoothed, terms):  # type: ignore[no-untyped-def]
     """Terms of each pixel, relative to the light of 3 x 3 of its surface."""
     h = len(light)
-    zero, one, tiny, around = np.float32(0.0), np.float32(1.0), np.float32(1e-8), np.float32(AROUND)
+    zero, one = np.float32(0.0), np.float32(1.0)
     near = np.empty((3, TILE + 2), np.float32)
     own = np.empty(TILE, np.float32)
     sums = np.empty((3, TILE), np.float32)
@@ -111,13 +111,57 @@ def _compare(y0, y1, guide, spans, light, smoothed, terms):  # type: ignore[no-u
                     x = x0 + i
                     before, after = light[y, LUMINANCE + lobe, x], smoothed[y, LUMINANCE + lobe, x]
                     variance = light[y, VARIANCE + lobe, x]
-                    level = abs(after) + around * sums[1 + lobe, i] / max(sums[0, i], one) + tiny
-                    square = level * level + variance
-                    # where variances are alike, the sum of squared weights, whose root is no less than the pixel's own
-                    # weight; beside noisier light it is more, and 1 at most
-                    weights = min(smoothed[y, VARIANCE + lobe, x] / max(variance, np.float32(1e-30)), one)
-                    terms[y, DIFFERENCE + lobe, x] = (before - after) / np.sqrt(square)
-                    terms[y, NOISE + lobe, x] = variance * (one - np.sqrt(weights)) / square
+                    terms[y, DIFFERENCE + lobe, x], terms[y, NOISE + lobe, x] = terms_of(
+                        before, after, sums[1 + lobe, i], sums[0, i], variance, smoothed[y, VARIANCE + lobe, x]
+                    )
+
+
+@inlined
+def terms_of(before, after, around, count, variance, left):  # type: ignore[no-untyped-def]
+    """Terms of a pixel and lobe.
+
+    Parameters
+    ----------
+    before, after : float32
+        Luminance of the noisy and of the smoothed light.
+    around : float32
+        Sum of that of the smoothed light over some pixels of the surface.
+    count : float32
+        Number of these pixels.
+    variance, left : float32
+        Of `before` and of `after`.
+
+    Returns
+    -------
+    float32
+        `DIFFERENCE`, and `NOISE`.
+    """
+    level = abs(after) + F(AROUND) * around / max(count, ONE) + F(1e-8)
+    square = level * level + variance
+    # where variances are alike, the sum of squared weights, whose root is no less than the pixel's own weight; beside
+    # noisier light it is more, and 1 at most
+    weights = min(left / max(variance, F(1e-30)), ONE)
+    return (before - after) / F(math.sqrt(square)), variance * (ONE - F(math.sqrt(weights))) / square
+
+
+@inlined
+def noisy_share(squares, products, taken, pixels, pairs):  # type: ignore[no-untyped-def]
+    """Share of the noisy light in the mixture, by the sums around a pixel of one lobe.
+
+    Parameters
+    ----------
+    squares, products, taken, pixels, pairs : float32
+        See `SQUARES`.
+
+    Returns
+    -------
+    float32
+        1 - w, in [0, 1].
+    """
+    # of noise, neighbours have nothing in common
+    common = products * (pixels / max(pairs, ONE))
+    noise = max(min(squares - common, taken), ZERO)
+    return ONE - noise / squares if noise < squares else ZERO
 
 
 @njit
@@ -163,13 +207,16 @@ def _mix(y0, y1, guide, spans, light, smoothed, terms):  # type: ignore[no-untyp
                             sums[k, i] += same * near[k, i + off]
             for lobe in range(2):
                 for i in range(n):
-                    whole = sums[SQUARES + lobe, i]
-                    # of noise, neighbours have nothing in common
-                    common = sums[PRODUCTS + lobe, i] * (sums[PIXELS, i] / max(sums[PAIRS, i], one))
-                    noise = max(min(whole - common, sums[TAKEN + lobe, i]), zero)
+                    share = noisy_share(
+                        sums[SQUARES + lobe, i],
+                        sums[PRODUCTS + lobe, i],
+                        sums[TAKEN + lobe, i],
+                        sums[PIXELS, i],
+                        sums[PAIRS, i],
+                    )
                     # a pixel without a number has nothing to give
                     usable = guide[y, SOURCE, x0 + i] == own[i]
-                    sums[SQUARES + lobe, i] = one - noise / whole if usable and noise < whole else zero
+                    sums[SQUARES + lobe, i] = share if usable else zero
                 for k in range(LIGHT + lobe * width, LIGHT + (lobe + 1) * width):
                     for i in range(n):
                         after = smoothed[y, k, x0 + i]

@@ -30,7 +30,6 @@ from ..denoise.demodulation import (
     planes_of,
 )
 from ..denoise.svgf_residual import (
-    AROUND,
     DIFFERENCE,
     MEASURED,
     NOISE,
@@ -40,6 +39,8 @@ from ..denoise.svgf_residual import (
     SQUARES,
     SUMS,
     TAKEN,
+    noisy_share,
+    terms_of,
 )
 from ..denoise.svgf_spatial import (
     FIREFLY,
@@ -308,11 +309,10 @@ def residual_pixels(
         for lobe in range(2):
             before, after = light[y, LUMINANCE + lobe, c], smoothed[y, LUMINANCE + lobe, c]
             variance = light[y, VARIANCE + lobe, c]
-            level = abs(after) + F(AROUND) * (around_d if lobe == 0 else around_g) / max(found, ONE) + F(1e-8)
-            square = level * level + variance
-            weights = min(smoothed[y, VARIANCE + lobe, c] / max(variance, F(1e-30)), ONE)
-            terms[y, DIFFERENCE + lobe, c] = (before - after) / F(math.sqrt(square))
-            terms[y, NOISE + lobe, c] = variance * (ONE - F(math.sqrt(weights))) / square
+            around, left = around_d if lobe == 0 else around_g, smoothed[y, VARIANCE + lobe, c]
+            difference, noise = terms_of(before, after, around, found, variance, left)
+            terms[y, DIFFERENCE + lobe, c] = difference
+            terms[y, NOISE + lobe, c] = noise
 
 
 def restore_pixels(
@@ -350,10 +350,8 @@ def restore_pixels(
                     sums[PRODUCTS + lobe] += difference * others
                     sums[TAKEN + lobe] += terms[yy, NOISE + lobe, j]
         for lobe in range(2):
-            whole = sums[SQUARES + lobe]
-            common = sums[PRODUCTS + lobe] * (sums[PIXELS] / max(sums[PAIRS], ONE))
-            noise = max(min(whole - common, sums[TAKEN + lobe]), ZERO)
-            share = ONE - noise / whole if noise < whole else ZERO
+            squares, products, taken = sums[SQUARES + lobe], sums[PRODUCTS + lobe], sums[TAKEN + lobe]
+            share = noisy_share(squares, products, taken, sums[PIXELS], sums[PAIRS])
             for k in range(LIGHT + lobe * width, LIGHT + (lobe + 1) * width):
                 after = smoothed[y, k, c]
                 smoothed[y, k, c] = after + share * (light[y, k, c] - after)
