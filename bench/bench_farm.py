@@ -309,7 +309,7 @@ def processors(scene: Path, folder: Path, count: int, samples: int) -> str:
     return (
         f"{count} frames of 96 x 96 pixels, {3 * samples} samples, by engines whose kernels were compiled for fixed "
         f"targets "
-        "and older processors, against this processor's own; Embree takes the best that there is.\n\n"
+        "and older processors, against this processor's own; Embree takes AVX2 where there is more.\n\n"
     ) + table(["kernels for", "pixels that differ", "largest relative difference", "largest difference"], rows)
 
 

@@ -41,13 +41,15 @@ PHASE = PREPARING
 _POLL = 0.1
 _REPORT = 0.4
 _ROOT = Path("/")
+#: Jobs whose kernels were prepared in this process.
+_prepared: set[str] = set()
 Progress = Callable[[str, float], None]
 
 
 def prepare_kernels(
     jobs: Iterable[str], progress: Progress | None = None, cancelled: Callable[[], bool] | None = None
 ) -> None:
-    """Compile what `jobs` need and the cache lacks; return at once where nothing is missing.
+    """Compile what `jobs` need and the cache lacks, once per process; return at once where nothing is missing.
 
     A process that ends, or cannot write what it compiled, leaves it to the first call of the kernel: this never fails
     for lack of a cache.
@@ -65,8 +67,12 @@ def prepare_kernels(
     ------
     Cancelled
     """
-    if is_on("DRGS_PREPARE", True):
+    if not is_on("DRGS_PREPARE", True):
+        return
+    jobs = [job for job in jobs if job not in _prepared]
+    if jobs:
         _compile(jobs, progress, cancelled)
+        _prepared.update(jobs)
 
 
 def _compile(

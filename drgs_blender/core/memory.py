@@ -96,6 +96,15 @@ def sparse_zeros(shape: tuple[int, ...]) -> np.ndarray:
     return np.zeros(shape, np.float32)
 
 
+def filled_columns(rows: np.ndarray) -> slice:
+    """The columns of some rows of a picture, (h, w, c), from the first to the last that is not all 0."""
+    filled = np.zeros(rows.shape[1], bool)
+    for channel in range(rows.shape[2]):  # NumPy is slow over axes of three
+        filled |= (rows[..., channel] != 0).any(axis=0)
+    found = np.flatnonzero(filled)
+    return slice(found[0], found[-1] + 1) if len(found) else slice(0, 0)
+
+
 def _windows() -> tuple[float, float]:
     """Memory of a machine with Windows, and what of it is free; infinite on others."""
     if sys.platform != "win32":

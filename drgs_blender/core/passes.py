@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .memory import sparse_zeros
+from .memory import filled_columns, sparse_zeros
 
 Array = np.ndarray
 
@@ -136,12 +136,13 @@ def without_colour(light: Array, colour: Array) -> Array:
     """(h, w, 3) float32 `light` / `colour`; where a channel has none, the mean of the others, as in Cycles."""
     made = sparse_zeros(light.shape)
     for first in range(0, len(light), _ROWS):  # what is computed on the way takes more memory than the pass
-        columns = np.flatnonzero(light[first : first + _ROWS].any(axis=(0, 2)))
-        if not len(columns):
-            continue
-        part = slice(first, first + _ROWS), slice(columns[0], columns[-1] + 1)  # the rest takes no memory
-        known = colour[part] != 0
-        out = np.where(known, light[part] / np.where(known, colour[part], 1), 0)
-        grey = out.sum(axis=-1, keepdims=True) / np.maximum(known.sum(axis=-1, keepdims=True), 1)
-        made[part] = np.where(known, out, grey)
+        rows = slice(first, first + _ROWS)
+        some = filled_columns(light[rows])  # the rest takes no memory
+        out, lit, by = made[rows, some], light[rows, some], colour[rows, some]
+        known = [by[..., c] != 0 for c in range(3)]  # by channel: NumPy is slow over axes of three
+        for c, there in enumerate(known):
+            np.divide(lit[..., c], by[..., c], out=out[..., c], where=there)
+        grey = (out[..., 0] + out[..., 1] + out[..., 2]) / np.maximum(sum(map(np.float32, known)), 1)
+        for c, there in enumerate(known):
+            np.copyto(out[..., c], grey, where=~there)
     return made

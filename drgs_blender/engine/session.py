@@ -104,7 +104,6 @@ class Session:
         self._pace = Pace()
         self._views_begun = 0
         self._backends = Backends()
-        self._compiled: set[str] = set()
 
     def load_asset(self, path: str | os.PathLike[str]) -> str:
         """Map the asset file at `path`; return its key. See `SceneCache.load_asset`."""
@@ -303,11 +302,7 @@ class Session:
         self, frame: Frame, jobs: tuple[str, ...], progress: OnProgress | None, cancelled: IsCancelled | None
     ) -> None:
         """Have the kernels compiled that a frame and some jobs besides need."""
-        wanted = dict.fromkeys((*jobs_of(frame), *self._scene_cache.jobs_of(frame), *jobs))
-        missing = [job for job in wanted if job not in self._compiled]
-        if missing:
-            prepare_kernels(missing, progress, cancelled)
-            self._compiled.update(missing)
+        prepare_kernels(dict.fromkeys((*jobs_of(frame), *self._scene_cache.jobs_of(frame), *jobs)), progress, cancelled)
 
     def _prepare(
         self,

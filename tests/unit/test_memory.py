@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drgs_blender.core.memory import available_memory, give_back, sparse_zeros, total_memory
+from drgs_blender.core.memory import available_memory, filled_columns, give_back, sparse_zeros, total_memory
 
 GIB = 1 << 30
 
@@ -92,3 +92,10 @@ def test_small_sparse_zeros_are_those_of_numpy():
     small = sparse_zeros((3, 4))
     assert small.flags.owndata and small.dtype == np.float32 and not small.any()
     assert sparse_zeros((0, 3)).shape == (0, 3)
+
+
+def test_filled_columns_are_those_between_the_first_and_the_last_with_a_value():
+    rows = np.zeros((3, 9, 4, 3), np.float32)
+    assert rows[:, filled_columns(rows[:, :, 1])].size == 0
+    rows[2, 3, 1, 2], rows[0, 6, 1, 0], rows[1, 8, 2, 0] = -1e-30, np.nan, 5.0  # the last is another part's
+    assert filled_columns(rows[:, :, 1]) == slice(3, 7)

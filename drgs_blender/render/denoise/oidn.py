@@ -125,7 +125,9 @@ def denoise_oidn(
         network.commit()
         for k in range(4 if split else 1):
             check()
-            images["color"][:] = widened(light[:, :, k] if split else light.sum(axis=2))
+            images["color"][:] = widened(
+                light[:, :, k] if split else light[:, :, 0] + light[:, :, 1] + light[:, :, 2] + light[:, :, 3]
+            )
             network.execute()
             _raise_errors(device)
             out[rows, columns, k] = np.where(cover > 0, images["output"][inside], 0)

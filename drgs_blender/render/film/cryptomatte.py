@@ -12,7 +12,7 @@ from ...compute.jit import njit
 from ...compute.threads import ROWS, over_range
 from ...core.cryptomatte import DRGS_MATERIAL, KINDS, identities
 from ...core.frame import Frame
-from ...core.memory import sparse_zeros
+from ...core.memory import filled_columns, sparse_zeros
 from ..gbuffer.gbuffer import GBuffer
 from ..scene.trace_scene import TraceScene
 from ..shading_points import CATCHER
@@ -49,10 +49,8 @@ class CryptoFilm:
         over_range(_rank, y1 - y0, rows, self._identities[owner], out, fewest=ROWS)
         for i, pixels in enumerate(self._passes):
             found = out[:, :, 2 * i : 2 * i + 2].reshape(y1 - y0, -1, 4)
-            columns = np.flatnonzero(found.any(axis=(0, 2)))
-            if len(columns):  # what is not written takes no memory
-                some = slice(columns[0], columns[-1] + 1)
-                pixels[y0 - top : y1 - top, some] = found[:, some]
+            some = filled_columns(found)  # what is not written takes no memory
+            pixels[y0 - top : y1 - top, some] = found[:, some]
 
     def passes(self) -> dict[str, Array]:
         """Name -> (h, w, 4) float32."""

@@ -29,9 +29,10 @@ from ...core.memory import sparse_zeros
 from ...core.passes import COLOURS, without_colour
 from ..camera import FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, footprints, sample_ray
 from ..gbuffer.gbuffer import GBuffer
-from ..lights.environment import EnvironmentLight, envmap_radiance, map_at
+from ..lights.environment import EnvironmentLight
 from ..sampling import luminance
 from ..shading_points import CATCHER, UNLIT, Radiance
+from .background import Background
 from .catcher_film import CatcherFilm
 from .guides import Guides
 from .light_passes import LIGHT_PASSES, add_light, light_parts
@@ -105,20 +106,28 @@ class Pixels(NamedTuple):
 class Film:
     """The picture while it is made, of the camera's window.
 
+    Parameters
+    ----------
+    camera : Camera
+    settings : RenderSettings
+    parameters : array
+        `camera.camera_parameters`.
+    background : Background, optional
+        That of an earlier film of the same samples.
+
     Attributes
     ----------
     pixels : Pixels
-    environment : (h, w, 3) float32 array
-        Light straight from the world, as if catchers had no shadow.
-    veiled : (h, w, 3) float32 array
-        The part of ``environment`` that is seen through catchers.
+    background : Background
     unlit : (h, w) float32 array, optional
         The part of the coverage that is of unlit objects; None: there are none.
     transmitted : (h, w, 2, 3) float32 array, optional
         The part of the glossy components, direct and indirect, that surfaces let pass; None: none does.
     """
 
-    def __init__(self, camera: Camera, settings: RenderSettings, parameters: Array) -> None:
+    def __init__(
+        self, camera: Camera, settings: RenderSettings, parameters: Array, background: Background | None = None
+    ) -> None:
         x0, y0, x1, y1 = camera.window
         size = (y1 - y0, x1 - x0)
         self.transparent = settings.film_transparent
@@ -127,7 +136,8 @@ class Film:
         self.round = camera.panorama in ("fisheye", "equisolid")
         self.pixels = Pixels.empty(size)
         self.catchers = CatcherFilm(camera, settings, parameters)
-        self.environment, self.veiled = (sparse_zeros((*size, 3)) for _ in range(2))
+        self._sees_world = background is None and not self.transparent
+        self.background = background or Background(size)
         self.unlit: Array | None = None
         self.transmitted: Array | None = None
         self._objects: ObjectNumbers | None = None
@@ -168,16 +178,8 @@ class Film:
         over_range(
             _develop, y1 - y0, buffer.point_rows(x0, int(self.parameters[WIDTH])), buffer.surfaces(), light,
             self.parameters, self.pixels.rows(y0 - top, y1 - top), fewest=ROWS)  # fmt: skip
-        if not self.transparent and not environment.black:
-            over_range(
-                _background, y1 - y0, self.parameters, x0, y0, buffer.alpha, environment.envmap,
-                self.environment[rows], fewest=ROWS)  # fmt: skip
-            caught = np.flatnonzero(points.flags & CATCHER)
-            if len(caught):
-                _behind(
-                    self.parameters, x0, y0, points.pixel[caught], points.sample[caught], points.weight[caught],
-                    environment.envmap, self.veiled[rows],
-                )  # fmt: skip
+        if self._sees_world and not environment.black:
+            self.background.add(buffer, environment, self.parameters, self.origin)
 
     def guides(self) -> Guides:
         """The denoiser's guides: what differs from surface to surface. Of unlit objects there is no light to guide."""
@@ -237,8 +239,7 @@ class Film:
 
     def seen_environment(self) -> Array:
         """(h, w, 3) float32: light straight from the world, the pass Env."""
-        shadow = self._shadow()
-        return self.environment - self.veiled * shadow[..., None] if shadow.any() else self.environment
+        return self.background.behind(self._shadow())
 
     def _shadow(self) -> Array:
         """(h, w) float32 in [0, 1]: how dense the shadows on catchers are."""
@@ -345,18 +346,6 @@ def _develop(y0, y1, points, surfaces, light, p, pixels):  # type: ignore[no-unt
 
 
 @njit
-def _world(p, pixel, sample, envmap):  # type: ignore[no-untyped-def]
-    """The world's radiance along the ray of a sub-pixel sample."""
-    _, _, _, dx, dy, dz = sample_ray(p, pixel, sample)
-    square = dx * dx + dy * dy + dz * dz
-    if square == 0.0:  # beyond the picture of a fisheye lens
-        return np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    scale = 1.0 / np.sqrt(square)
-    u, v = map_at(np.float32(dx * scale), np.float32(dy * scale), np.float32(dz * scale), envmap)
-    return envmap_radiance(u, v, envmap)
-
-
-@njit
 def _around(first, last, p, x0, y0, opaque):  # type: ignore[no-untyped-def]
     """Add the share of each pixel's samples that a fisheye lens does not see: it is black, as in Cycles."""
     width, subpixels = np.int64(p[WIDTH]), np.int64(p[SUBPIXELS])
@@ -366,34 +355,3 @@ def _around(first, last, p, x0, y0, opaque):  # type: ignore[no-untyped-def]
                 _, _, _, dx, dy, dz = sample_ray(p, (y0 + y) * width + x0 + x, k)
                 if dx * dx + dy * dy + dz * dz == 0.0:
                     opaque[y, x] += np.float32(1.0 / subpixels)
-
-
-@njit
-def _background(first, last, p, x0, y0, alpha, envmap, out):  # type: ignore[no-untyped-def]
-    """Add the world's radiance along every sub-pixel ray, weighted by what the surfaces leave uncovered."""
-    width = np.int64(p[WIDTH])
-    _, columns, subpixels = alpha.shape
-    share = np.float32(1.0 / subpixels)
-    for y in range(first, last):
-        for x in range(columns):
-            red = green = blue = np.float32(0.0)
-            for k in range(subpixels):
-                left = (np.float32(1.0) - alpha[y, x, k]) * share
-                if left <= np.float32(0.0):
-                    continue
-                r, g, b = _world(p, (y0 + y) * width + x0 + x, k, envmap)
-                red, green, blue = red + left * r, green + left * g, blue + left * b
-            if red != np.float32(0.0) or green != np.float32(0.0) or blue != np.float32(0.0):
-                out[y, x, 0], out[y, x, 1], out[y, x, 2] = red, green, blue
-
-
-@njit
-def _behind(p, x0, y0, pixel, sample, weight, envmap, out):  # type: ignore[no-untyped-def]
-    """Add the world's radiance behind some points, by weight."""
-    width = np.int64(p[WIDTH])
-    for i in range(len(pixel)):
-        y, x = pixel[i] // width - y0, pixel[i] % width - x0
-        r, g, b = _world(p, pixel[i], sample[i], envmap)
-        out[y, x, 0] += weight[i] * r
-        out[y, x, 1] += weight[i] * g
-        out[y, x, 2] += weight[i] * b

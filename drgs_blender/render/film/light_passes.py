@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...compute.jit import njit
+from ...compute.threads import ROWS, over_range
+
 Array = np.ndarray
 
 #: Passes of light that are denoised, in the order of `Pixels.components`, and all: of the glossy ones' light, what
@@ -48,8 +51,16 @@ def light_parts(light: Array, noisy: Array, transmitted: Array | None, colours: 
 def add_light(light: Array, environment: Array, emission: Array, opaque: Array | np.float32) -> Array:
     """(h, w, 4) float32 Combined of (h, w, 4, 3) light, what is behind it and what surfaces emit."""
     out = np.empty((*light.shape[:2], 4), np.float32)
-    colour = np.add(light[:, :, 0], light[:, :, 1], out=out[..., :3])
-    for part in (light[:, :, 2], light[:, :, 3], environment, emission):
-        colour += part
+    parts = (np.ascontiguousarray(part, np.float32) for part in (light, environment, emission))
+    over_range(_add, len(out), *parts, out, fewest=ROWS)
     out[..., 3] = opaque
     return out
+
+
+@njit
+def _add(y0, y1, light, environment, emission, out):  # type: ignore[no-untyped-def]
+    for y in range(y0, y1):
+        for x in range(out.shape[1]):
+            for k in range(3):
+                beauty = light[y, x, 0, k] + light[y, x, 1, k] + light[y, x, 2, k] + light[y, x, 3, k]
+                out[y, x, k] = beauty + environment[y, x, k] + emission[y, x, k]
