@@ -115,6 +115,16 @@ class DrgsSceneSettings(LevelOfDetail, bpy.types.PropertyGroup):
         default=0.0,
         precision=1,
     )
+    filter_glossy: FloatProperty(
+        name="Filter Glossy",
+        description="Make surfaces rougher that light meets behind rough ones: caustics, as of a metal on a wall, are "
+        "blurred and less noisy. 0 is off. Cycles' own, which is 1 by default, is not applied",
+        min=0.0,
+        soft_max=10.0,
+        max=1000.0,
+        default=0.0,
+        precision=2,
+    )
     subpixel_samples: IntProperty(
         name="Sub-Pixel Samples",
         description="Positions per pixel among which samples are divided: edges and textures get smoother. 0 chooses: "
@@ -266,6 +276,7 @@ class DrgsSceneSettings(LevelOfDetail, bpy.types.PropertyGroup):
             threads=threads,
             noise_threshold=own.noise_threshold if own.use_noise_threshold else 0.0,
             clamp_indirect=own.clamp_indirect,
+            filter_glossy=own.filter_glossy,
             device=own.device.lower(),
             filter_width=own.filter_width,
         )

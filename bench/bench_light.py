@@ -1,7 +1,7 @@
 """What light costs: time to equal quality against Cycles and Mitsuba, what makes the time, and what it buys.
 
 python bench/bench_light.py [--part equal-psnr mitsuba denoised relmse cost memory efficiency cases denoisers
-    ablation] ...
+    filter-glossy ablation] ...
 
 Each part writes its own section. Everything runs on two processors, as far as the system allows that to be set.
 """
@@ -15,6 +15,7 @@ import light_ablation
 import light_cost
 import light_denoisers
 import light_efficiency
+import light_filter
 import light_renderers
 import light_variance
 from light_cases import FOLDER
@@ -31,6 +32,7 @@ PARTS = {
     "efficiency": ("Light: what denoiser, MIS and mesh bring", light_efficiency.efficiency),
     "cases": ("Light: noise of single cases", light_variance.variance),
     "denoisers": ("Light: denoisers by samples", light_denoisers.denoisers),
+    "filter-glossy": ("Light: Filter Glossy", light_filter.filter_glossy),
     "ablation": ("Light: inter-reflection, shadows and reflections", light_ablation.ablation),
 }
 

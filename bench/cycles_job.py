@@ -119,7 +119,7 @@ def render(scene: bpy.types.Scene, job: dict) -> tuple[np.ndarray, float]:
     cycles.max_bounces = job["bounces"]
     cycles.diffuse_bounces = cycles.glossy_bounces = job["bounces"]
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
-    cycles.blur_glossy = 0.0
+    cycles.blur_glossy = job.get("filter_glossy", 0.0)
     cycles.caustics_reflective = cycles.caustics_refractive = True
     cycles.seed = job.get("seed", 0)
     scene.render.film_transparent = True

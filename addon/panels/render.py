@@ -83,7 +83,7 @@ class DRGS_PT_light(_RenderPanel, bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         settings = context.scene.drgs
-        for name in ("bounces", "clamp_indirect", "shading_model", "camera_sees", "rays_see"):
+        for name in ("bounces", "clamp_indirect", "filter_glossy", "shading_model", "camera_sees", "rays_see"):
             layout.prop(settings, name)
 
 

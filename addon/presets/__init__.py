@@ -19,6 +19,7 @@ VALUES = (
     "use_noise_threshold",
     "noise_threshold",
     "clamp_indirect",
+    "filter_glossy",
     "subpixel_samples",
     "denoise",
 )

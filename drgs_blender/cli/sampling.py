@@ -66,6 +66,13 @@ def add_arguments(
         type=at_least_zero,
     )
     add(
+        "--filter-glossy",
+        "filter_glossy",
+        "make surfaces rougher behind rough reflections, as Cycles' setting (1 by default there): less noise of "
+        "caustics, blurred; 0 is off",
+        type=at_least_zero,
+    )
+    add(
         "--subpixel-samples",
         "subpixel_samples",
         "anti-aliasing positions per pixel, which share its samples; 0: chosen by the number of samples, "
@@ -210,6 +217,7 @@ def override(settings: RenderSettings, args: argparse.Namespace) -> RenderSettin
         "bounces",
         "noise_threshold",
         "clamp_indirect",
+        "filter_glossy",
         "subpixel_samples",
         "filter_width",
         "seed",

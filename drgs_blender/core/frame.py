@@ -497,6 +497,9 @@ class RenderSettings:
         are then the most that a pixel gets.
     clamp_indirect : float
         Above 0, the limit of a single indirect sample, which loses energy.
+    filter_glossy : float
+        Above 0, surfaces that light meets behind a bounce of less density by the BSDF (sr^-1) are rougher, as by
+        Cycles' setting: less noise of caustics, which are blurred.
     device : {"cpu", "cuda"}
         "cuda" has a graphics card do what it can, see docs/gpu.md; without one it is as "cpu", with a warning.
     filter_width : float
@@ -517,6 +520,7 @@ class RenderSettings:
     threads: int = 0
     noise_threshold: float = 0.0
     clamp_indirect: float = 0.0
+    filter_glossy: float = 0.0
     device: Literal["cpu", "cuda"] = "cpu"
     filter_width: float = 0.0
 

@@ -20,11 +20,11 @@ from ..core.errors import Cancelled
 from ..core.frame import Frame, RenderSettings
 from .backend import CPU, RenderBackend
 from .camera import camera_parameters
-from .film.background import Background
 from .film.film import Film
 from .film.light_group_film import LightGroupFilm
 from .film.lobe_colours import put_lobe_colours
 from .film.object_numbers import object_numbers
+from .film.seen_world import SeenWorld
 from .film.surface_film import SurfaceFilm
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.visible_lights import visible_lights
@@ -168,7 +168,7 @@ class Progressive:
         self._strips = [_Strip((y, min(y + height, bottom))) for y in range(top, bottom, height)]
         self._visible: VisibleSurfaces | None = None
         self._left = KEPT_BYTES
-        self._background: Background | None = None
+        self._seen_world: SeenWorld | None = None
 
     @property
     def fraction(self) -> float:
@@ -246,7 +246,7 @@ class Progressive:
 
     def _develop(self, prepared: PreparedScene, check: Callable[[], None]) -> dict[str, Array]:
         camera, lights = self.frame.camera, prepared.lights
-        film = Film(camera, self.frame.settings, self._parameters, self._background)
+        film = Film(camera, self.frame.settings, self._parameters, self._seen_world)
         numbers = object_numbers(prepared.scene)
         surfaces = SurfaceFilm(prepared.scene, self.frame, self._parameters, put_lobe_colours)
         groups = LightGroupFilm(prepared.scene, lights, self.frame, self._parameters)
@@ -263,7 +263,7 @@ class Progressive:
             if lights is not None and lights.seen:
                 rows = slice(strip.rows[0] - camera.window[1], strip.rows[1] - camera.window[1])
                 film.pixels.emission[rows] += visible_lights(lights.tables, self._parameters, camera.window[0], buffer)
-        self._background = film.background
+        self._seen_world = film.seen_world
         components = denoised(film, self.frame, check, self._backend)  # first: the world is seen through its catchers
         made = surfaces.passes() | groups.passes(film.seen_environment())
         names = tuple(name for name in self.frame.passes if name not in made)

@@ -319,7 +319,7 @@ def test_settings_and_passes_reach_the_frame(ball, scene, captured):
         5,
     )
     settings.camera_sees, settings.rays_see, scene.render.film_transparent = "mesh", "surfels", True
-    settings.noise_threshold, settings.clamp_indirect = 0.02, 10
+    settings.noise_threshold, settings.clamp_indirect, settings.filter_glossy = 0.02, 10, 2
     layer.use_pass_z = layer.use_pass_object_index = layer.drgs.use_pass_albedo = layer.drgs.use_pass_noisy_image = True
     scene.frame_set(12)
     bpy.ops.render.render()
@@ -333,7 +333,7 @@ def test_settings_and_passes_reach_the_frame(ball, scene, captured):
         "surfels",
         True,
     )
-    assert (s.noise_threshold, s.clamp_indirect) == (0, 10), "the threshold is off"
+    assert (s.noise_threshold, s.clamp_indirect, s.filter_glossy) == (0, 10, 2), "the threshold is off"
     assert frame.passes == ("Combined", "Depth", "Albedo", "IndexOB", "Noisy Image")
     assert frame.noise_index == 12
     settings.use_animated_seed, settings.use_noise_threshold = False, True

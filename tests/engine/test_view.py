@@ -297,8 +297,10 @@ def test_newer_frame_interrupts_within_tens_of_milliseconds(client, make_frame):
 
 
 def test_cancelled_step_leaves_the_view_as_it_was(session, make_frame, monkeypatch):
+    """The world behind included, of which some strips are known by then."""
     monkeypatch.setattr("drgs_blender.engine.progressive_view.STEP_SECONDS", 0.0)
-    frame = make_frame(0.2, samples=16, threads=1)  # it is always asked as often
+    monkeypatch.setattr(progressive, "strip_height", lambda *_: 8)
+    frame = lit(make_frame(0.2, samples=16, threads=1, film_transparent=False))  # it is always asked as often
     session.view("A", frame)
     before = session.refine("A").statistics["view.fraction"]
     for asked in range(1, 400):
@@ -311,4 +313,16 @@ def test_cancelled_step_leaves_the_view_as_it_was(session, make_frame, monkeypat
         pytest.fail("no step was ever drawn")
     while (passes := session.refine("A")).statistics["view.fraction"] < 1:
         pass
+    assert_close(passes, session.render(frame))
+
+
+def test_passes_of_a_view_may_be_written_into(session, make_frame, monkeypatch):
+    monkeypatch.setattr("drgs_blender.engine.progressive_view.STEP_SECONDS", 0.0)
+    frame = make_frame(0.2, samples=16, film_transparent=False)
+    frame.passes = ("Combined", "Env")
+    passes = session.view("A", frame)
+    while passes.statistics["view.fraction"] < 1.0:
+        for values in passes.values():
+            values[:] = -1.0
+        passes = session.refine("A")
     assert_close(passes, session.render(frame))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
 import sys
 import types
@@ -119,6 +120,13 @@ def test_nothing_to_hit() -> None:
 def test_faces_must_exist() -> None:
     with pytest.raises(UsageError, match=r"0\.\.2"):
         TriangleBVH().build(np.zeros((3, 3)), [[0, 1, 3]])
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="of x86 processors")
+def test_rays_take_no_wider_instructions_than_avx2() -> None:
+    """Embree ignores settings that it does not know."""
+    native_ray16 = 34
+    assert embree.library().rtcGetDeviceProperty(embree.device(), native_ray16) == 0
 
 
 def test_a_wheel_without_embree_is_a_device_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

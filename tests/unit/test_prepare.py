@@ -17,7 +17,7 @@ import pytest
 
 from drgs_blender.compute import folders, manifest, prepare, worker_pool
 from drgs_blender.compute.jit import numba
-from drgs_blender.core.errors import EXIT_CANNOT_WRITE
+from drgs_blender.core.errors import EXIT_CANNOT_WRITE, Cancelled
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -246,6 +246,20 @@ def test_a_damaged_kernel_is_compiled_again_ahead(small) -> None:
     with contextlib.closing(worker_pool.Pool(small, 2)) as pool:
         finish(pool)
     assert not prepare.not_compiled(kernels) and 0 not in [path.stat().st_size for path in paths]
+
+
+def test_kernels_that_were_found_are_not_looked_for_again(small, monkeypatch) -> None:
+    """Those of a job that was cancelled, or compiled just now, are."""
+    kernels, looks = [known[0] for known in small], []
+    monkeypatch.setattr(prepare, "_complete", set())
+    monkeypatch.setattr(manifest, "needed", lambda jobs: looks.append(list(jobs)) or kernels)
+    with pytest.raises(Cancelled):
+        prepare.prepare_kernels(["some"], cancelled=lambda: True)
+    for _ in range(4):
+        prepare.prepare_kernels(["some"])
+    assert looks == [["some"]] * 3
+    prepare.prepare_kernels(["some", "other"])
+    assert looks[3:] == [["other"]] and not prepare.not_compiled(kernels)
 
 
 @pytest.fixture

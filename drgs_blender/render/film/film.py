@@ -32,11 +32,11 @@ from ..gbuffer.gbuffer import GBuffer
 from ..lights.environment import EnvironmentLight
 from ..sampling import luminance
 from ..shading_points import CATCHER, UNLIT, Radiance
-from .background import Background
 from .catcher_film import CatcherFilm
 from .guides import Guides
 from .light_passes import LIGHT_PASSES, add_light, light_parts
 from .object_numbers import ObjectNumbers, number_of
+from .seen_world import SeenWorld
 from .surface_film import mean_of_points
 
 Array = np.ndarray
@@ -112,13 +112,13 @@ class Film:
     settings : RenderSettings
     parameters : array
         `camera.camera_parameters`.
-    background : Background, optional
+    seen_world : SeenWorld, optional
         That of an earlier film of the same samples.
 
     Attributes
     ----------
     pixels : Pixels
-    background : Background
+    seen_world : SeenWorld
     unlit : (h, w) float32 array, optional
         The part of the coverage that is of unlit objects; None: there are none.
     transmitted : (h, w, 2, 3) float32 array, optional
@@ -126,7 +126,7 @@ class Film:
     """
 
     def __init__(
-        self, camera: Camera, settings: RenderSettings, parameters: Array, background: Background | None = None
+        self, camera: Camera, settings: RenderSettings, parameters: Array, seen_world: SeenWorld | None = None
     ) -> None:
         x0, y0, x1, y1 = camera.window
         size = (y1 - y0, x1 - x0)
@@ -136,8 +136,8 @@ class Film:
         self.round = camera.panorama in ("fisheye", "equisolid")
         self.pixels = Pixels.empty(size)
         self.catchers = CatcherFilm(camera, settings, parameters)
-        self._sees_world = background is None and not self.transparent
-        self.background = background or Background(size)
+        self._adds_world = seen_world is None and not self.transparent
+        self.seen_world = seen_world or SeenWorld(size)
         self.unlit: Array | None = None
         self.transmitted: Array | None = None
         self._objects: ObjectNumbers | None = None
@@ -154,7 +154,7 @@ class Film:
         objects : ObjectNumbers
             The same for all strips.
         environment : EnvironmentLight
-            Background, unless the film is transparent.
+            Background, unless the film is transparent, or took over what is seen of it.
         """
         self._objects = objects
         x0, top = self.origin
@@ -178,8 +178,8 @@ class Film:
         over_range(
             _develop, y1 - y0, buffer.point_rows(x0, int(self.parameters[WIDTH])), buffer.surfaces(), light,
             self.parameters, self.pixels.rows(y0 - top, y1 - top), fewest=ROWS)  # fmt: skip
-        if self._sees_world and not environment.black:
-            self.background.add(buffer, environment, self.parameters, self.origin)
+        if self._adds_world and not environment.black:
+            self.seen_world.add(buffer, environment, self.parameters, self.origin)
 
     def guides(self) -> Guides:
         """The denoiser's guides: what differs from surface to surface. Of unlit objects there is no light to guide."""
@@ -239,7 +239,7 @@ class Film:
 
     def seen_environment(self) -> Array:
         """(h, w, 3) float32: light straight from the world, the pass Env."""
-        return self.background.behind(self._shadow())
+        return self.seen_world.behind(self._shadow())
 
     def _shadow(self) -> Array:
         """(h, w) float32 in [0, 1]: how dense the shadows on catchers are."""

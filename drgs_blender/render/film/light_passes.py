@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import njit, plain
 from ...compute.threads import ROWS, over_range
 
 Array = np.ndarray
@@ -51,7 +51,7 @@ def light_parts(light: Array, noisy: Array, transmitted: Array | None, colours: 
 def add_light(light: Array, environment: Array, emission: Array, opaque: Array | np.float32) -> Array:
     """(h, w, 4) float32 Combined of (h, w, 4, 3) light, what is behind it and what surfaces emit."""
     out = np.empty((*light.shape[:2], 4), np.float32)
-    parts = (np.ascontiguousarray(part, np.float32) for part in (light, environment, emission))
+    parts = (plain(part) for part in (light, environment, emission))
     over_range(_add, len(out), *parts, out, fewest=ROWS)
     out[..., 3] = opaque
     return out

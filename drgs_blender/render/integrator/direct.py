@@ -19,8 +19,8 @@ from ..scene import ray_masks
 from . import mis
 from . import wavefront as w
 from .group_sums import KIND, KINDS, credit_lamps_of_point, credit_point, deliver_groups, finish_groups
-from .indirect import CARRIED, INDIRECT, trace_paths
-from .intersect import FAR, meet, passed, put_hit
+from .indirect import CARRIED, INDIRECT, begin_path, trace_paths
+from .intersect import FAR, meet, passed
 from .light_visibility import light_radiance
 from .sample_allocation import COSINE, ENVIRONMENT, GGX, LIGHTS
 
@@ -269,7 +269,8 @@ def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: igno
             trace_paths(paths, begun, scene, settings, found)
             deliver(begun, found, settings.clamp, scene.lights, sums)
             begun = np.int64(0)
-        put_hit(tracer, paths, begun, (position, direction), hit, ints[c + w.KEY], begun)
+        pdf = others / (cosine * s[i + w.WC] + ggx * s[i + w.WG])
+        begin_path(tracer, paths, begun, (position, direction), hit, ints[c + w.KEY], pdf, settings)
         found[begun, CARRIED], found[begun, CARRIED + 1], found[begun, CARRIED + 2] = (
             s[i + w.QR] * rest, s[i + w.QG] * rest, s[i + w.QB] * rest,
         )  # fmt: skip

@@ -27,6 +27,7 @@ from .group_sums import clear_groups, credit_lamps_of_path, credit_path
 from .intersect import FAR, meet, passed, put_hit, surface_of
 from .light_visibility import light_radiance
 from .multiscatter import has_multiscatter, lobe_weights
+from .path_regularisation import least_alpha
 
 Array = np.ndarray
 
@@ -61,6 +62,29 @@ def lifted(px, py, pz, gx, gy, gz, extent):  # type: ignore[no-untyped-def]
 
 
 @njit
+def begin_path(tracer, paths, slot, start, hit, key, pdf, settings):  # type: ignore[no-untyped-def]
+    """Put what a sample of a shading point met into a slot, where `trace_paths` goes on.
+
+    Parameters
+    ----------
+    tracer : MixedTracer
+    paths : Batch
+    slot : int64
+        Also the path's row of `found`.
+    start : tuple of tuple
+    hit : Hit or MixedHit
+    key : uint32
+        As of `intersect.put_hit`.
+    pdf : float32
+        Density of the sample by the BRDF, sr^-1.
+    settings : Settings
+    """
+    put_hit(tracer, paths, slot, start, hit, key, slot)
+    i, _ = w.at(slot)
+    paths.floats[i + w.LEAST_ALPHA] = least_alpha(pdf, settings.filter_glossy)
+
+
+@njit
 def _surfaces(rays, count, scene, settings):  # type: ignore[no-untyped-def]
     """Normals and materials where the rays hit. Emission was already added (`direct`, `_onwards`)."""
     s, ints = rays
@@ -86,7 +110,8 @@ def _surfaces(rays, count, scene, settings):  # type: ignore[no-untyped-def]
         s[a + w.OX], s[a + w.OY], s[a + w.OZ] = lifted(s[a + w.OX], s[a + w.OY], s[a + w.OZ], gx, gy, gz, extent)
         s[a + w.AR], s[a + w.AG], s[a + w.AB] = r, g, b
         s[a + w.PATH_SET] = set_of(scene.lights, np.int32(ints[c + w.N0]), np.int32(ints[c + w.OWN]), geometry)
-        s[a + w.A2] = brdf.alpha_squared(roughness)
+        least = s[a + w.LEAST_ALPHA]
+        s[a + w.A2] = max(brdf.alpha_squared(roughness), least * least)
         multiscatter = scene.traits.multiscatter and has_multiscatter(np.int32(ints[c + w.N0]), geometry)
         s[a + w.KD], metal, s[a + w.FD] = lobe_weights(
             mx * vx + my * vy + mz * vz, roughness, metallic, (r, g, b), multiscatter, settings
@@ -148,10 +173,10 @@ def _towards_lights(rays, count, scene, shift, found):  # type: ignore[no-untype
 
 
 @njit
-def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no-untyped-def]
+def _onwards(rays, count, bounce, last, scene, settings, found):  # type: ignore[no-untyped-def]
     """The BRDF samples; return how many paths go on, in slots 0, 1, ..."""
     s, ints = rays
-    tracer, envmap = scene.tracer, scene.envmap
+    tracer, envmap, shift = scene.tracer, scene.envmap, settings.shift
     any_lights, emissive = scene.traits.lights, scene.traits.emissive
     going = 0
     for slot in range(count):
@@ -206,9 +231,11 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
                 if not unit(mix(U(key + U(0x165667B1)))) < survive:
                     continue
                 fr, fg, fb = fr / survive, fg / survive, fb / survive
+            least = max(s[i + w.LEAST_ALPHA], least_alpha(s[i + w.PG], settings.filter_glossy))
             # The slots before this one are done with.
             put_hit(tracer, rays, going, (position, direction), hit, key, owner)
             i, _ = w.at(going)
+            s[i + w.LEAST_ALPHA] = least
             s[i + w.TR], s[i + w.TG], s[i + w.TB] = fr, fg, fb
             going += 1
     return going
@@ -216,7 +243,7 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
 
 @njit
 def trace_paths(rays, count, scene, settings, found):  # type: ignore[no-untyped-def]
-    """Follow `count` paths that `put_hit` began in slots 0, 1, ...; their light goes to rows OWNER of `found`.
+    """Follow `count` paths that `begin_path` began in slots 0, 1, ...; their light goes to rows OWNER of `found`.
 
     Parameters
     ----------
@@ -259,4 +286,4 @@ def trace_paths(rays, count, scene, settings, found):  # type: ignore[no-untyped
         w.brdf_directions(rays, count)
         _evaluate(rays, count, scene, shading_model)
         mis.path_weights(rays, count, ZERO)
-        count = _onwards(rays, count, bounce, bounce + 1 == settings.bounces, scene, shift, found)
+        count = _onwards(rays, count, bounce, bounce + 1 == settings.bounces, scene, settings, found)

@@ -121,8 +121,9 @@ def integrate(
     if min(counts) < 0 or settings.bounces < 0 or settings.subpixel_samples < 0:
         problem = "samples, bounces or sub-pixel samples are negative"
         raise UsageError("render settings", problem, "Use counts of zero or more")
-    if not (0.0 <= settings.clamp_indirect < np.inf and 0.0 <= settings.noise_threshold < np.inf):
-        raise UsageError("render settings", "the clamp or the threshold is no number of at least 0", "Use 0 for none")
+    if not all(0.0 <= x < np.inf for x in (settings.clamp_indirect, settings.filter_glossy, settings.noise_threshold)):
+        problem = "Clamp Indirect, Filter Glossy or the noise threshold is no number of at least 0"
+        raise UsageError("render settings", problem, "Use 0 for none")
     if settings.shading_model not in brdf.SHADING_MODELS:
         problem = f"shading model {settings.shading_model!r} is unknown"
         raise UsageError("render settings", problem, "Use principled or paper")
@@ -145,9 +146,9 @@ def integrate(
     table = scene.mesh_materials.table
     traits = Traits(extent, *shines, lights.rays_differ, apart, table.detailed, table.clear, table.multiscatter)
     given = Scene(tracer, geometry, envmap, light_tables, traits)
-    clamp = F(settings.clamp_indirect * settings.subpixel_count * part[1] / sum(counts))
+    limits = F(settings.clamp_indirect * settings.subpixel_count * part[1] / sum(counts)), F(settings.filter_glossy)
     tables = brdf.layer_table(), *energy_tables()
-    how = Settings(settings.bounces, brdf.SHADING_MODELS[settings.shading_model], *tables, clamp, 0)
+    how = Settings(settings.bounces, brdf.SHADING_MODELS[settings.shading_model], *tables, *limits, 0)
     seed, sequence = U(hash_seed(settings.seed, noise_index)), sampling.point_set(sum(counts) + 1)
     shares = F(environment_part), F(lights_part), _MAX_LIGHT_SHARE if scene.rays_differ else ONE
     sampler = Sampler._make([seed, sequence, settings.subpixel_count, *part, auto, *map(F, counts), *shares])

@@ -30,6 +30,7 @@ from .group_sums import FOUND, MOMENTS, clear_groups, group_columns
 from .integrate import ShadingKernel
 from .intersect import meet, put_hit, put_start, surface_of
 from .path_light import Scratch, aim, is_bright, light_along, towards_envmap, towards_lights, weigh
+from .path_regularisation import least_alpha, roughen
 from .records import Sampler, Scene, Settings
 
 Array = np.ndarray
@@ -107,12 +108,15 @@ def _follow(start, numbers, receiver, surfaces, scene, settings, scratch):  # ty
     geometry, envmap, extent = scene.geometry, scene.envmap, scene.traits.extent
     red = green = blue = ONE
     reflected = transmitted = 0
+    least = ZERO  # of the alphas of surfaces, see `path_regularisation`
     first = True
     while True:
         normals = (normal, smooth)
         count, passes = put_lobes(
             place, base, normals, facing, view, geometry, surfaces.rows, surfaces.tables, scratch.parameters, b
         )
+        if least > ZERO:
+            roughen(b, count, least)
         row = np.int32(SIDE * SIDE)
         if not passes:
             row = product_row(normal[0], normal[1], normal[2], envmap)
@@ -162,6 +166,8 @@ def _follow(start, numbers, receiver, surfaces, scene, settings, scratch):  # ty
             reflected += 1
         if through == ONE or reflected > settings.bounces or transmitted > TRANSMISSION_BOUNCES:
             return
+        if not delta:
+            least = max(least, least_alpha(pdf, settings.filter_glossy))
         k = (ONE - through) / pdf
         if first:
             for i in range(9):

@@ -86,6 +86,8 @@ class Settings(NamedTuple):
         Their second.
     clamp : np.float32
         Limit of the mean of an indirect sample's channels; 0: none.
+    filter_glossy : np.float32
+        Density of a bounce below which the surfaces behind it are rougher, sr^-1, see `path_regularisation`; 0: none.
     shift : int
         Of the masks of rays: 0, or ``ray_masks.WITHOUT``.
     """
@@ -96,6 +98,7 @@ class Settings(NamedTuple):
     energy: Array
     mean_energy: Array
     clamp: np.float32
+    filter_glossy: np.float32
     shift: int
 
 

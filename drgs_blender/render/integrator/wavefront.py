@@ -52,6 +52,8 @@ WC, WG, WE, WL, SIZE = (LANES * i for i in range(46, 51))
 UX, UY, UZ = (LANES * i for i in range(51, 54))
 # where smooth meshes have a terminator offset: see `scene.terminator`, and the part of it that a shadow ray gets
 HX, HY, HZ, LIMIT, MOVED = (LANES * i for i in range(54, 59))
+# of paths: the alpha that the surface has at least, see `path_regularisation`
+LEAST_ALPHA = LANES * 59
 #: Four fields, 256 bytes, divide it: at 51 or 59 fields the kernel took a tenth longer than at 48, 56, 60, 64 or 72.
 PACKET_FLOATS = 60 * LANES
 #: Where lights are linked, the set of the surface: of a point's samples, which have no throughput, and of paths.
@@ -67,7 +69,7 @@ IN_LANES = (
     "AR", "AG", "AB", "FR", "FG", "FB", "FD", "A2", "KD",
     "LX", "LY", "LZ", "LIVE", "QR", "QG", "QB", "SR", "SG", "SB", "PC", "PG",
     "MU", "MV", "PE", "TR", "TG", "TB", "SHARE", "ER", "EG", "EB", "WC", "WG", "WE", "WL", "SIZE",
-    "UX", "UY", "UZ", "HX", "HY", "HZ", "LIMIT", "MOVED", "POINT_SET", "PATH_SET",
+    "UX", "UY", "UZ", "HX", "HY", "HZ", "LIMIT", "MOVED", "LEAST_ALPHA", "POINT_SET", "PATH_SET",
     "N0", "N1", "N2", "KEY", "OWNER", "CELL", "ROW", "OWN",
 )  # fmt: skip
 
@@ -80,7 +82,7 @@ class Batch(NamedTuple):
     Attributes
     ----------
     floats : (packets * 60 * LANES,) float32 array
-        Fields from OX to MOVED.
+        Fields from OX to LEAST_ALPHA.
     ints : (packets * 8 * LANES,) uint32 array
         Fields from N0 to OWN.
     """

@@ -8,5 +8,6 @@ settings.bounces = 1
 settings.use_noise_threshold = False
 settings.noise_threshold = 0.01
 settings.clamp_indirect = 10.0
+settings.filter_glossy = 1.0
 settings.subpixel_samples = 0
 settings.denoise = "svgf"

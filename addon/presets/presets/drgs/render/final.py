@@ -8,5 +8,6 @@ settings.bounces = 4
 settings.use_noise_threshold = True
 settings.noise_threshold = 0.01
 settings.clamp_indirect = 0.0
+settings.filter_glossy = 0.0
 settings.subpixel_samples = 0
 settings.denoise = "svgf"

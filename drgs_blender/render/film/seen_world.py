@@ -15,8 +15,8 @@ from ..shading_points import CATCHER
 Array = np.ndarray
 
 
-class Background:
-    """Light straight from the world, of the camera's window; the same for all films of the same samples.
+class SeenWorld:
+    """Light straight from the world, of the camera's window: the same in all films of the same samples.
 
     Parameters
     ----------
@@ -56,8 +56,8 @@ class Background:
             _through(parameters, x0, y0, *seen, envmap, self.veiled[rows])
 
     def behind(self, shadow: Array) -> Array:
-        """(h, w, 3) float32: the light past (h, w) shadows on catchers, from 0 for none to 1."""
-        return self.environment - self.veiled * shadow[..., None] if shadow.any() else self.environment
+        """(h, w, 3) float32, an array of its own: the light past (h, w) shadows on catchers, from 0 for none to 1."""
+        return self.environment - self.veiled * shadow[..., None] if shadow.any() else self.environment.copy()
 
 
 @njit
