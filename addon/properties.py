@@ -118,10 +118,9 @@ class DrgsSceneSettings(LevelOfDetail, bpy.types.PropertyGroup):
     filter_glossy: FloatProperty(
         name="Filter Glossy",
         description="Make surfaces rougher that light meets behind rough ones: caustics, as of a metal on a wall, are "
-        "blurred and less noisy. 0 is off. Cycles' own, which is 1 by default, is not applied",
+        "blurred and less noisy, and lose some light. 0 is off. Cycles' own, which is 1 by default, is not applied",
         min=0.0,
-        soft_max=10.0,
-        max=1000.0,
+        max=10.0,
         default=0.0,
         precision=2,
     )

@@ -60,7 +60,7 @@ def filter_glossy(options: argparse.Namespace) -> str:
                     "-" if strength == 0.0 else f"{psnr(picture, free, where.mask):.1f}",
                 ]
             )  # fmt: skip
-    columns = ["Case", "Filter Glossy", f"relMSE at {EQUAL} / trimmed", "light", "Cycles' light"]
+    columns = ["Case", "Filter Glossy", f"noise at {EQUAL} / trimmed", "light", "Cycles' light"]
     columns += ["dB to Cycles", "dB to 0"]
     return (
         f"{size}x{size}, {options.cases_seeds} seeds. Light: of {CONVERGED} rays, of Cycles {CONVERGED_SPP} spp with "

@@ -37,6 +37,10 @@ class DRGS_OT_render_preset(DrgsOperator, bpy.types.Operator):
         except Exception as error:  # whatever a program may raise; of another version, or edited
             problem, remedy = f"cannot be used ({type(error).__name__}: {error})", "Remove it, or keep it once more"
             raise UsageError(str(path), problem, remedy) from error
+        text = path.read_text(encoding="utf-8", errors="replace")
+        for name in presets.VALUES:
+            if f"settings.{name} " not in text:  # the version that kept the preset did not know it
+                context.scene.drgs.property_unset(name)
         return {"FINISHED"}
 
 

@@ -69,7 +69,7 @@ def add_arguments(
         "--filter-glossy",
         "filter_glossy",
         "make surfaces rougher behind rough reflections, as Cycles' setting (1 by default there): less noise of "
-        "caustics, blurred; 0 is off",
+        "caustics, which are blurred and lose some light; 0 is off",
         type=at_least_zero,
     )
     add(

@@ -41,8 +41,8 @@ PHASE = PREPARING
 _POLL = 0.1
 _REPORT = 0.4
 _ROOT = Path("/")
-#: Jobs of which this process has found all kernels.
-_complete: set[str] = set()
+#: Jobs that were prepared in this process.
+_prepared: set[str] = set()
 Progress = Callable[[str, float], None]
 
 
@@ -51,10 +51,8 @@ def prepare_kernels(
 ) -> None:
     """Compile what `jobs` need and the cache lacks; return at once where nothing is missing.
 
-    A process that has found all kernels of a job does not look for them again.
-
-    A process that ends, or cannot write what it compiled, leaves it to the first call of the kernel: this never fails
-    for lack of a cache.
+    A process does so once per job. A worker that ends, or cannot write what it compiled, leaves it to the first call of
+    the kernel: this never fails for lack of a cache.
 
     Parameters
     ----------
@@ -71,24 +69,24 @@ def prepare_kernels(
     """
     if not is_on("DRGS_PREPARE", True):
         return
-    jobs = [job for job in jobs if job not in _complete]
-    if jobs and _compile(jobs, progress, cancelled):
-        _complete.update(jobs)
+    jobs = [job for job in jobs if job not in _prepared]
+    if jobs:
+        _compile(jobs, progress, cancelled)
+        _prepared.update(jobs)
 
 
 def _compile(
     jobs: Iterable[str],
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
-) -> bool:
-    """Whether nothing was missing."""
+) -> None:
     if cache_folder().path is None or cache_folder().has_failed:
-        return False
+        return
     kernels = manifest.needed(jobs)
     with _started_early(len(kernels)) as started:
         missing = _missing(kernels)
         if not missing:
-            return True
+            return
         pool = Pool(missing, processes(), started)
     with contextlib.closing(pool):
         reported = 0.0
@@ -99,7 +97,6 @@ def _compile(
                 reported = time.monotonic()
                 progress(f"{PHASE}, {min(pool.done + 1, len(missing))} of {len(missing)}", pool.fraction)
             pool.wait(_POLL)
-    return False
 
 
 @contextlib.contextmanager

@@ -26,7 +26,7 @@ Array = np.ndarray
 #: Ending of such files.
 SUFFIX = ".drgsframe"
 #: Of the description; counts up when its fields change. `_UPGRADES` reads the formats before.
-FORMAT = 11
+FORMAT = 12
 _DESCRIPTION = "description"
 #: Arrays of as many bytes have a file of their own.
 _LARGE = 1 << 16
@@ -105,13 +105,13 @@ def _named_samples(frame: dict[str, Any]) -> dict[str, Any]:
 
 
 def _with_new_fields(frame: dict[str, Any]) -> dict[str, Any]:
-    """Formats 2 to 11: fields that came later have their defaults."""
+    """Formats 2 to 12: fields that came later have their defaults."""
     found: dict[str, Any] = completed(Frame, frame)
     return found
 
 
 #: From each format to the next, the oldest first.
-_UPGRADES = (_named_samples, *(_with_new_fields,) * 9)
+_UPGRADES = (_named_samples, *(_with_new_fields,) * 10)
 
 
 def _write_beside(folder: Path, array: Array) -> str:

@@ -84,7 +84,7 @@ __all__ = [  # the messages are part of it
 Array = np.ndarray
 
 #: Raised with every change of the messages. Two sides work together only when it and the version are the same.
-PROTOCOL = 17
+PROTOCOL = 18
 
 MAGIC = b"DRGS"
 PREFIX = struct.Struct("<4sIQ")  # magic, bytes of the header, bytes of arrays behind it in the pipe

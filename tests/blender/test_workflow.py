@@ -167,6 +167,8 @@ def test_presets_set_what_they_say_and_are_refused_elsewhere(scene, name, tmp_pa
     scene.drgs.samples, scene.drgs.bounces = 7, 0
     assert bpy.ops.drgs.render_preset(filepath=str(path), menu_idname="DRGS_PT_presets") == {"FINISHED"}
     assert scene.drgs.samples in (16, 64, 1024) and scene.drgs.bounces > 0 and not scene.drgs.use_strategy_samples
+    assert all(f"settings.{value} = " in path.read_text() for value in presets.VALUES if not value.endswith("_samples"))
+    assert (scene.drgs.filter_glossy, scene.drgs.clamp_indirect) == ((0, 0) if name == "final" else (1, 10))
     stray = tmp_path / f"{name}.py"
     stray.write_bytes(path.read_bytes())
     with pytest.raises(RuntimeError, match="is no render preset"):
@@ -181,6 +183,11 @@ def test_own_settings_are_kept_as_a_preset(scene):
     path = next(f for p in bpy.utils.preset_paths(presets.FOLDER) for f in Path(p).iterdir() if f.stem == "My_Look")
     bpy.ops.drgs.render_preset(filepath=str(path))
     assert scene.drgs.samples == 123 and scene.drgs.clamp_indirect == 4.5
+    text = path.read_text()  # as a version would have kept it that did not know one of the settings
+    path.write_text("".join(line for line in text.splitlines(True) if "filter_glossy" not in line))
+    scene.drgs.samples, scene.drgs.filter_glossy = 5, 1
+    bpy.ops.drgs.render_preset(filepath=str(path))
+    assert scene.drgs.samples == 123 and scene.drgs.filter_glossy == 0
     path.unlink()
 
 

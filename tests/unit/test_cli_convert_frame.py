@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import typing
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +25,7 @@ from drgs_blender.formats.registry import read_environment, read_mesh, read_surf
 from drgs_blender.ipc import frame_file
 from drgs_blender.ipc.codec import CodecError, completed, decode_frame, encode_frame
 from drgs_blender.ipc.frame_file import read_frame_file, write_frame_file
+from drgs_blender.ipc.protocol import PROTOCOL
 
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
 FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
@@ -108,6 +113,43 @@ def test_fields_that_came_after_format_2_have_their_defaults() -> None:
     old["camera"]["colour"] = 3
     with pytest.raises(CodecError, match="camera"):
         decode_frame(completed(Frame, old), arrays)
+
+
+def test_frame_files_of_the_format_before_lack_what_came_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Filter Glossy came with format 12."""
+    encode = frame_file.encode_frame
+
+    def before(frame: Frame) -> tuple[dict, dict]:
+        data, arrays = encode(frame)
+        del data["settings"]["filter_glossy"]
+        return data, arrays
+
+    monkeypatch.setattr(frame_file, "FORMAT", 11)
+    monkeypatch.setattr(frame_file, "encode_frame", before)
+    write_frame_file(tmp_path / "a.drgsframe", frame_of([], settings=RenderSettings(samples=7, filter_glossy=3.0)))
+    monkeypatch.undo()
+    settings = read_frame_file(tmp_path / "a.drgsframe").settings
+    assert (settings.samples, settings.filter_glossy) == (7, 0.0)
+
+
+def test_a_change_of_the_fields_of_frames_is_a_new_format() -> None:
+    """Where this fails, raise both numbers: programs of either side of the change must not take each other's frames."""
+
+    def fields_of(kind: Any, known: set[Any]) -> list[str]:
+        found: list[str] = []
+        for part in (kind, *typing.get_args(kind)):
+            if is_dataclass(part) and part not in known:
+                known.add(part)
+                for name, hint in typing.get_type_hints(part).items():
+                    found += [f"{part.__name__}.{name}", *fields_of(hint, known)]
+            elif part is not kind:
+                found += fields_of(part, known)
+        return found
+
+    names = fields_of(Frame, set())
+    assert "RenderSettings.filter_glossy" in names and "MeshState.materials" in names
+    digest = hashlib.sha256("\n".join(sorted(names)).encode()).hexdigest()[:12]
+    assert (frame_file.FORMAT, PROTOCOL, digest) == (12, 18, "b2b6a75cfba6")
 
 
 def test_frame_files_of_a_later_format_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

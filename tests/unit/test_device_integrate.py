@@ -242,7 +242,8 @@ def test_a_device_finds_the_light_that_the_processor_finds(
 
 
 @pytest.mark.parametrize("settings", [
-    replace(SETTINGS, strategy_samples=(5, 5, 6), bounces=0), replace(SETTINGS, bounces=8, clamp_indirect=0.5, filter_glossy=1.0),
+    replace(SETTINGS, strategy_samples=(5, 5, 6), bounces=0),
+    replace(SETTINGS, bounces=8, clamp_indirect=0.5, filter_glossy=1.0),
     replace(SETTINGS, strategy_samples=(0, 0, 8)),
 ])  # fmt: skip
 def test_settings_mean_the_same_on_a_device(device: WarpRenderBackend, settings: RenderSettings) -> None:

@@ -248,18 +248,18 @@ def test_a_damaged_kernel_is_compiled_again_ahead(small) -> None:
     assert not prepare.not_compiled(kernels) and 0 not in [path.stat().st_size for path in paths]
 
 
-def test_kernels_that_were_found_are_not_looked_for_again(small, monkeypatch) -> None:
-    """Those of a job that was cancelled, or compiled just now, are."""
+def test_kernels_are_prepared_once_in_a_process(small, monkeypatch) -> None:
+    """Those of a job that was cancelled are prepared the next time."""
     kernels, looks = [known[0] for known in small], []
-    monkeypatch.setattr(prepare, "_complete", set())
+    monkeypatch.setattr(prepare, "_prepared", set())
     monkeypatch.setattr(manifest, "needed", lambda jobs: looks.append(list(jobs)) or kernels)
     with pytest.raises(Cancelled):
         prepare.prepare_kernels(["some"], cancelled=lambda: True)
-    for _ in range(4):
+    for _ in range(3):
         prepare.prepare_kernels(["some"])
-    assert looks == [["some"]] * 3
+    assert looks == [["some"]] * 2 and not prepare.not_compiled(kernels)
     prepare.prepare_kernels(["some", "other"])
-    assert looks[3:] == [["other"]] and not prepare.not_compiled(kernels)
+    assert looks[2:] == [["other"]]
 
 
 @pytest.fixture
@@ -294,6 +294,7 @@ def test_an_engine_with_a_full_disk_goes_on(full: Path, small, monkeypatch, capl
     assert not folders.cache_folder().trouble
     (full / "filler").write_bytes(bytes(20 << 10))
     for _ in range(2):  # the second time there is no try
+        monkeypatch.setattr(prepare, "_prepared", set())
         prepare.prepare_kernels(["any"])
     assert len(caplog.messages) == 1 and str(full) in folders.cache_folder().trouble
     assert prepare.not_compiled(kernels) == kernels

@@ -49,7 +49,7 @@ def light_parts(light: Array, noisy: Array, transmitted: Array | None, colours: 
 
 
 def add_light(light: Array, environment: Array, emission: Array, opaque: Array | np.float32) -> Array:
-    """(h, w, 4) float32 Combined of (h, w, 4, 3) light, what is behind it and what surfaces emit."""
+    """(h, w, 4) float32 Combined of (h, w, 4, 3) light, what is behind it and what surfaces emit, float32 all."""
     out = np.empty((*light.shape[:2], 4), np.float32)
     parts = (plain(part) for part in (light, environment, emission))
     over_range(_add, len(out), *parts, out, fewest=ROWS)

@@ -246,6 +246,8 @@ def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: igno
     # Lights are seen before the BRDF is weighed, for they have densities of their own: such rays are traced first.
     if not see_lights:
         mis.balance_heuristic(rays, count, cosine, ggx)
+    if settings.filter_glossy > ZERO:
+        w.lobe_shares(rays, count, shading_model)
     if scene.traits.environment:
         w.warm(rays, count, envmap)
     for slot in range(count):
@@ -269,7 +271,7 @@ def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: igno
             trace_paths(paths, begun, scene, settings, found)
             deliver(begun, found, settings.clamp, scene.lights, sums)
             begun = np.int64(0)
-        pdf = others / (cosine * s[i + w.WC] + ggx * s[i + w.WG])
+        pdf = s[i + w.SHARE] * s[i + w.PC] + (ONE - s[i + w.SHARE]) * s[i + w.PG]
         begin_path(tracer, paths, begun, (position, direction), hit, ints[c + w.KEY], pdf, settings)
         found[begun, CARRIED], found[begun, CARRIED + 1], found[begun, CARRIED + 2] = (
             s[i + w.QR] * rest, s[i + w.QG] * rest, s[i + w.QB] * rest,

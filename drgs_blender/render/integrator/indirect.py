@@ -76,7 +76,7 @@ def begin_path(tracer, paths, slot, start, hit, key, pdf, settings):  # type: ig
     key : uint32
         As of `intersect.put_hit`.
     pdf : float32
-        Density of the sample by the BRDF, sr^-1.
+        Density of its direction by the BRDF, both lobes mixed by SHARE, sr^-1; read under `filter_glossy` alone.
     settings : Settings
     """
     put_hit(tracer, paths, slot, start, hit, key, slot)

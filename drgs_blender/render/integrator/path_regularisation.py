@@ -2,6 +2,7 @@
 
 Light that a sharp reflection brings by way of a rough one (a caustic) is found by few samples, each of them a firefly.
 Rougher, the reflection is found by more, and is darker and blurred: a bias, which no number of samples takes away.
+What a lobe reflects in all stays as it was, as in Cycles: energy compensation and layers know the sharp alpha.
 """
 
 from __future__ import annotations
