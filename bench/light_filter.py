@@ -1,4 +1,4 @@
-"""What Filter Glossy gains and takes, ours and that of Cycles. Part of bench_light.py."""
+"""What Filter Glossy gains and takes, ours and that of Cycles. Part of bench_light.py; draws a figure."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from judge import psnr, run_cycles
+from judge import psnr, run_cycles, to_srgb
 from light_cases import FOLDER, Case, Reference
 from light_variance import EQUAL, Noise, chosen
-from report import table
+from report import picture_path, table
 
 from drgs_blender.engine.session import Session
 
@@ -19,6 +19,9 @@ Array = np.ndarray
 FILTERS = (0.0, 1.0, 10.0)
 #: Rays and samples of the pictures by which the light is compared.
 CONVERGED, CONVERGED_SPP = 4096, 2048
+FIGURE = "filter-glossy.png"
+#: What the figure shows, at how many pixels and samples.
+SHOWN, SHOWN_SIZE, SHOWN_SAMPLES = "facing", 300, 64
 
 
 def ours(case: Case, size: int, seeds: int) -> tuple[Reference, list[tuple[Noise, Array]]]:
@@ -33,6 +36,26 @@ def ours(case: Case, size: int, seeds: int) -> tuple[Reference, list[tuple[Noise
         found.append((pictures, picture))
     where = Reference.of(found[0][1])
     return where, [(Noise.of(p, [0.0], Reference(picture, where.mask)), picture) for p, picture in found]
+
+
+def draw(case: Case, options: argparse.Namespace) -> None:
+    """A row as it is and one denoised, a column a filter."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    session = Session()
+    key = session.load_asset(case.files[0])
+    figure, rows = pyplot.subplots(2, len(FILTERS), figsize=(9, 6.2), constrained_layout=True)
+    for row, (name, denoise) in zip(rows, (("", "none"), (", SVGF", "svgf")), strict=True):
+        for axes, strength in zip(row, FILTERS, strict=True):
+            frame = case.frame(key, SHOWN_SIZE, SHOWN_SAMPLES, filter_glossy=strength, denoise=denoise)
+            axes.imshow(to_srgb(session.render(frame)["Combined"][..., :3]))
+            axes.set_title(f"{strength:g}{name}", fontsize="small")
+            axes.axis("off")
+    figure.savefig(picture_path(FIGURE, options), dpi=100)
+    pyplot.close(figure)
 
 
 def filter_glossy(options: argparse.Namespace) -> str:
@@ -62,8 +85,13 @@ def filter_glossy(options: argparse.Namespace) -> str:
             )  # fmt: skip
     columns = ["Case", "Filter Glossy", f"noise at {EQUAL} / trimmed", "light", "Cycles' light"]
     columns += ["dB to Cycles", "dB to 0"]
+    shown = next((case for case in cases if case.name == SHOWN), None)
+    figure = ""
+    if shown is not None:
+        draw(shown, options)
+        figure = f"![Filter Glossy 0, 1 and 10 at {SHOWN_SAMPLES} samples, as it is and denoised](images/{FIGURE})\n\n"
     return (
         f"{size}x{size}, {options.cases_seeds} seeds. Light: of {CONVERGED} rays, of Cycles {CONVERGED_SPP} spp with "
         "the same setting, relative to that without it; PSNR in sRGB over the subject, of these pictures. Cases are "
-        "those of *Light: noise of single cases*.\n\n" + table(columns, rows)
+        "those of *Light: noise of single cases*.\n\n" + figure + table(columns, rows)
     )
