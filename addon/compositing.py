@@ -1,8 +1,8 @@
 """DR-GS over the picture of another engine: a second scene that shows the same things, and the nodes that join both.
 
 The second scene is a copy that shares all collections and objects. DR-GS renders it with everything that is not its own
-as shadow catchers or holdouts (`properties.DrgsViewLayerSettings.others`), so that its picture is cut, sample by
-sample, by what stands in front of it; laid over the other engine's picture it is in its place in depth. The other
+as shadow catchers or holdouts (`view_layer_settings.DrgsViewLayerSettings.others`), so that its picture is cut, sample
+by sample, by what stands in front of it; laid over the other engine's picture it is in its place in depth. The other
 engine renders no DR-GS objects: they are in a collection that is disabled in renders, but stay in its viewports.
 """
 
@@ -49,8 +49,8 @@ def set_up(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, others: str,
     Parameters
     ----------
     view_layer : the layer of `scene` over which DR-GS is laid
-    others : "CATCHER" or "HOLDOUT", see `properties.DrgsViewLayerSettings.others`; with "HOLDOUT" the other engine has
-        the meshes of DR-GS objects throw shadows and be reflected
+    others : "CATCHER" or "HOLDOUT", see `view_layer_settings.DrgsViewLayerSettings.others`; with "HOLDOUT" the other
+        engine has the meshes of DR-GS objects throw shadows and be reflected
     compare : also hide DR-GS behind what the other engine's depth pass says is nearer
 
     Returns

@@ -9,13 +9,13 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
 from ..drgs_blender.core.frame import RenderSettings
-from ..drgs_blender.core.passes import PASSES, Pass
 from . import blend_paths, mesh_display
 from .adjustment_settings import DrgsAdjustmentSettings
 from .level_of_detail import LevelOfDetail
 from .physics_settings import DrgsPhysicsSettings
 from .property_limits import Limited, tag_changed
 from .submit import DrgsSubmitSettings
+from .view_layer_settings import DrgsViewLayerSettings
 
 _DENOISERS = {
     "none": ("None", "Keep the noise"),
@@ -279,33 +279,6 @@ class DrgsSceneSettings(LevelOfDetail, bpy.types.PropertyGroup):
             device=own.device.lower(),
             filter_width=own.filter_width,
         )
-
-
-def switch_of(render_pass: Pass) -> str:
-    """Property of `DrgsViewLayerSettings` that switches on a pass Blender does not know."""
-    return "use_pass_" + render_pass.name.lower().replace(" ", "_")
-
-
-class DrgsViewLayerSettings(bpy.types.PropertyGroup):
-    """Passes that Blender's own view layer has no switch for."""
-
-    __annotations__ = {  # Blender reads properties from here; they follow the one table
-        switch_of(p): BoolProperty(name=p.name, description=p.about, default=False) for p in PASSES if not p.blender
-    }
-    __annotations__["others"] = EnumProperty(
-        name="Other Objects",
-        description="What the camera sees of objects that are not DR-GS objects",
-        items=(
-            ("SEEN", "Visible", "The objects themselves"),
-            (
-                "CATCHER",
-                "Shadow Catchers",
-                "Only the shadows on them, and that they hide what is behind; for laying over another engine's picture",
-            ),
-            ("HOLDOUT", "Holdouts", "Only that they hide what is behind"),
-        ),
-        default="SEEN",
-    )
 
 
 def _get_path(group: DrgsObjectSettings) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..drgs_blender.core.passes import AOV_COLOUR, AOV_VALUE, LIGHT_GROUP, PASSES, TEMPORAL, Pass, pass_of
-from .properties import switch_of
+from .view_layer_settings import switch_of
 
 #: Names that Blender 5.0 spelled out; compositor nodes and its EXR files know only these.
 _FULL_NAMES = {
@@ -23,7 +23,6 @@ _FULL_NAMES = {
     "Env": "Environment",
     "Emit": "Emission",
 }
-
 
 #: Blender's other passes, by the properties of view layers that switch them on.
 _NOT_RENDERED = {

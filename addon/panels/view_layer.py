@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 import bpy
 
 from ...drgs_blender.core.passes import PASSES
-from ..properties import switch_of
 from ..view_layer_passes import label
+from ..view_layer_settings import switch_of
 
 
 class DRGS_PT_passes(bpy.types.Panel):

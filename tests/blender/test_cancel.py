@@ -112,7 +112,7 @@ def test_export_stops_before_the_next_object(lit, escape, captured, monkeypatch)
 def test_handing_over_stops_between_two_passes(lit, escape, captured, monkeypatch):
     layer = lit.view_layers[0]
     for p in part("drgs_blender.core.passes").PASSES:
-        switch = part("addon.properties").switch_of
+        switch = part("addon.view_layer_settings").switch_of
         setattr(*((layer, p.blender) if p.blender else (layer.drgs, switch(p))), True)
     lit.render.resolution_x, lit.render.resolution_y = 2048, 1080
     handed = []

@@ -242,7 +242,7 @@ def test_what_every_redraw_says_again_is_printed_once(scene, monkeypatch, caplog
 
 GROUPS = (
     ("addon.properties", "DrgsSceneSettings"),
-    ("addon.properties", "DrgsViewLayerSettings"),
+    ("addon.view_layer_settings", "DrgsViewLayerSettings"),
     ("addon.properties", "DrgsObjectSettings"),
     ("addon.physics_settings", "DrgsPhysicsSettings"),
     ("addon.physics_settings", "DrgsPhysicsRegion"),

@@ -55,7 +55,7 @@ def test_every_property_of_every_group_is_listed(pages):
     groups = {
         "scene.drgs": properties.DrgsSceneSettings,
         "scene.drgs.submit": part("addon.submit").DrgsSubmitSettings,
-        "view_layer.drgs": properties.DrgsViewLayerSettings,
+        "view_layer.drgs": part("addon.view_layer_settings").DrgsViewLayerSettings,
         "object.drgs": properties.DrgsObjectSettings,
         "object.drgs.adjustment": part("addon.adjustment_settings").DrgsAdjustmentSettings,
         "object.drgs.physics": physics.DrgsPhysicsSettings,

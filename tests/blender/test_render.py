@@ -141,7 +141,7 @@ def test_passes_of_the_table_reach_the_compositor(ball, scene, captured):
     """Every pass that can be switched on arrives in the render result under Blender's name."""
     layer = scene.view_layers[0]
     table, names = part("drgs_blender.core.passes").PASSES, part("addon.view_layer_passes")
-    switch = part("addon.properties").switch_of
+    switch = part("addon.view_layer_settings").switch_of
     for p in table:
         setattr(*((layer, p.blender) if p.blender else (layer.drgs, switch(p))), True)
     registered = []
