@@ -9,15 +9,13 @@ from dataclasses import replace
 import numpy as np
 from judge import environments, look_at, psnr, to_srgb
 from ours import SESSION, pinhole
-from report import picture_path, table
+from report import picture_grid, table
 from subjects import asset_path
 
 from drgs_blender.core.color import LUMINANCE
 from drgs_blender.core.frame import Frame, MeshState, ObjectState, RenderSettings, Visibility, World
 from drgs_blender.core.materials import Material
 from drgs_blender.formats.registry import read_environment
-
-Array = np.ndarray
 
 FIGURE = "ablation.png"
 #: Indirect bounces of the full method.
@@ -90,36 +88,19 @@ def scenes(options: argparse.Namespace) -> dict[str, Frame]:
     }
 
 
-def draw(pictures: dict[str, dict[str, Array]], options: argparse.Namespace) -> None:
-    """A row a scene, a column a variant."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, rows = pyplot.subplots(len(pictures), len(VARIANTS), figsize=(9, 6.2), constrained_layout=True)
-    for row, found in zip(rows, pictures.values(), strict=True):
-        for axes, (name, picture) in zip(row, found.items(), strict=True):
-            axes.imshow(to_srgb(picture[..., :3]))
-            axes.set_title(name, fontsize="small")
-            axes.axis("off")
-    figure.savefig(picture_path(FIGURE, options), dpi=100)
-    pyplot.close(figure)
-
-
 def ablation(options: argparse.Namespace) -> str:
     """The part's text; draws the figure."""
-    pictures: dict[str, dict[str, Array]] = {}
-    rows = []
+    shown, rows = [], []
     for scene, frame in scenes(options).items():
         made = {name: SESSION.render(change(frame)) for name, change in VARIANTS.items()}
         mask = made["full"]["Coverage"][..., 0] > 0.999
-        found = pictures[scene] = {name: passes["Combined"] for name, passes in made.items()}
+        found = {name: passes["Combined"] for name, passes in made.items()}
+        shown.append({name: to_srgb(picture[..., :3]) for name, picture in found.items()})
         light = {name: float((picture[mask][:, :3] @ np.array(LUMINANCE)).mean()) for name, picture in found.items()}
         for name in list(VARIANTS)[1:]:
             ratio = light[name] / light["full"]
             rows.append((scene, name, f"{ratio:.3f}", f"{psnr(found[name], found['full'], mask):.1f}"))
-    draw(pictures, options)
+    picture_grid(FIGURE, shown, options)
     return (
         f"{options.ablation_size}x{options.ablation_size}, {options.ablation_rays} rays, mesh as primary surface, "
         f"{BOUNCES} indirect bounces in full. One object: robot, roughness 0.1, metallic 1, forest.exr; composed: "

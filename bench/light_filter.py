@@ -9,7 +9,7 @@ import numpy as np
 from judge import psnr, run_cycles, to_srgb
 from light_cases import FOLDER, Case, Reference
 from light_variance import EQUAL, Noise, chosen
-from report import picture_path, table
+from report import picture_grid, table
 
 from drgs_blender.engine.session import Session
 
@@ -40,22 +40,16 @@ def ours(case: Case, size: int, seeds: int) -> tuple[Reference, list[tuple[Noise
 
 def draw(case: Case, options: argparse.Namespace) -> None:
     """A row as it is and one denoised, a column a filter."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     session = Session()
     key = session.load_asset(case.files[0])
-    figure, rows = pyplot.subplots(2, len(FILTERS), figsize=(9, 6.2), constrained_layout=True)
-    for row, (name, denoise) in zip(rows, (("", "none"), (", SVGF", "svgf")), strict=True):
-        for axes, strength in zip(row, FILTERS, strict=True):
-            frame = case.frame(key, SHOWN_SIZE, SHOWN_SAMPLES, filter_glossy=strength, denoise=denoise)
-            axes.imshow(to_srgb(session.render(frame)["Combined"][..., :3]))
-            axes.set_title(f"{strength:g}{name}", fontsize="small")
-            axes.axis("off")
-    figure.savefig(picture_path(FIGURE, options), dpi=100)
-    pyplot.close(figure)
+
+    def picture(strength: float, denoise: str) -> Array:
+        frame = case.frame(key, SHOWN_SIZE, SHOWN_SAMPLES, filter_glossy=strength, denoise=denoise)
+        return to_srgb(session.render(frame)["Combined"][..., :3])
+
+    ways = ("", "none"), (", SVGF", "svgf")
+    rows = [{f"{strength:g}{name}": picture(strength, denoise) for strength in FILTERS} for name, denoise in ways]
+    picture_grid(FIGURE, rows, options)
 
 
 def filter_glossy(options: argparse.Namespace) -> str:

@@ -87,6 +87,23 @@ def picture_path(name: str, options: argparse.Namespace) -> Path:
     return folder / name
 
 
+def picture_grid(name: str, rows: Sequence[dict[str, Any]], options: argparse.Namespace) -> None:
+    """Write a figure of pictures, (h, w, 3) in [0, 1], sRGB, by row and title, to `picture_path`."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, places = pyplot.subplots(len(rows), len(rows[0]), figsize=(9, 6.2), constrained_layout=True)
+    for line, pictures in zip(places, rows, strict=True):
+        for axes, (title, picture) in zip(line, pictures.items(), strict=True):
+            axes.imshow(picture)
+            axes.set_title(title, fontsize="small")
+            axes.axis("off")
+    figure.savefig(picture_path(name, options), dpi=100)
+    pyplot.close(figure)
+
+
 def section_pattern(name: str) -> re.Pattern[str]:
     """What finds section `name` in the text of docs/benchmarks.md."""
     return re.compile(f"<!-- begin {re.escape(name)} -->.*?<!-- end {re.escape(name)} -->", re.DOTALL)

@@ -302,7 +302,7 @@ class Session:
         self, frame: Frame, jobs: tuple[str, ...], progress: OnProgress | None, cancelled: IsCancelled | None
     ) -> None:
         """Have the kernels compiled that a frame and some jobs besides need."""
-        prepare_kernels(dict.fromkeys((*jobs_of(frame), *self._scene_cache.jobs_of(frame), *jobs)), progress, cancelled)
+        prepare_kernels((*jobs_of(frame), *self._scene_cache.jobs_of(frame), *jobs), progress, cancelled)
 
     def _prepare(
         self,

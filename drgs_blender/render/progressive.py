@@ -268,6 +268,8 @@ class Progressive:
         made = surfaces.passes() | groups.passes(film.seen_environment())
         names = tuple(name for name in self.frame.passes if name not in made)
         made |= film.passes(names, made, components)
+        if "Env" in made:
+            made["Env"] = made["Env"].copy()  # the next step goes on with it
         return {name: made[name] for name in self.frame.passes}
 
 

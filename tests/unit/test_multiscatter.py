@@ -106,7 +106,7 @@ def test_paths_through_any_bsdf_agree() -> None:
 
 
 def test_weights_are_the_material_s_own_without_it() -> None:
-    settings = Settings(0, PRINCIPLED, layer_table(), *energy_tables(), F(0), F(0), 0)
+    settings = Settings(0, PRINCIPLED, layer_table(), *energy_tables())
     given = F(0.6), F(0.9), F(0.3), (F(0.5), F(0.2), F(0.1))
     plain = lobe_weights(*given, False, settings)
     assert plain[1] == (F(0.3),) * 3 and plain[2] == F(0.7)

@@ -56,8 +56,8 @@ class SeenWorld:
             _through(parameters, x0, y0, *seen, envmap, self.veiled[rows])
 
     def behind(self, shadow: Array) -> Array:
-        """(h, w, 3) float32, an array of its own: the light past (h, w) shadows on catchers, from 0 for none to 1."""
-        return self.environment - self.veiled * shadow[..., None] if shadow.any() else self.environment.copy()
+        """(h, w, 3) float32: the light past (h, w) shadows on catchers, from 0 for none to 1."""
+        return self.environment - self.veiled * shadow[..., None] if shadow.any() else self.environment
 
 
 @njit

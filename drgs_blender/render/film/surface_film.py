@@ -96,7 +96,7 @@ class SurfaceFilm:
         diffuse, glossy, passed = (np.zeros((len(points), 3), np.float32) for _ in range(3))
         model = brdf.SHADING_MODELS[self._frame.settings.shading_model]
         geometry = self._scene.geometry
-        settings = Settings(0, model, brdf.layer_table(), *energy_tables(), np.float32(0), np.float32(0), 0)
+        settings = Settings(0, model, brdf.layer_table(), *energy_tables())
         given = points.arrays, geometry, settings, brdf.schlick_table()
         over_range(_lobe_colours, len(points), *given, diffuse, glossy, fewest=ELEMENTS)
         rows = self._scene.mesh_materials.table.rows

@@ -271,7 +271,7 @@ def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: igno
             trace_paths(paths, begun, scene, settings, found)
             deliver(begun, found, settings.clamp, scene.lights, sums)
             begun = np.int64(0)
-        pdf = s[i + w.SHARE] * s[i + w.PC] + (ONE - s[i + w.SHARE]) * s[i + w.PG]
+        pdf = w.mixture_pdf(s, i)
         begin_path(tracer, paths, begun, (position, direction), hit, ints[c + w.KEY], pdf, settings)
         found[begun, CARRIED], found[begun, CARRIED + 1], found[begun, CARRIED + 2] = (
             s[i + w.QR] * rest, s[i + w.QG] * rest, s[i + w.QB] * rest,

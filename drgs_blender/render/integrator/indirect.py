@@ -76,7 +76,7 @@ def begin_path(tracer, paths, slot, start, hit, key, pdf, settings):  # type: ig
     key : uint32
         As of `intersect.put_hit`.
     pdf : float32
-        Density of its direction by the BRDF, both lobes mixed by SHARE, sr^-1; read under `filter_glossy` alone.
+        Of `wavefront.mixture_pdf`, sr^-1; read under `filter_glossy` alone.
     settings : Settings
     """
     put_hit(tracer, paths, slot, start, hit, key, slot)
@@ -159,7 +159,7 @@ def _towards_lights(rays, count, scene, shift, found):  # type: ignore[no-untype
     s, ints = rays
     for slot in range(count):
         i, c = w.at(slot)
-        others = s[i + w.SHARE] * s[i + w.PC] + (ONE - s[i + w.SHARE]) * s[i + w.PG]
+        others = w.mixture_pdf(s, i)
         dr, dg, db, gr, gg, gb = light_radiance(
             rays, slot, others, others, (ONE, ONE), s[i + w.PATH_SET], scene, np.int32(ray_masks.SHADOW << shift)
         )

@@ -148,7 +148,7 @@ def integrate(
     given = Scene(tracer, geometry, envmap, light_tables, traits)
     limits = F(settings.clamp_indirect * settings.subpixel_count * part[1] / sum(counts)), F(settings.filter_glossy)
     tables = brdf.layer_table(), *energy_tables()
-    how = Settings(settings.bounces, brdf.SHADING_MODELS[settings.shading_model], *tables, *limits, 0)
+    how = Settings(settings.bounces, brdf.SHADING_MODELS[settings.shading_model], *tables, *limits)
     seed, sequence = U(hash_seed(settings.seed, noise_index)), sampling.point_set(sum(counts) + 1)
     shares = F(environment_part), F(lights_part), _MAX_LIGHT_SHARE if scene.rays_differ else ONE
     sampler = Sampler._make([seed, sequence, settings.subpixel_count, *part, auto, *map(F, counts), *shares])

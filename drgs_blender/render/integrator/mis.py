@@ -197,6 +197,6 @@ def path_weights(rays, count, light):  # type: ignore[no-untyped-def]
             s[i + w.QR] = s[i + w.TR] * (s[i + w.QR] + s[i + w.SR])
             s[i + w.QG] = s[i + w.TG] * (s[i + w.QG] + s[i + w.SG])
             s[i + w.QB] = s[i + w.TB] * (s[i + w.QB] + s[i + w.SB])
-            density = max(s[i + w.SHARE] * s[i + w.PC] + (ONE - s[i + w.SHARE]) * s[i + w.PG], _TINY)
+            density = max(w.mixture_pdf(s, i), _TINY)
             s[i + w.PG] = density
             s[i + w.PE] = density + light * s[i + w.PE]

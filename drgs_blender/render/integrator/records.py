@@ -97,9 +97,9 @@ class Settings(NamedTuple):
     layers: Array
     energy: Array
     mean_energy: Array
-    clamp: np.float32
-    filter_glossy: np.float32
-    shift: int
+    clamp: np.float32 = np.float32(0.0)
+    filter_glossy: np.float32 = np.float32(0.0)
+    shift: int = 0
 
 
 class Sampler(NamedTuple):

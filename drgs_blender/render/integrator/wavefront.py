@@ -588,6 +588,25 @@ def lobe_shares(rays, count, shading_model):  # type: ignore[no-untyped-def]
             s[i + SHARE] = diffuse_share(mv, (s[i + AR], s[i + AG], s[i + AB]), weights, shading_model)
 
 
+@inlined
+def mixture_pdf(s, i):  # type: ignore[no-untyped-def]
+    """Density of a slot's direction by the BRDF: of both lobes, mixed by SHARE.
+
+    Parameters
+    ----------
+    s : float32 array
+        `Batch.floats`: SHARE, PC and PG are read.
+    i : int64
+        The slot's field 0, of `at`.
+
+    Returns
+    -------
+    float32
+        sr^-1.
+    """
+    return s[i + SHARE] * s[i + PC] + (ONE - s[i + SHARE]) * s[i + PG]
+
+
 @njit
 def fresh_numbers(rays, count, step):  # type: ignore[no-untyped-def]
     """Move on to the next key and hash three random numbers from it.
