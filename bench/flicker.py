@@ -11,7 +11,7 @@ from drgs_blender.core.color import LUMINANCE
 Array = np.ndarray
 
 
-def flicker(pictures: Array, mask: Array, vectors: Array | None = None) -> float:
+def flicker(pictures: Array, mask: Array, vectors: Array | None = None, *, converged: Array | None = None) -> float:
     """Mean absolute second difference in time of what a surface point shows.
 
     A steady change (light that turns, a fade) has none; noise of deviation s, different in each frame, has about 2 s.
@@ -22,12 +22,16 @@ def flicker(pictures: Array, mask: Array, vectors: Array | None = None) -> float
     mask : (n, h, w) bool, pixels to look at
     vectors : (n, h, w, 2) pixels, from each pixel to its surface's place in the frame before; NaN where there is none.
         None when nothing moves
+    converged : (n, h, w, 3) linear, None for nothing
+        What the pictures should show: flicker is then that of their error, which blur does not lower
 
     Returns
     -------
-    float, in sRGB luminance; subtract that of a converged sequence to have what the noise alone does
+    float, in sRGB luminance; without `converged`, subtract that of a converged sequence to have what is beyond it
     """
     shown = [to_srgb(p[..., :3]) @ LUMINANCE for p in pictures]
+    if converged is not None:
+        shown = [p - to_srgb(q[..., :3]) @ LUMINANCE for p, q in zip(shown, converged, strict=True)]
     n, h, w = mask.shape
     total, count = 0.0, 0
     for t in range(2, n):

@@ -26,6 +26,8 @@ Array = np.ndarray
 FOLDER = OUT / "light"
 #: Indirect bounces in every renderer.
 BOUNCES = 1
+#: Pixels a side of the pictures that measure the setup.
+TINY = 8
 #: Sub-pixel positions of our references; other pictures have as many as the settings choose for their rays.
 REFERENCE_AA = 64
 #: Strength of the world, as in the parity bench: hardly a pixel is clipped.

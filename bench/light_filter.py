@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from judge import psnr, run_cycles, to_srgb
 from light_cases import FOLDER, Case, Reference
-from light_variance import EQUAL, Noise, chosen
+from light_variance import EQUAL, chosen, noise_of
+from noise import Noise
 from report import picture_grid, table
 
 from drgs_blender.engine.session import Session
@@ -35,7 +36,7 @@ def ours(case: Case, size: int, seeds: int) -> tuple[Reference, list[tuple[Noise
         picture = session.render(case.frame(key, size, CONVERGED, 1000, filter_glossy=strength))["Combined"]
         found.append((pictures, picture))
     where = Reference.of(found[0][1])
-    return where, [(Noise.of(p, [0.0], Reference(picture, where.mask)), picture) for p, picture in found]
+    return where, [(noise_of(p, [0.0], Reference(picture, where.mask)), picture) for p, picture in found]
 
 
 def draw(case: Case, options: argparse.Namespace) -> None:

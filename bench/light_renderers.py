@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from judge import cycles_pictures, psnr, run_cycles
-from light_cases import BOUNCES, FOLDER, REFERENCE_AA, Case, Plan, Reference, chosen, our_reference
+from light_cases import BOUNCES, FOLDER, REFERENCE_AA, TINY, Case, Plan, Reference, chosen, our_reference
 from noise import EPSILON, relative_mse, time_ratios
 from report import ROOT, table
 
@@ -29,8 +29,6 @@ TRIM = 0.001
 EQUAL = 32
 #: Part of the setup that sampling must take for the difference to be believed.
 LEAST = 0.05
-#: Pixels a side of the pictures that measure the setup.
-TINY = 8
 MITSUBA = ["mitsuba==3.9.*", "numpy"]
 #: Renders one list of jobs, see cycles_job.py; each result has `seconds`.
 Runner = Callable[[list[dict[str, Any]], str], list[dict[str, Any]]]

@@ -1,6 +1,6 @@
 """Scenes that nobody tuned to, for part `cases` of bench_light.py: one mesh each, with all its objects and materials.
 
-The statues are of the development data (see tests/conftest.py); where these are missing, their cases are left out.
+The statues are of the development data (see tests/conftest.py); where these are missing, their cases are refused.
 """
 
 from __future__ import annotations

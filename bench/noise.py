@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -31,14 +32,16 @@ def time_at(seconds: Sequence[float], decibels: Sequence[float], target: float) 
 
     Parameters
     ----------
-    seconds, decibels : of the same pictures; any order; those without seconds (NaN) do not count
+    seconds, decibels : of the same pictures; any order; those without seconds (NaN) do not count, nor do those that
+        took longer than a better one
 
     Returns
     -------
     seconds; NaN where the measured pictures do not enclose the target
     """
     t, q = np.asarray(seconds, float), np.asarray(decibels, float)
-    order = np.argsort(t)[: np.isfinite(t).sum()]
+    best = [i for i in range(len(t)) if np.isfinite(t[i]) and not np.any((t < t[i]) & (q >= q[i]))]
+    order = sorted(best, key=lambda i: (t[i], q[i]))
     t, q = np.log(t[order]), q[order]
     for i in range(len(t) - 1):
         if q[i] <= target <= q[i + 1]:
@@ -55,3 +58,47 @@ def time_ratios(
     """Their time over ours at each dB of `levels` that both reach; the curves are (seconds, decibels)."""
     ratios = {level: time_at(*theirs, level) / time_at(*ours, level) for level in levels}
     return {level: ratio for level, ratio in ratios.items() if np.isfinite(ratio)}
+
+
+@dataclass
+class Noise:
+    """What pictures of one number of samples are worth: dB, relative errors, and processor seconds (median)."""
+
+    decibels: float
+    untrimmed: float
+    trimmed: float
+    seconds: float
+
+
+@dataclass
+class Series:
+    """All that was measured of one renderer on one case."""
+
+    counts: tuple[int, ...]
+    noise: list[Noise]
+    setup: float  # processor seconds of a picture of hardly any pixels
+
+    def at(self, count: int) -> Noise:
+        return self.noise[self.counts.index(count)]
+
+    @property
+    def gain(self) -> float:
+        """dB by four times the samples, over the whole series."""
+        return float(np.polyfit(np.log(self.counts) / np.log(4), [n.decibels for n in self.noise], 1)[0])
+
+    def seconds(self, count: float) -> float:
+        """Processor seconds without the setup of a number of samples, linear between those that were measured.
+
+        A sample costs more where there are few: sub-pixel positions do not grow as fast. So below the least number it
+        costs as much as there, and beyond the largest as much as between the last two.
+        """
+        counts, spent = self.counts, [noise.seconds - self.setup for noise in self.noise]
+        if count > counts[-1]:
+            return spent[-1] + (spent[-1] - spent[-2]) / (counts[-1] - counts[-2]) * (count - counts[-1])
+        return float(np.interp(count, [0, *counts], [0.0, *spent]))
+
+    def time_to(self, error: float) -> float:
+        """Processor seconds of sampling alone until the untrimmed relative error is `error`: log over log, linear."""
+        e = [n.untrimmed for n in self.noise]
+        slope, start = np.polyfit(np.log(e), np.log(self.counts), 1)
+        return self.seconds(float(np.exp(start + slope * np.log(error))))

@@ -56,6 +56,8 @@ def scene_warnings(cache: SceneCache, passes: Collection[str] = ()) -> list[str]
             "nothing lights the scene: it has no lamp that shines, its World gives no light and no material emits "
             "any. Add a lamp, or give the World a colour or an environment image that is not black"
         )
+    if any(light.negative_colour for light in (cache.environment, cache.background) if light is not None):
+        found.append("world: a part of its colour is negative, and counts as 0. Choose a colour of 0 or more")
     bad = sum(light.bad_texels for light in (cache.environment, cache.background) if light is not None)
     if bad:
         found.append(

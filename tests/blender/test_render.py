@@ -212,6 +212,26 @@ def test_animation_writes_every_frame_with_its_pose(ball, scene, tmp_path):
     assert middles[0] < 26 and abs(middles[1] - 32) < 0.5 and middles[2] > 38
 
 
+def test_frames_of_several_layers_stay_and_those_cut_off_go(ball, scene, tmp_path):
+    """Blender cannot read a multilayer EXR back; what is whole by its chunks is kept all the same."""
+    light(scene)
+    scene.view_layers[0].use_pass_z = True
+    image = scene.render.image_settings
+    if hasattr(image, "media_type"):
+        image.media_type = "MULTI_LAYER_IMAGE"
+    image.file_format = "OPEN_EXR_MULTILAYER"
+    scene.frame_start, scene.frame_end = 1, 2
+    scene.render.filepath = str(tmp_path / "layers_####")
+    bpy.ops.render.render(animation=True)
+    files = sorted(tmp_path.glob("layers_*.exr"))
+    assert [path.name for path in files] == ["layers_0001.exr", "layers_0002.exr"]
+    files[0].write_bytes(files[0].read_bytes()[:-200])
+    for number in (1, 2):
+        scene.frame_set(number)
+        part("addon.background_render").verify(scene)
+    assert [path.is_file() for path in files] == [False, True]
+
+
 def test_engine_process_survives_between_renders_and_is_replaced_when_killed(ball, scene):
     light(scene)
     first = render(scene)

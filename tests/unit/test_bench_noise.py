@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,6 +53,12 @@ def test_a_setback_in_quality_takes_the_first_time_the_target_is_reached(noise: 
     assert noise.time_at([1, 2, 4, 8], [30, 34, 33, 36], 34) == pytest.approx(2)
 
 
+def test_a_picture_that_took_longer_than_a_better_one_does_not_count(noise: ModuleType) -> None:
+    # the first was disturbed: a renderer that has 40 dB after one second has 38 dB no later
+    assert noise.time_at([1.7, 1.0, 4.0], [36, 40, 44], 42) == pytest.approx(2.0)
+    assert np.isnan(noise.time_at([1.7, 1.0, 4.0], [36, 40, 44], 38))
+
+
 def test_ratio_of_speeds_is_the_ratio_of_times(noise: ModuleType) -> None:
     ours, theirs = monte_carlo(np.array([8.0, 32, 128]), rate=10), monte_carlo(np.array([16.0, 64, 512]), rate=2.5)
     ratios = noise.time_ratios(ours, theirs, (30, 32, 34, 36, 40, 60))
@@ -83,3 +90,22 @@ def test_only_the_mask_counts(noise: ModuleType) -> None:
     mask = np.ones((8, 8), bool)
     mask[0, 0] = False
     assert noise.relative_mse(picture, reference, mask) == 0
+
+
+def series(noise: ModuleType, counts: tuple[int, ...], seconds: list[float], setup: float) -> Any:
+    """A renderer's figures, whose relative variance is one over the number of samples."""
+    return noise.Series(counts, [noise.Noise(0.0, 1 / n, 1 / n, s) for n, s in zip(counts, seconds)], setup)
+
+
+def test_samples_are_charged_what_they_took_not_what_one_more_does(noise: ModuleType) -> None:
+    """The first samples cost more than later ones: a tenth of a second, then a hundredth each."""
+    found = series(noise, (10, 20, 30), [2.0, 2.1, 2.2], 1.0)
+    assert found.time_to(1 / 10) == pytest.approx(1.0)
+    assert found.time_to(1 / 15) == pytest.approx(1.05)
+    assert found.time_to(1 / 5) == pytest.approx(0.5)
+    assert found.time_to(1 / 50) == pytest.approx(1.4)
+
+
+def test_the_setup_is_no_part_of_sampling(noise: ModuleType) -> None:
+    quick, slow = (series(noise, (8, 32), [setup + 0.8, setup + 3.2], setup) for setup in (0.1, 7.0))
+    assert quick.time_to(1 / 16) == pytest.approx(slow.time_to(1 / 16)) == pytest.approx(1.6)

@@ -59,3 +59,11 @@ def test_only_the_mask_counts(flicker: Callable[..., float]) -> None:
     noise[:, :, W // 2 :] = 0
     assert flicker(grey(0.5 + noise), mask) < 1e-4
     assert flicker(grey(0.5 + noise), ALL & False) == 0.0
+
+
+def test_blur_in_time_has_no_flicker_but_its_error_has(flicker: Callable[..., float]) -> None:
+    there = grey(0.5 + 0.1 * np.cos(np.pi * np.arange(N))[:, None, None])
+    blurred = grey(np.full((1, 1, 1), 0.5))
+    assert flicker(blurred, ALL) < 1e-4
+    assert abs(flicker(blurred, ALL, converged=there) - 0.4) < 1e-3
+    assert flicker(there, ALL, converged=there) == 0.0

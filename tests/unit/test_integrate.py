@@ -298,6 +298,13 @@ def test_roulette_takes_nothing_from_the_mean() -> None:
     assert 4 * np.hypot(a, b) < 0.02 * all_  # roulette starts late: a loss of a fifth a bounce shows as some percent
 
 
+def test_no_bounce_is_waited_for_after_the_last_path() -> None:
+    """A thousand million bounces take no longer than those that paths live for."""
+    scene, seen = scene_of(corner()), points(50, origin=(3, 0, 0))
+    many, enough = (integrate(scene, WHITE, seen, settings(16, 0, 8, bounces=b), 0).total for b in (10**9, 400))
+    np.testing.assert_array_equal(many, enough)
+
+
 def test_a_closed_room_is_dark() -> None:
     box = trimesh.creation.box((2, 2, 2))
     scene = scene_of((box.vertices, box.faces))

@@ -267,6 +267,36 @@ def test_black_worlds_are_black() -> None:
         assert not light.lookup([[0, 0, 1]]).any() and not light.pdf([[0, 0, 1]]).any()
 
 
+@pytest.mark.parametrize("strength", [1e-41, 2e-40, 1e-36, 1e-31])
+def test_nearly_black_worlds_are_black_or_have_densities(strength: float) -> None:
+    light = EnvironmentLight(World(strength=strength))
+    assert np.isfinite(light.pdf([[0, 0, 1]], (0, 0, 1))).all()
+    assert light.black == (not light.lookup([[0, 0, 1]]).any()) == (not light.pdf([[0, 0, 1]]).any())
+
+
+def test_a_negative_part_of_the_colour_takes_nothing_from_the_others() -> None:
+    light = EnvironmentLight(World(colour=(-1.0, 0.5, 1.0)))
+    assert light.negative_colour and light.bad_texels == 0
+    np.testing.assert_allclose(light.lookup([[0, 0, 1]]), [[0, 0.5, 1]])
+
+
+def test_dim_sky_is_left_to_the_samples_of_the_surface() -> None:
+    """MIS compensation (Karlik et al. 2019): of light all alike nothing is to be left out, of dim light most is."""
+    window = np.full((64, 128, 3), 0.2, np.float32)
+    window[8:16, 8:16] = 40.0
+    bright, dim = EnvironmentLight(World()), EnvironmentLight(World(environment=window))
+    around = np.array([[0.0, 0.6, 0.8], [0.6, 0.0, 0.8]], np.float32)  # as steep as each other
+    even = bright.pdf(around, (0, 0, 1))
+    assert even[0] == pytest.approx(even[1], rel=0.2)
+    row, column = 12, 12  # the middle of the window
+    polar, turn = np.pi * row / 64, 2 * np.pi * (0.5 - column / 128)
+    there = np.array([[np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)]], np.float32)
+    assert dim.lookup(there).max() > 30
+    share = dim.pdf(around, (0, 0, 1)) / dim.pdf(there, (0, 0, 1))
+    product = (dim.lookup(around)[:, 0] * around[:, 2]) / (dim.lookup(there)[0, 0] * there[0, 2])
+    assert (share < 0.7 * product).all() and (share > 0.01 * product).all()
+
+
 @pytest.mark.parametrize("strength", [-1.0, 1e39])
 def test_a_strength_that_no_light_has_is_named_and_not_the_pixels(strength: float) -> None:
     with pytest.raises(UsageError, match=r"environment: its strength is .*must be from 0 to 1e\+06"):

@@ -26,9 +26,10 @@ from .sample_allocation import COSINE, ENVIRONMENT, GGX, LIGHTS
 
 #: Rays of a batch: few enough for the second cache, enough to fill vectors.
 BATCH = 512
-#: Columns of a block's sums, once each for what samples of environment and lights find, indirect light, and light of
-#: lights and surfaces that rays met: diffuse and glossy light, then sum and sum of squares of the luminance of each.
-MOMENTS = 6
+#: A block's sums have KIND columns for each kind of light: what samples of environment and lights find, indirect light,
+#: and light of lights and surfaces that rays met. The first six are diffuse and glossy light; from this one on, sum and
+#: sum of squares of the luminance of each follow.
+_LUMINANCE = 6
 
 
 @njit
@@ -106,7 +107,7 @@ def deliver(count, found, limit, lights, sums):  # type: ignore[no-untyped-def]
 def _see_lights(rays, slot, reach, hit, taking_part, scene, sums):  # type: ignore[no-untyped-def]
     """Add reflected light of the lights between a point and its ray's hit, and of the hit's emission, with MIS weights.
 
-    Called before `wavefront.weigh_one`, while the BRDF of the slot is not yet divided by densities.
+    Called before `mis.balance_heuristic_at`, while the BRDF of the slot is not yet divided by densities.
 
     `taking_part` says (1 or 0) whether cosine and GGX sampling do, as in `mis.balance_heuristic`.
     """
@@ -115,7 +116,7 @@ def _see_lights(rays, slot, reach, hit, taking_part, scene, sums):  # type: igno
     i, _ = w.at(slot)
     lights = lights_of(scene.lights, s[i + w.POINT_SET])
     position, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
-    others, share = cosine * s[i + w.WC] * s[i + w.PC] + ggx * s[i + w.WG] * s[i + w.PG], s[i + w.WL]
+    others, share = w.brdf_pdf(s, i, cosine, ggx), s[i + w.WL]
     if not others > ZERO:
         return
     dr, dg, db = lights_along(position, direction, reach, others, share, DIFFUSE, lights)
@@ -265,7 +266,7 @@ def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: igno
         if through == ONE or settings.bounces == 0:
             continue
         # Light of surfaces is found by these strategies alone: the density of the environment's samples goes out again.
-        others = cosine * s[i + w.WC] * s[i + w.PC] + ggx * s[i + w.WG] * s[i + w.PG]
+        others = w.brdf_pdf(s, i, cosine, ggx)
         rest = (ONE - through) * (ONE + s[i + w.WE] * s[i + w.PE] / max(others, F(1e-30)))
         if begun == BATCH:
             trace_paths(paths, begun, scene, settings, found)
@@ -301,8 +302,8 @@ def finish(lights, sums, h, total, components, moments, i):  # type: ignore[no-u
         Its samples.
     components : (n, 4, 3) float32 array
         Row `i` is written, linear Rec.709, see ``Radiance.components``.
-    moments : (n, 5) float32 array
-        Row `i` is written, see ``Radiance.moments``.
+    moments : (n, 5 or more) float32 array
+        Row `i` is written, see ``Radiance.moments``; behind its columns, those of light groups.
     i : int64
         The point among all.
     """
@@ -311,7 +312,7 @@ def finish(lights, sums, h, total, components, moments, i):  # type: ignore[no-u
             c = 3 * lobe + k
             components[i, 2 * lobe, k] = sums[h, c] + sums[h, 2 * KIND + c]
             components[i, 2 * lobe + 1, k] = sums[h, KIND + c]
-        m = MOMENTS + 2 * lobe
+        m = _LUMINANCE + 2 * lobe
         mean, square = ZERO, ZERO
         for kind in range(KINDS):
             mean += sums[h, kind * KIND + m]

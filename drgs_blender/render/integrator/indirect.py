@@ -264,6 +264,8 @@ def trace_paths(rays, count, scene, settings, found):  # type: ignore[no-untyped
             found[owner, k] = ZERO
         clear_groups(lights, found, owner)
     for bounce in range(settings.bounces):
+        if count == 0:
+            return
         _surfaces(rays, count, scene, settings)
         w.lobe_shares(rays, count, shading_model)
         if scene.traits.environment:

@@ -41,6 +41,8 @@ Array = np.ndarray
 #: Largest share of the samples that goes to the light where rays of different kinds meet different objects: there the
 #: picture follows from how strategies are weighed (docs/rendering.md), and this comes closest to Cycles.
 _MAX_LIGHT_SHARE = F(0.25)
+#: Settings beyond are no float32.
+_LARGEST = float(np.finfo(np.float32).max)
 #: Points of a block.
 _BLOCK = 64
 #: Least share of the light samples that go to environment or lights when both shine.
@@ -121,7 +123,9 @@ def integrate(
     if min(counts) < 0 or settings.bounces < 0 or settings.subpixel_samples < 0:
         problem = "samples, bounces or sub-pixel samples are negative"
         raise UsageError("render settings", problem, "Use counts of zero or more")
-    if not all(0.0 <= x < np.inf for x in (settings.clamp_indirect, settings.filter_glossy, settings.noise_threshold)):
+    if not all(
+        0.0 <= x < _LARGEST for x in (settings.clamp_indirect, settings.filter_glossy, settings.noise_threshold)
+    ):
         problem = "Clamp Indirect, Filter Glossy or the noise threshold is no number of at least 0"
         raise UsageError("render settings", problem, "Use 0 for none")
     if settings.shading_model not in brdf.SHADING_MODELS:
@@ -238,7 +242,7 @@ def shade_points(thread, stride, scratch, points, scene, settings, sampler, out)
     settings : Settings
     sampler : Sampler
     out : tuple of array
-        Components (n, 4, 3) and moments (n, 5) of the points' `Radiance`.
+        Components (n, 4, 3) and moments (n, 5 or more, see `direct.finish`) of the points' `Radiance`.
     """
     components, moments = out
     n = len(points.pixel)

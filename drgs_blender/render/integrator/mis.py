@@ -40,8 +40,7 @@ def power_heuristic(own, other):  # type: ignore[no-untyped-def]
 @inlined
 def _weight_over_pdf(s, i, cosine, ggx):  # type: ignore[no-untyped-def]
     """One over the density of all strategies together for the slot at i."""
-    brdf_density = cosine * s[i + w.WC] * s[i + w.PC] + ggx * s[i + w.WG] * s[i + w.PG]
-    return ONE / max(brdf_density + s[i + w.WE] * s[i + w.PE], _TINY)
+    return ONE / max(w.brdf_pdf(s, i, cosine, ggx) + s[i + w.WE] * s[i + w.PE], _TINY)
 
 
 @inlined
@@ -57,7 +56,7 @@ def balance_heuristic_at(s, i, cosine, ggx):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    s : (packets * 48 * LANES,) float32 array
+    s : (packets * 60 * LANES,) float32 array
         `Batch.floats`.
     i : int64
         Index of the slot in it, see `wavefront.at`.
@@ -171,7 +170,7 @@ def terminator_part(s, i, cosine, ggx, settings, envmap):  # type: ignore[no-unt
     """
     if not w.grazing(s, i) > ZERO:
         return ONE
-    others = cosine * s[i + w.WC] * s[i + w.PC] + ggx * s[i + w.WG] * s[i + w.PG]
+    others = w.brdf_pdf(s, i, cosine, ggx)
     own = ONE - _light_weight(s, i, settings, envmap)
     return own * (ONE + s[i + w.WE] * s[i + w.PE] / max(others, _TINY))
 

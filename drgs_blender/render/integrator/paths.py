@@ -240,7 +240,8 @@ def shade_points_by_paths(thread, stride, scratch, points, surfaces, scene, sett
     settings : Settings
     sampler : Sampler
     out : tuple of array
-        Components (n, 4, 3) and moments (n, 5) of the points' `Radiance`, and the transmitted part (n, 2, 3), all 0.
+        Components (n, 4, 3) and moments (n, 5 or more) of the points' `Radiance`, and the transmitted part (n, 2, 3);
+        all 0.
     """
     components, moments, transmitted = out
     n = len(points.pixel)

@@ -15,8 +15,8 @@ from .indirect import lifted
 from .intersect import put_start
 from .multiscatter import has_multiscatter, lobe_weights
 
-#: Strategies in the order of ``RenderSettings``' counts; the samples of the last are divided between environment and
-# lights.
+#: Strategies. ``RenderSettings.strategy_samples`` has three counts: the third is of samples of the light, divided
+#: between environment and lights.
 COSINE, GGX, ENVIRONMENT, LIGHTS = range(4)
 #: Columns of a point's state: start of the rays, alpha squared, normal m, samples of each strategy, weights of the
 #: lobes (diffuse, metal by channel, dielectric).

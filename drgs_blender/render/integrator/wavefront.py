@@ -465,6 +465,16 @@ def moved_part(above, flat, limit):  # type: ignore[no-untyped-def]
 
 
 @inlined
+def _heights(s, i):  # type: ignore[no-untyped-def]
+    """Cosines of a slot's direction with the smooth normal and with the face's."""
+    lx, ly, lz = s[i + LX], s[i + LY], s[i + LZ]
+    ux, uy, uz = s[i + UX], s[i + UY], s[i + UZ]
+    own = ux * ux + uy * uy + uz * uz > ZERO
+    ux, uy, uz = ux if own else s[i + NX], uy if own else s[i + NY], uz if own else s[i + NZ]
+    return ux * lx + uy * ly + uz * lz, s[i + GX] * lx + s[i + GY] * ly + s[i + GZ] * lz
+
+
+@inlined
 def grazing(s, i):  # type: ignore[no-untyped-def]
     """`moved_part` of light along the direction of the slot at i.
 
@@ -480,11 +490,8 @@ def grazing(s, i):  # type: ignore[no-untyped-def]
     float32
         In [0, 1].
     """
-    lx, ly, lz = s[i + LX], s[i + LY], s[i + LZ]
-    ux, uy, uz = s[i + UX], s[i + UY], s[i + UZ]
-    own = ux * ux + uy * uy + uz * uz > ZERO
-    ux, uy, uz = ux if own else s[i + NX], uy if own else s[i + NY], uz if own else s[i + NZ]
-    return moved_part(ux * lx + uy * ly + uz * lz, s[i + GX] * lx + s[i + GY] * ly + s[i + GZ] * lz, s[i + LIMIT])
+    nl, gl = _heights(s, i)
+    return moved_part(nl, gl, s[i + LIMIT])
 
 
 @njit
@@ -505,11 +512,8 @@ def terminate(rays, count):  # type: ignore[no-untyped-def]
     s = rays.floats
     for p in range(packets(count)):
         for i in range(p * PACKET_FLOATS, p * PACKET_FLOATS + LANES):
-            lx, ly, lz, limit = s[i + LX], s[i + LY], s[i + LZ], s[i + LIMIT]
-            ux, uy, uz = s[i + UX], s[i + UY], s[i + UZ]
-            own = ux * ux + uy * uy + uz * uz > ZERO
-            ux, uy, uz = ux if own else s[i + NX], uy if own else s[i + NY], uz if own else s[i + NZ]
-            nl, gl = ux * lx + uy * ly + uz * lz, s[i + GX] * lx + s[i + GY] * ly + s[i + GZ] * lz
+            limit = s[i + LIMIT]
+            nl, gl = _heights(s, i)
             any_light = limit > ZERO and nl > ZERO
             s[i + MOVED] = moved_part(nl, gl, limit)
             below = any_light and gl <= ZERO
@@ -605,6 +609,27 @@ def mixture_pdf(s, i):  # type: ignore[no-untyped-def]
         sr^-1.
     """
     return s[i + SHARE] * s[i + PC] + (ONE - s[i + SHARE]) * s[i + PG]
+
+
+@inlined
+def brdf_pdf(s, i, cosine, ggx):  # type: ignore[no-untyped-def]
+    """Counts times pdfs of cosine and GGX sampling for a slot's direction.
+
+    Parameters
+    ----------
+    s : float32 array
+        `Batch.floats`: WC, WG (counts), PC and PG (pdfs) are read.
+    i : int64
+        The slot's field 0, of `at`.
+    cosine, ggx : float32
+        1 or 0: whether the strategy takes part.
+
+    Returns
+    -------
+    float32
+        sr^-1.
+    """
+    return cosine * s[i + WC] * s[i + PC] + ggx * s[i + WG] * s[i + PG]
 
 
 @njit

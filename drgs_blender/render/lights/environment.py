@@ -26,6 +26,8 @@ Array = np.ndarray
 
 #: Radiance above this is cut: its square is still a float32.
 BRIGHTEST = np.float32(1e15)
+#: An environment of less power, integrated over all directions, is black: one over it is no float32, or hardly.
+_DARKEST = 1e-30
 #: Largest strength of an environment, that of Blender's Background node.
 STRONGEST = 1e6
 
@@ -117,6 +119,8 @@ class EnvironmentLight:
         World direction to environment direction.
     bad_texels : int
         NaN, infinite or negative texels, taken as black; not those of filters that ring, whose negative values are 0.
+    negative_colour : bool
+        Whether a part of the world's colour is negative, taken as 0.
     """
 
     def __init__(self, world: World) -> None:
@@ -136,8 +140,9 @@ class EnvironmentLight:
             )
         self.texels = np.zeros((*image.shape[:2], 4), np.float32)
         found = np.zeros((len(image), 3))
+        self.negative_colour = bool((tint < 0).any())
         with np.errstate(over="ignore"):
-            tinted = tint.astype(np.float32)
+            tinted = np.maximum(tint, 0.0).astype(np.float32)
         over_range(_clean, len(self.texels), plain(image), tinted, False, self.texels, found, fewest=ROWS)
         bad, dark, bright = found.sum(axis=0)
         if bad and dark > -_RINGING * bright:
@@ -146,6 +151,9 @@ class EnvironmentLight:
         self.bad_texels = int(bad)
         self.rotation = np.ascontiguousarray(rotation, np.float32)
         self.cells = Cells(self.texels)
+        if 0.0 < self.cells.power < _DARKEST:
+            self.texels[:] = 0.0
+            self.cells = Cells(self.texels)
         self.row_z = self.cells.edges.astype(np.float32)
         self.product = ProductTables(self.cells)
 

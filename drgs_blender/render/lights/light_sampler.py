@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...compute.jit import njit, plain
+from ...core.errors import first_of
 from ...core.frame import Light
 from ..sampling import ONE, ZERO, F, U
 from ..scene.interaction import emitted
@@ -123,14 +124,18 @@ class Lights:
         self.parts: list[Lights] = []
         rows: list[Array] = []
         kept: list[int] = []
-        self.warnings: list[str] = []
+        left_out: dict[str, list[str]] = {}
         for i, light in enumerate(lights):
             row = light_row(light)
             if isinstance(row, str):
-                self.warnings.append(f"light {light.name!r} is left out: {row}")
+                left_out.setdefault(row, []).append(repr(light.name))
             else:
                 rows.append(row)
                 kept.append(i)
+        self.warnings: list[str] = []
+        for why, names in left_out.items():
+            which = f"light {names[0]} is" if len(names) == 1 else f"{len(names)} lights ({first_of(names)}) are each"
+            self.warnings.append(f"{which} left out: {why}")
         self.warnings += self.emitters.warnings
         self.count = len(rows) + self.emitters.count
         table = np.array(rows, np.float32).reshape(-1, WIDTH)
