@@ -128,7 +128,7 @@ class DrgsSceneSettings(LevelOfDetail, bpy.types.PropertyGroup):
         name="Sub-Pixel Samples",
         description="Positions per pixel among which samples are divided: edges and textures get smoother. 0 chooses: "
         "an eighth of the samples, from 4 to 16, where surfels are visible to the camera; of meshes alone half, "
-        "up to 16, and of more than 64 a quarter, up to 64",
+        "up to 8, and of more than 32 a quarter, up to 64",
         min=0,
         soft_max=64,
         max=1024,
@@ -175,8 +175,8 @@ class DrgsSceneSettings(LevelOfDetail, bpy.types.PropertyGroup):
     )
     use_denoising_data: BoolProperty(
         name="Store Denoising Data",
-        description="Keep the noise and write every pass that the command `drgs denoise` needs to take it out of the "
-        "finished frames, each with the help of its neighbours",
+        description="Keep the noise and have `drgs render` write every pass that `drgs denoise` needs to take it "
+        "out of finished frames, each with the help of its neighbours. That command reads no files that Blender writes",
         default=False,
     )
     blur_steps: IntProperty(

@@ -118,9 +118,12 @@ def compared(options: argparse.Namespace, step: float, environment: str) -> list
     sequence = frames(options, step, environment)
     noisy, windows, coverage = in_windows(sequence)
     # As many positions as there can be: those of few differ from frame to frame, which is flicker of ours.
-    truth = np.stack(rendered(sequence, samples=options.reference, subpixel_samples=64, seed=1000))
+    truth, again = (
+        np.stack(rendered(sequence, samples=options.reference, subpixel_samples=64, seed=seed)) for seed in (1000, 2000)
+    )
     mask = np.stack([foreground(c, 1) for c in coverage])
     ways: dict[str, list[Array]] = {
+        "converged, another seed": list(again),
         "noisy": noisy,
         "SVGF, each frame alone": rendered(sequence, denoise="svgf"),
         "SVGF, over time": rendered(sequence, f"{environment} {step}", denoise="svgf"),

@@ -216,8 +216,8 @@ def subjects_text(options: argparse.Namespace) -> str:
     cases = "; ".join(f"{c.name}: {c.mesh}, {c.materials}, {c.light}" for c in chosen(options))
     return (
         f"{options.size}x{options.size}, {BOUNCES} indirect bounce, 2 threads, {options.seeds} seeds. Subjects: "
-        f"{cases}. Ours: mesh as primary surface, {options.subpixel_samples or 'by the rays'} sub-pixel samples, "
-        f"{_list(options.samples)} samples. "
+        f"{cases}. Ours: mesh as primary surface, sub-pixel samples {options.subpixel_samples or 'as settings choose'}"
+        f", {_list(options.samples)} samples. "
         f"Each program against its own converged picture (ours {options.reference_rays} rays, {REFERENCE_AA} "
         f"sub-pixel samples; "
         f"theirs {options.reference_spp} spp), PSNR in sRGB over the subject (mask eroded by 2 px). Seconds from "

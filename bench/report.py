@@ -23,8 +23,8 @@ HEADER = """# Benchmarks
 
 Every figure here was measured by a program in `bench/`, which wrote its own section over the one before. `make bench`
 runs them all, which takes many hours; in the commands below `python` is that of the checkout, `.venv/bin/python`. Some
-need the development data, the folder that `DRGS_SHARED` names ([CONTRIBUTING](../CONTRIBUTING.md#variables)). Some tables
-have a plot below them in the site that `make docs` builds, drawn from their numbers.
+need the development data, the folder that `DRGS_SHARED` names ([CONTRIBUTING](../CONTRIBUTING.md#variables)). Some
+tables have a plot below them in the site that `make docs` builds, drawn from their numbers.
 """
 
 

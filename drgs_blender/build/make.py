@@ -103,7 +103,7 @@ def _surfel_note(count: int, left: int, most: int, density: float) -> str:
         )
     return (
         f"{left} of {count} surfels are coarser than the textures and normal maps: --max-surfels {most} is reached. "
-        "For more detail give more"
+        "For more detail give a larger number"
     )
 
 

@@ -5,8 +5,9 @@ denoised in the same run: however a sequence is divided among runs and machines,
 is followed, cuts are found by the cameras that the frames name. The first and last frames have fewer neighbours: those
 that are there, or that --sequence names.
 
-The noisy frames come from `drgs render --denoise none --passes temporal`, or from a scene in which Store Denoising
-Data is on. Frames that are already denoised, from the same noisy ones, are skipped.
+The noisy frames come from `drgs render --denoise none --passes temporal`, or from `drgs render` of a scene in which
+Store Denoising Data is on; files that Blender itself writes are not read. Frames that are already denoised, from the
+same noisy ones, are skipped.
 
 The last line is DRGS_EXIT class=ok, or the class of what went wrong.
 """

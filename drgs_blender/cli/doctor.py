@@ -170,6 +170,14 @@ def openexr(args: argparse.Namespace) -> str:
     return f"{version} at {Path(OpenEXR.__file__).parent}"
 
 
+def oidn(args: argparse.Namespace) -> str:
+    """OpenImageDenoise, loaded as its denoisers load it."""
+    from ..render.denoise.oidn import require
+
+    require()
+    return f"pyoidn {importlib.metadata.version('pyoidn')}"
+
+
 def engine(args: argparse.Namespace) -> str:
     """Start an engine process as the extension does, and shake hands."""
     from ..ipc.client import EngineClient, engine_command, locate_engine
@@ -279,6 +287,7 @@ CHECKS: tuple[tuple[str, bool, Callable[[argparse.Namespace], str]], ...] = (
     ("kernels", False, kernels),
     ("Embree", True, embree),
     ("OpenEXR", True, openexr),
+    ("OIDN", False, oidn),
     ("engine", True, engine),
     ("Blender", False, blender),
     ("scikit-image", False, scikit_image),

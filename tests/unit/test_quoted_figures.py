@@ -22,6 +22,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 def sections() -> dict[str, str]:
     """Text of the benchmarks below each heading, by the name that links have."""
     text = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    text = re.sub(r"^`.*` · \d{4}-\d\d-\d\d · .*$", "", text, flags=re.MULTILINE)  # command, date, machine
     parts = re.split(r"^## (.+)\n", text, flags=re.MULTILINE)
     names = (re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in parts[1::2])
     return dict(zip(names, parts[2::2], strict=True))

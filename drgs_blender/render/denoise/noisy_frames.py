@@ -29,7 +29,7 @@ Array = np.ndarray
 SAME_CAMERA = 1e-4
 #: Passes of newer versions, which add to the others.
 _LATER = ("TransDir", "TransInd", "TransCol", "Object")
-_HOW = "Render it with `drgs render --denoise none --passes temporal`, or with Store Denoising Data switched on"
+_HOW = "Render it with `drgs render --denoise none --passes temporal`, or with Store Denoising Data of its scene on"
 
 
 @dataclass(slots=True)

@@ -33,6 +33,11 @@ Array = np.ndarray
 
 PREFIX = "drgs:"
 _CHECKSUM = "crc32"
+#: What is wrong with a file of others, and what to do.
+_FOREIGN = (
+    "was not written by DR-GS's commands",
+    "Frames to be read come from `drgs render`, not from Blender itself; to write, choose another folder or file name",
+)
 _LARGEST_HALF = 65504.0
 #: What OpenEXR raises when a file is absent, damaged or cannot be written; the kind says nothing about the cause.
 _FAILURES = (OSError, RuntimeError, ValueError, TypeError)
@@ -115,7 +120,7 @@ def read_frame(path: str | Path) -> tuple[dict[str, Array], dict[str, str]]:
     metadata = {k.removeprefix(PREFIX): v for k, v in texts.items()}
     checksum = metadata.pop(_CHECKSUM, None)
     if checksum is None:
-        raise AssetError(str(path), "was not written by DR-GS", "Choose another output folder or file name")
+        raise AssetError(str(path), *_FOREIGN)
     if checksum != _checksum(channels, metadata):
         raise AssetError(str(path), "is damaged: its checksum does not fit", "Render this frame again")
     passes: dict[str, Array] = {}
@@ -154,7 +159,7 @@ def read_checksum(path: str | Path) -> str:
     except _FAILURES as error:
         raise AssetError(str(path), f"cannot be read as OpenEXR ({error})", "Render this frame again") from error
     if not isinstance(checksum, str):
-        raise AssetError(str(path), "was not written by DR-GS", "Choose another output folder or file name")
+        raise AssetError(str(path), *_FOREIGN)
     return checksum
 
 
