@@ -11,16 +11,18 @@ from ...compute.jit import njit
 from ...compute.threads import over_strided
 from ..camera import CLIP_END, CLIP_START, WIDTH, pixel_shift, sample_ray
 from ..sampling import F
+from ..scene.embree import packet_address
 from ..scene.interaction import nearest, position_at, surface_at
 from ..scene.ray import Hit, Ray
 from ..scene.see_through import MOST, nearest_there
 from ..scene.trace_scene import TraceScene
+from .camera_packets import BLOCK, trace_packets
 from .gbuffer import GBuffer, face_viewer
 
 Array = np.ndarray
 
 #: Samples or points of a block.
-_BLOCK = 256
+_BLOCK = BLOCK
 #: Step of the third coordinate of a pixel's lattice, and what makes another hash of its first.
 _SILVER, _HASHED = 0.41421356237309503, 65521.0
 _BELOW_ONE = F(1.0 - 2.0**-24)
@@ -82,7 +84,8 @@ def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: 
         over_strided(_trace_through, blocks, seen, view_of, np.int32(mask), owners, (*hits.arrays, cut), calls=8)
         scene.cut.update(np.flatnonzero(cut).tolist())
         return hits
-    over_strided(_trace, blocks, scene.tracer, view_of, np.int32(mask), owners, hits.arrays, calls=8)
+    packets = packet_address()
+    over_strided(_trace, blocks, packets, scene.tracer, view_of, np.int32(mask), owners, hits.arrays, calls=8)
     return hits
 
 
@@ -106,9 +109,12 @@ def arrays_of(buffer: GBuffer) -> tuple[tuple[Array, ...], tuple[tuple[Array, ..
 
 
 @njit
-def _trace(first, last, stride, tracer, view_of, mask, owners, out):  # type: ignore[no-untyped-def]
+def _trace(first, last, stride, packets, tracer, view_of, mask, owners, out):  # type: ignore[no-untyped-def]
     for thread in range(first, last):
-        trace_samples(thread, stride, None, tracer, view_of, mask, owners, out)
+        if packets != 0:
+            trace_packets(thread, stride, packets, tracer, view_of, mask, owners, out)
+        else:
+            trace_samples(thread, stride, None, tracer, view_of, mask, owners, out)
 
 
 @njit

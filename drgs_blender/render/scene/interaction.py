@@ -100,11 +100,31 @@ def nearest(tracer, ray):  # type: ignore[no-untyped-def]
     Hit
     """
     t, group, face, instance, u, v, gx, gy, gz = trace(tracer.intersect, tracer.scene, ray)
+    face, instance = numbered(tracer, group, face, instance)
+    return Hit(t, face, instance, u, v, gx, gy, gz)
+
+
+@njit
+def numbered(tracer, group, face, instance):  # type: ignore[no-untyped-def]
+    """Face and instance of a hit as the scene numbers them.
+
+    Parameters
+    ----------
+    tracer : Tracer
+        Or anything that has its fields.
+    group, face, instance : int32
+        As of `embree.trace`.
+
+    Returns
+    -------
+    face, instance : int32
+        -1 as they were: nothing is met, or no instance.
+    """
     if group >= 0:
         face = np.int32(face + load_int32(tracer.first_face, group))
         if instance >= 0:
             instance = np.int32(instance + load_int32(tracer.first_instance, group))
-    return Hit(t, face, instance, u, v, gx, gy, gz)
+    return face, instance
 
 
 @njit
