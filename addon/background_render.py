@@ -14,7 +14,7 @@ import bpy
 import imbuf
 
 from ..drgs_blender.core.errors import EXIT_CANNOT_WRITE, EXIT_CLASSES
-from ..drgs_blender.core.file_integrity import EXR, is_whole
+from ..drgs_blender.core.file_integrity import is_exr, is_whole
 from ..drgs_blender.core.phases import is_preparing
 from ..drgs_blender.core.switches import is_on
 from . import engine_link, messages
@@ -65,9 +65,8 @@ def _readable(path: Path) -> bool:
     """Whether a picture is whole, and Blender can decode it."""
     if not is_whole(path):  # looked at first: of a part of a file Blender makes a picture, or crashes
         return False
-    with path.open("rb") as file:
-        if file.read(len(EXR)) == EXR:  # every chunk of it is there; Blender's imbuf decodes none of several layers
-            return True
+    if is_exr(path):  # every chunk of it is there; Blender's imbuf decodes none of several layers
+        return True
     try:
         picture = imbuf.load(str(path))
     except (ValueError, OSError):

@@ -78,9 +78,19 @@ def crashes_blender(file: str | os.PathLike[str] | bytes) -> bool:
     file : str, path-like or bytes
         Its path, or its bytes.
     """
+    return is_exr(file) and not is_whole(file)
+
+
+def is_exr(file: str | os.PathLike[str] | bytes) -> bool:
+    """Whether a file begins as an OpenEXR file does.
+
+    Parameters
+    ----------
+    file : str, path-like or bytes
+        Its path, or its bytes.
+    """
     with _opened(file) as stream:
-        start = stream.read(4)
-    return start == EXR and not is_whole(file)
+        return stream.read(len(EXR)) == EXR
 
 
 def _opened(file: str | os.PathLike[str] | bytes) -> BinaryIO:

@@ -369,6 +369,9 @@ class MeshState:
     vertex_normals: Array | None = None
 
 
+LightKind = Literal["point", "sun", "spot", "area"]
+
+
 @dataclass(slots=True)
 class Light:
     """One of Blender's lights. The quantities are those of Blender's panel; the engine turns them into radiance.
@@ -412,7 +415,7 @@ class Light:
     """
 
     name: str
-    kind: Literal["point", "sun", "spot", "area"]
+    kind: LightKind
     matrix_world: Array
     colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
     power: float = 10.0

@@ -56,9 +56,10 @@ def scene_warnings(cache: SceneCache, passes: Collection[str] = ()) -> list[str]
             "nothing lights the scene: it has no lamp that shines, its World gives no light and no material emits "
             "any. Add a lamp, or give the World a colour or an environment image that is not black"
         )
-    if any(light.negative_colour for light in (cache.environment, cache.background) if light is not None):
+    worlds = [light for light in (cache.environment, cache.background) if light is not None]
+    if any(light.negative_colour for light in worlds):
         found.append("world: a part of its colour is negative, and counts as 0. Choose a colour of 0 or more")
-    bad = sum(light.bad_texels for light in (cache.environment, cache.background) if light is not None)
+    bad = sum(light.bad_texels for light in worlds)
     if bad:
         found.append(
             f"world: {bad} pixels of the environment are negative, infinite or no number, and "

@@ -16,7 +16,7 @@ from ..scene.interaction import nearest, position_at, surface_at
 from ..scene.ray import Hit, Ray
 from ..scene.see_through import MOST, nearest_there
 from ..scene.trace_scene import TraceScene
-from .camera_packets import BLOCK, trace_packets
+from .camera_packets import BLOCK, put_hit, trace_packets
 from .gbuffer import GBuffer, face_viewer
 
 Array = np.ndarray
@@ -149,10 +149,9 @@ def trace_samples(thread, stride, scratch, tracer, view_of, mask, owners, out): 
         `MeshHits.arrays`.
     """
     p, x0, y0 = view_of
-    face_object, instance_object = owners
-    depth, owner, face, instance, where = out
+    owner = out[1]
     width = np.int64(p[WIDTH])
-    rows, columns, subpixels = depth.shape
+    rows, columns, subpixels = owner.shape
     near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
     count = rows * columns * subpixels
     for block in range(thread, (count + _BLOCK - 1) // _BLOCK, stride):
@@ -163,15 +162,7 @@ def trace_samples(thread, stride, scratch, tracer, view_of, mask, owners, out): 
                 owner[y, x, k] = -1
                 continue
             start, along = (F(ox), F(oy), F(oz)), (F(dx), F(dy), F(dz))
-            t, f, i, u, v, gx, gy, gz = nearest(tracer, Ray(start, along, near, far, mask))
-            depth[y, x, k], face[y, x, k], instance[y, x, k] = t, f, i
-            where[y, x, k, 0], where[y, x, k, 1] = u, v
-            where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4] = gx, gy, gz
-            owner[y, x, k] = -1
-            if f >= 0 and i >= 0:
-                owner[y, x, k] = instance_object[i]
-            elif f >= 0:
-                owner[y, x, k] = face_object[f]
+            put_hit((y, x, k), nearest(tracer, Ray(start, along, near, far, mask)), owners, out)
 
 
 @njit
@@ -191,10 +182,10 @@ def trace_through_samples(thread, stride, scratch, seen, view_of, mask, owners, 
     """
     tracer, geometry = seen
     p, x0, y0 = view_of
-    face_object, instance_object = owners
     depth, owner, face, instance, where, cut = out
+    found = depth, owner, face, instance, where
     width = np.int64(p[WIDTH])
-    rows, columns, subpixels = depth.shape
+    rows, columns, subpixels = owner.shape
     near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
     count = rows * columns * subpixels
     for block in range(thread, (count + _BLOCK - 1) // _BLOCK, stride):
@@ -209,15 +200,7 @@ def trace_through_samples(thread, stride, scratch, seen, view_of, mask, owners, 
             number = number - math.floor(number)
             ray = Ray((F(ox), F(oy), F(oz)), (F(dx), F(dy), F(dz)), near, far, mask)
             t, f, i, u, v, gx, gy, gz, passed = nearest_there(tracer, ray, geometry, min(F(number), _BELOW_ONE))
-            depth[y, x, k], face[y, x, k], instance[y, x, k] = t, f, i
-            where[y, x, k, 0], where[y, x, k, 1] = u, v
-            where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4] = gx, gy, gz
-            who = np.int32(-1)
-            if f >= 0 and i >= 0:
-                who = instance_object[i]
-            elif f >= 0:
-                who = face_object[f]
-            owner[y, x, k] = who
+            who = put_hit((y, x, k), Hit(t, f, i, u, v, gx, gy, gz), owners, found)
             if who >= 0 and passed >= MOST:
                 cut[who] = 1
 

@@ -8,9 +8,42 @@ from ...compute.jit import njit
 from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
 from ..scene import embree as e
 from ..scene.interaction import numbered
+from ..scene.ray import Hit
 
 #: Samples or points of a block: whole packets.
 BLOCK = 256
+
+
+@njit
+def put_hit(at, hit, owners, out):  # type: ignore[no-untyped-def]
+    """Write what a sample's ray meets.
+
+    Parameters
+    ----------
+    at : tuple of int64
+        Row, column and number of the sample.
+    hit : Hit
+    owners, out : tuple
+        As of `camera_hits.trace_samples`.
+
+    Returns
+    -------
+    int32
+        The object, or -1.
+    """
+    y, x, k = at
+    face_object, instance_object = owners
+    depth, owner, face, instance, where = out
+    depth[y, x, k], face[y, x, k], instance[y, x, k] = hit.t, hit.face, hit.instance
+    where[y, x, k, 0], where[y, x, k, 1] = hit.u, hit.v
+    where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4] = hit.gx, hit.gy, hit.gz
+    who = np.int32(-1)
+    if hit.face >= 0 and hit.instance >= 0:
+        who = instance_object[hit.instance]
+    elif hit.face >= 0:
+        who = face_object[hit.face]
+    owner[y, x, k] = who
+    return who
 
 
 @njit
@@ -26,10 +59,9 @@ def trace_packets(thread, stride, packets, tracer, view_of, mask, owners, out): 
         As of `camera_hits.trace_samples`.
     """
     p, x0, y0 = view_of
-    face_object, instance_object = owners
-    depth, owner, face, instance, where = out
+    owner = out[1]
     width = np.int64(p[WIDTH])
-    rows, columns, subpixels = depth.shape
+    rows, columns, subpixels = owner.shape
     near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
     count = rows * columns * subpixels
     memory = np.zeros(e.PACKET_WORDS + 16, np.float32)
@@ -69,11 +101,7 @@ def trace_packets(thread, stride, packets, tracer, view_of, mask, owners, out): 
                 if place >= 0:
                     group, its = place, words[e.INSTANCE_PRIMITIVE + i]
                 f, its = numbered(tracer, group, words[e.PRIMITIVE + i], its)
-                depth[y, x, k], face[y, x, k], instance[y, x, k] = rays[e.TFAR + i], f, its
-                where[y, x, k, 0], where[y, x, k, 1] = rays[e.U + i], rays[e.V + i]
-                for c in range(3):
-                    where[y, x, k, 2 + c] = rays[e.NORMAL + c * e.PACKET + i]
-                if f >= 0 and its >= 0:
-                    owner[y, x, k] = instance_object[its]
-                elif f >= 0:
-                    owner[y, x, k] = face_object[f]
+                normal = e.NORMAL + i
+                gx, gy, gz = rays[normal], rays[normal + e.PACKET], rays[normal + 2 * e.PACKET]
+                hit = Hit(rays[e.TFAR + i], f, its, rays[e.U + i], rays[e.V + i], gx, gy, gz)
+                put_hit((y, x, k), hit, owners, out)

@@ -8,12 +8,13 @@ measured in Cycles of Blender 5.0.1 (see docs/rendering.md).
 from __future__ import annotations
 
 import math
+from typing import get_args
 
 import numpy as np
 
 from ...compute.jit import njit
 from ...core.color import LUMINANCE
-from ...core.frame import Light
+from ...core.frame import Light, LightKind
 from ..sampling import HALF, ONE, PI, TWO, ZERO, F, basis, sincos_turns, unit
 from .environment import BRIGHTEST
 
@@ -31,9 +32,6 @@ WIDTH = 28
 
 #: Kinds. A soft point is a disk that faces the shading point; rays do not hit the two without size.
 BARE_POINT, BARE_SUN, SOFT_POINT, SPHERE, SUN, RECTANGLE, ELLIPSE = range(7)
-
-#: Those of `Light`.
-_KINDS = ("point", "sun", "spot", "area")
 
 #: Bits of FLAGS: rays that see the light, and whether things block it.
 CAMERA, DIFFUSE, GLOSSY, SHADOW = 1, 2, 4, 8
@@ -53,8 +51,8 @@ def light_row(light: Light) -> Array | str:
     shape = (light.radius, light.angle, light.spot_size, light.spot_blend, light.size_x, light.size_y, light.spread)
     if not (np.isfinite(matrix).all() and np.isfinite(colour).all() and np.isfinite(shape).all()):
         return "a setting is not finite"
-    if light.kind not in _KINDS:
-        return f"its kind {light.kind!r} is none of {', '.join(_KINDS)}"
+    if light.kind not in (kinds := get_args(LightKind)):
+        return f"its kind {light.kind!r} is none of {', '.join(kinds)}"
     if light.power < 0:
         return "its power is negative"
     if not colour.max() > 0:
