@@ -118,7 +118,13 @@ def write_section(name: str, title: str, body: str) -> None:
         f"{begin}\n## {title}\n\n{body.strip()}\n\n`{command_line()}` · {date.today().isoformat()} · {machine()}\n{end}"
     )
     pattern = section_pattern(name)
-    if pattern.search(text):
+    if before := pattern.search(text):
+        rows = [len(re.findall(r"^\|", part, re.MULTILINE)) for part in (before.group(), section)]
+        if rows[1] < rows[0]:  # those that a program keeps from run to run in `OUT` are not in a fresh clone
+            print(
+                f"{name}: {rows[0] - rows[1]} lines of the table before are gone: `git diff` shows them",
+                file=sys.stderr,
+            )
         text = pattern.sub(lambda _: section, text)
     else:
         text = text.rstrip() + "\n\n" + section + "\n"

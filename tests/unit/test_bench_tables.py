@@ -14,6 +14,7 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / "bench"))
 import bench_asset
 import bench_baselines
 import bench_materials
+import report
 from bench_evaluate import similarity
 from report import table
 
@@ -46,6 +47,15 @@ def test_rows_of_earlier_runs_have_dashes_in_columns_that_they_lack():
     head, rule, old = table(columns, [("spot", "DR-GS", "1", "2", "3", "4")]).splitlines()
     assert head.count("|") == rule.count("|") == old.count("|") == len(columns) + 1
     assert old.endswith("| 4 | - | - |")
+
+
+def test_rows_that_a_section_loses_are_told(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(report, "DOCUMENT", tmp_path / "benchmarks.md")
+    rows = [("cat", 1), ("helmet", 2)]
+    for count, told in ((2, ""), (2, ""), (1, "1 lines of the table before are gone")):
+        report.write_section("some", "Some", table(("Scene", "dB"), rows[:count]))
+        said = capsys.readouterr().err
+        assert told in said and bool(said) == bool(told)
 
 
 def test_rows_of_some_scenes_go_where_the_order_has_them_and_the_others_stay():
