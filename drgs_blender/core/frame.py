@@ -482,7 +482,8 @@ class RenderSettings:
         Indirect bounces.
     subpixel_samples : int
         Sub-pixel samples: anti-aliasing positions per pixel, which share its samples; 0 chooses by their number
-        (`subpixel_count`), in a session as of "mesh" where the camera sees no surfels anyway.
+        (`subpixel_count`), in a session as of "mesh" where the camera sees no surfels anyway. Where they are more than
+        the samples, some have none: the mean is right, but noisier.
     camera_sees, rays_see : {"surfels", "mesh"}
         Representation of DR-GS objects for camera rays, and for shadow and indirect rays: their meshes, or the
         surfels, blended along each ray (slower; for thin things without a good mesh). With "surfels" and "mesh" light

@@ -48,12 +48,13 @@ def check_camera(camera: Camera) -> None:
         refuse(f"the picture has {camera.width} x {camera.height} pixels", "Render it in several parts")
     if problem := lens_problem(camera):
         refuse(problem, "Check the camera's panorama type, field of view and lens")
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-    if not np.isfinite(intrinsics).all() or camera.fx <= 0 or camera.fy <= 0:
+    if not all(math.isfinite(focal) and focal > 0 for focal in (camera.fx, camera.fy)):
         refuse(
             f"its focal lengths are {camera.fx:g} and {camera.fy:g} pixels",
             "Check focal length, sensor size, orthographic scale and pixel aspect",
         )
+    if not (math.isfinite(camera.cx) and math.isfinite(camera.cy)):
+        refuse(f"its principal point is at {camera.cx:g}, {camera.cy:g} pixels", "Check the camera's shift")
     if not (math.isfinite(camera.clip_start) and camera.clip_end > camera.clip_start):
         refuse(f"it clips from {camera.clip_start:g} to {camera.clip_end:g}", "Let the clip end exceed the clip start")
     if camera.clip_start <= 0 and not camera.orthographic:

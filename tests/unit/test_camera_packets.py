@@ -1,8 +1,9 @@
-"""Camera rays eight at a time meet what single ones meet, to the bit."""
+"""Camera rays eight at a time meet what single ones meet, to the bit, and the same in every tile."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ CAMERAS = {
     "orthographic": look_along_y(61, focal=12.0, orthographic=True),
     "clipped": look_along_y(61, clip_start=2.2, clip_end=4.4),
     "fisheye": replace(look_along_y(61), panorama="fisheye", fov=2.0),
+    "equirectangular": replace(look_along_y(61), panorama="equirectangular"),
 }
 
 
@@ -47,17 +49,52 @@ def instances() -> TraceScene:
     return scene
 
 
+def twice() -> TraceScene:
+    """A ball, a wall that is there twice, as two instances, and once more as another mesh."""
+    vertices, faces = sphere_mesh(4)
+    shades = np.full((len(vertices), 3), 0.5, np.float32), np.full(len(vertices), 0.6), np.zeros(len(vertices))
+    corners = np.float32([[-2, 2, -2], [2, 2, -2], [2, 2, 2], [-2, 2, 2]])
+    walls = [
+        MeshState(name, corners, np.int32([[0, 1, 2], [0, 2, 3]]), np.tile(np.eye(4), (n, 1, 1)), np.arange(n))
+        for name, n in (("two", 2), ("third", 1))
+    ]
+    scene = TraceScene()
+    scene.update([TraceObject("ball", vertices, faces, *shades)], walls)
+    return scene
+
+
+def find(scene: TraceScene, camera: Camera, x0: int, y0: int, shape: tuple[int, int, int]) -> camera_hits.MeshHits:
+    settings = RenderSettings(subpixel_samples=shape[2], camera_sees="mesh", seed=5)
+    return camera_hits.trace_camera(scene, camera_parameters(camera, settings, 2), x0, y0, shape, CAMERA)
+
+
+def test_processors_with_avx2_trace_packets() -> None:
+    info = Path("/proc/cpuinfo")
+    if not info.exists() or " avx2 " not in info.read_text():
+        pytest.skip("not known to have AVX2")
+    assert packet_address() != 0
+
+
 @pytest.mark.skipif(packet_address() == 0, reason="Embree traces no packets of eight rays on this processor")
+@pytest.mark.parametrize("subpixels", [8, 16])
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
-def test_packets_find_what_single_rays_find(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene, subpixels = instances(), 3
-    parameters = camera_parameters(camera, RenderSettings(subpixel_samples=subpixels, camera_sees="mesh", seed=5), 2)
-    shape = (61, 61, subpixels)  # the last packet is not full
-    packets = camera_hits.trace_camera(scene, parameters, 0, 0, shape, CAMERA)
+def test_packets_find_what_single_rays_find(camera: Camera, subpixels: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, tile = instances(), (7, 5, (43, 51, subpixels))
+    packets = find(scene, camera, *tile)
     monkeypatch.setattr(camera_hits, "packet_address", lambda: 0)
-    single = camera_hits.trace_camera(scene, parameters, 0, 0, shape, CAMERA)
+    single = find(scene, camera, *tile)
     np.testing.assert_array_equal(packets.owner, single.owner)
     met = single.owner >= 0
     assert len(np.unique(single.owner[met])) >= 3 and not met.all()
     for found, expected in zip(packets.arrays, single.arrays, strict=True):
         np.testing.assert_array_equal(found[met], expected[met])
+
+
+@pytest.mark.parametrize("subpixels", [1, 4, 8])
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+def test_surfaces_in_one_place_are_met_alike_in_every_tile(camera: Camera, subpixels: int) -> None:
+    whole, part = (find(twice(), camera, x0, y0, (61 - y0, 61 - x0, subpixels)) for x0, y0 in ((0, 0), (3, 1)))
+    met = part.owner >= 0
+    assert met.sum() > 1000
+    for found, expected in zip(part.arrays, whole.arrays, strict=True):
+        np.testing.assert_array_equal(found[met], expected[1:, 3:][met])

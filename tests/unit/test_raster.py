@@ -324,23 +324,25 @@ def test_clipping() -> None:
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "named"),
     [
-        {"fx": 0.0},
-        {"fy": float("nan")},
-        {"width": 0},
-        {"width": 10**6},
-        {"clip_start": 0.0},
-        {"clip_end": 1e-4},
-        {"region": (5, 5, 5, 9)},
-        {"region": (0, 0, 33, 8)},
-        {"matrix_world": np.diag([2.0, 1, 1, 1])},
-        {"matrix_world": np.full((4, 4), np.nan)},
+        ({"fx": 0.0}, "focal lengths"),
+        ({"fy": float("nan")}, "focal lengths"),
+        ({"cx": float("nan")}, "principal point"),
+        ({"cy": float("inf")}, "principal point"),
+        ({"width": 0}, "pixels"),
+        ({"width": 10**6}, "pixels"),
+        ({"clip_start": 0.0}, "clip start"),
+        ({"clip_end": 1e-4}, "clips from"),
+        ({"region": (5, 5, 5, 9)}, "region"),
+        ({"region": (0, 0, 33, 8)}, "region"),
+        ({"matrix_world": np.diag([2.0, 1, 1, 1])}, "scales or shears"),
+        ({"matrix_world": np.full((4, 4), np.nan)}, "matrix is not"),
     ],
 )
-def test_cameras_that_cannot_see_are_refused(change: dict[str, object]) -> None:
+def test_cameras_that_cannot_see_are_refused(change: dict[str, object], named: str) -> None:
     camera = replace(look_along_y(32, 32), **change)
-    with pytest.raises(UsageError, match="camera"):
+    with pytest.raises(UsageError, match=f"camera: .*{named}"):
         camera_parameters(camera, RenderSettings(), 1)
 
 

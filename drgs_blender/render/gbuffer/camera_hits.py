@@ -11,7 +11,7 @@ from ...compute.jit import njit
 from ...compute.threads import over_strided
 from ..camera import CLIP_END, CLIP_START, WIDTH, pixel_shift, sample_ray
 from ..sampling import F
-from ..scene.embree import packet_address
+from ..scene.embree import PACKET, packet_address
 from ..scene.interaction import nearest, position_at, surface_at
 from ..scene.ray import Hit, Ray
 from ..scene.see_through import MOST, nearest_there
@@ -21,8 +21,6 @@ from .gbuffer import GBuffer, face_viewer
 
 Array = np.ndarray
 
-#: Samples or points of a block.
-_BLOCK = BLOCK
 #: Step of the third coordinate of a pixel's lattice, and what makes another hash of its first.
 _SILVER, _HASHED = 0.41421356237309503, 65521.0
 _BELOW_ONE = F(1.0 - 2.0**-24)
@@ -75,7 +73,7 @@ def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: 
         hits.owner[:] = -1
         return hits
     owners = scene.face_object, scene.instance_object
-    blocks = -(-owner.size // _BLOCK)
+    blocks = -(-owner.size // BLOCK)
     view_of = parameters, x0, y0
     if scene.mesh_materials.table.clear:
         # Another kernel, so that scenes without see-through surfaces do not wait for it to be compiled.
@@ -84,8 +82,8 @@ def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: 
         over_strided(_trace_through, blocks, seen, view_of, np.int32(mask), owners, (*hits.arrays, cut), calls=8)
         scene.cut.update(np.flatnonzero(cut).tolist())
         return hits
-    packets = packet_address()
-    over_strided(_trace, blocks, packets, scene.tracer, view_of, np.int32(mask), owners, hits.arrays, calls=8)
+    entry = packet_address() if shape[2] % PACKET == 0 else 0
+    over_strided(_trace, blocks, entry, scene.tracer, view_of, np.int32(mask), owners, hits.arrays, calls=8)
     return hits
 
 
@@ -94,7 +92,7 @@ def shade_mesh(scene: TraceScene, hits: MeshHits, parameters: Array, x0: int, bu
     moving = scene.vertices, scene.faces, scene.instances
     view_of = parameters, x0, buffer.rows[0]
     keys, out = arrays_of(buffer)
-    blocks = -(-len(keys[0]) // _BLOCK)
+    blocks = -(-len(keys[0]) // BLOCK)
     over_strided(_shade, blocks, scene.geometry, moving, view_of, layer, hits.arrays, keys, out, calls=8)
 
 
@@ -109,10 +107,10 @@ def arrays_of(buffer: GBuffer) -> tuple[tuple[Array, ...], tuple[tuple[Array, ..
 
 
 @njit
-def _trace(first, last, stride, packets, tracer, view_of, mask, owners, out):  # type: ignore[no-untyped-def]
+def _trace(first, last, stride, entry, tracer, view_of, mask, owners, out):  # type: ignore[no-untyped-def]
     for thread in range(first, last):
-        if packets != 0:
-            trace_packets(thread, stride, packets, tracer, view_of, mask, owners, out)
+        if entry != 0:
+            trace_packets(thread, stride, entry, tracer, view_of, mask, owners, out)
         else:
             trace_samples(thread, stride, None, tracer, view_of, mask, owners, out)
 
@@ -154,8 +152,8 @@ def trace_samples(thread, stride, scratch, tracer, view_of, mask, owners, out): 
     rows, columns, subpixels = owner.shape
     near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
     count = rows * columns * subpixels
-    for block in range(thread, (count + _BLOCK - 1) // _BLOCK, stride):
-        for n in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
+    for block in range(thread, (count + BLOCK - 1) // BLOCK, stride):
+        for n in range(block * BLOCK, min((block + 1) * BLOCK, count)):
             x, y, k = n // subpixels % columns, n // (subpixels * columns), n % subpixels
             ox, oy, oz, dx, dy, dz = sample_ray(p, (y0 + y) * width + x0 + x, k)
             if dx * dx + dy * dy + dz * dz == 0.0:  # beyond the picture of a fisheye lens
@@ -188,8 +186,8 @@ def trace_through_samples(thread, stride, scratch, seen, view_of, mask, owners, 
     rows, columns, subpixels = owner.shape
     near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
     count = rows * columns * subpixels
-    for block in range(thread, (count + _BLOCK - 1) // _BLOCK, stride):
-        for n in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
+    for block in range(thread, (count + BLOCK - 1) // BLOCK, stride):
+        for n in range(block * BLOCK, min((block + 1) * BLOCK, count)):
             x, y, k = n // subpixels % columns, n // (subpixels * columns), n % subpixels
             pixel = (y0 + y) * width + x0 + x
             ox, oy, oz, dx, dy, dz = sample_ray(p, pixel, k)
@@ -234,8 +232,8 @@ def shade_hits(thread, stride, scratch, geometry, moving, view_of, layer, hits, 
     albedo, roughness, metallic = materials
     position, depth, owner, emission, out_face, out_instance, barycentric = seen
     width = np.int64(p[WIDTH])
-    for block in range(thread, (len(pixel) + _BLOCK - 1) // _BLOCK, stride):
-        for n in range(block * _BLOCK, min((block + 1) * _BLOCK, len(pixel))):
+    for block in range(thread, (len(pixel) + BLOCK - 1) // BLOCK, stride):
+        for n in range(block * BLOCK, min((block + 1) * BLOCK, len(pixel))):
             if flags[n] & layer != layer:
                 continue
             y, x, k = pixel[n] // width - y0, pixel[n] % width - x0, sample[n]

@@ -117,7 +117,7 @@ def device() -> int:
 
 @functools.cache
 def packet_address() -> int:
-    """Address of rtcIntersect8 for `trace_packet`; 0 where Embree does not trace eight rays at a time (Arm)."""
+    """Address of rtcIntersect8 for `trace_packet`; 0 where Embree does not trace eight rays at a time."""
     return address(library().rtcIntersect8) if library().rtcGetDeviceProperty(device(), _EIGHT_RAYS_PROPERTY) else 0
 
 
@@ -235,8 +235,8 @@ def blocked(typing, address, scene, ray):  # type: ignore[no-untyped-def]
     return types.boolean(*_ARGUMENTS), codegen
 
 
-#: Rays of a packet. Words of RTCRayHit8, whose fields are those of RTCRayHit up to instPrimID, and of which rays
-#: count.
+#: Rays of a packet. Words of its memory: RTCRayHit8, whose fields are those of RTCRayHit up to instPrimID, and for
+#: each ray whether it counts.
 PACKET = 8
 PACKET_WORDS, PACKET_VALID = 22 * PACKET, 21 * PACKET
 #: Where fields of `trace_packet`'s memory begin; vectors have three.
@@ -252,14 +252,17 @@ _COHERENT, _FEATURES = 1 << 16, -1
 
 @intrinsic
 def trace_packet(typing, address, scene, memory):  # type: ignore[no-untyped-def]
-    """Closest hits of eight rays that go much the same way, for compiled code: to the bit those of `trace`.
+    """Closest hits of eight rays that go much the same way, for compiled code.
+
+    To the bit those of `trace`, but for which of several surfaces in one place is met: that may depend on all eight.
 
     Parameters
     ----------
     address, scene : int64
         `packet_address`, which is not 0, and ``TriangleBVH.scene``.
     memory : int64
-        Address of `PACKET_WORDS` words, a multiple of 64: RTCRayHit8, then -1 for each ray that counts, else 0.
+        Address of `PACKET_WORDS` words, a multiple of 64: RTCRayHit8, then -1 for each ray that counts, else 0. Of
+        rays that hit, tfar and the fields of the hit are written.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
