@@ -35,6 +35,8 @@ from drgs_blender.evaluate.flip import find_flip
 from drgs_blender.evaluate.truth import read_relit
 
 FOLDER = OUT / "uncalibrated"
+#: Pixels across, of rows that name none.
+SIZE = 560
 COLUMNS = (
     "Scene", "Cameras and masks", "Pictures", "Masks: IoU", "Relit, foreground: raw / scaled", "Relit: SSIM / FLIP",
     "Processor s", "s",
@@ -164,16 +166,17 @@ def main() -> None:
     parser.add_argument("--relit", type=Path, required=True)
     parser.add_argument("--object", type=Path, default=ROOT / "examples" / "cat" / "egyptian_cat.glb")
     parser.add_argument("--pictures", type=int, default=36)
-    parser.add_argument("--size", type=int, default=560)
+    parser.add_argument("--size", type=int, default=SIZE)
     parser.add_argument("--spp", type=int, default=32)
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--steps", type=int, nargs=2, help="of surfels, of materials and light; else the default ones")
     parser.add_argument("--only", choices=list(WAYS), nargs="+", default=list(WAYS))
     options = parser.parse_args()
-    folder = FOLDER / options.scene.replace(" ", "-")
+    folder = FOLDER / f"{options.scene.replace(' ', '-')}-{options.size}"
     folder.mkdir(parents=True, exist_ok=True)
     photographed(folder, options)
-    scene = options.scene + (", {} and {} steps".format(*options.steps) if options.steps else "")
+    scene = options.scene + (f", {options.size} pixels" if options.size != SIZE else "")
+    scene += ", {} and {} steps".format(*options.steps) if options.steps else ""
     for label in options.only:
         made = asset_of(folder, *WAYS[label], options.steps)
         cells = [made.pictures, made.masks, *relit(made, folder, options.relit, options.samples)]
@@ -183,10 +186,10 @@ def main() -> None:
         print(scene, label, *cells, flush=True)
     body = (
         "An object among boxes on a table of noise, photographed by Cycles under one sky, and relit under another, "
-        f"where Cycles' pictures of it alone judge; {options.size} pixels across. Default settings of `drgs capture "
-        "--masks auto` and `drgs reconstruct`, but for steps that are named. PSNR of the foreground in dB, scaled by "
-        "one factor a channel; SSIM and FLIP of the scaled frames on white. Seconds: of both commands where both "
-        "cameras and masks are found, else of `drgs reconstruct`.\n\n"
+        f"where Cycles' pictures of it alone judge; {SIZE} pixels across but for rows that say so. Default settings of "
+        "`drgs capture --masks auto` and `drgs reconstruct`, but for steps that are named. PSNR of the "
+        "foreground in dB, scaled by one factor a channel; SSIM and FLIP of the scaled frames on white. "
+        "Seconds: of both commands where both cameras and masks are found, else of `drgs reconstruct`.\n\n"
     )
     write_section(
         "uncalibrated", "Without cameras and masks, relit",
