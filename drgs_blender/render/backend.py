@@ -14,8 +14,9 @@ from .denoise.demodulation import Signal
 from .denoise.svgf_spatial import denoise
 from .denoise.svgf_temporal import NoisyPicture, denoise_next
 from .film.guides import Guides
-from .gbuffer.camera_hits import MeshHits, shade_mesh, trace_camera
+from .gbuffer.camera_hits import shade_mesh, trace_camera
 from .gbuffer.gbuffer import GBuffer
+from .gbuffer.mesh_hits import MeshHits
 from .gbuffer.surfels import tie_to_mesh
 from .integrator.integrate import integrate
 from .integrator.paths import PathKernel

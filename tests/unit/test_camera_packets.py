@@ -12,6 +12,7 @@ from shapes import look_along_y, sphere_mesh
 from drgs_blender.core.frame import Camera, MeshState, RenderSettings, Visibility
 from drgs_blender.render.camera import camera_parameters
 from drgs_blender.render.gbuffer import camera_hits
+from drgs_blender.render.gbuffer.mesh_hits import MeshHits
 from drgs_blender.render.scene.embree import packet_address
 from drgs_blender.render.scene.ray_masks import CAMERA
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
@@ -25,24 +26,31 @@ CAMERAS = {
 }
 
 
-def instances() -> TraceScene:
-    """A ball, a wall behind it, three plates of one mesh before it, and one that the camera does not see."""
+#: Faces of a wall with four corners.
+SQUARE = np.int32([[0, 1, 2], [0, 2, 3]])
+
+
+def ball() -> TraceObject:
     vertices, faces = sphere_mesh(4)
     shades = np.full((len(vertices), 3), 0.5, np.float32), np.full(len(vertices), 0.6), np.zeros(len(vertices))
+    return TraceObject("ball", vertices, faces, *shades)
+
+
+def instances() -> TraceScene:
+    """A ball, a wall behind it, three plates of one mesh before it, and one that the camera does not see."""
     corners = np.float32([[-2, 2, -2], [2, 2, -2], [2, 2.5, 2], [-2, 2.5, 2]])
-    square = np.int32([[0, 1, 2], [0, 2, 3]])
     places = np.tile(np.eye(4), (3, 1, 1))
     places[:, :3, :3] *= np.array([0.25, 0.4, 0.15])[:, None, None]
     places[:, :3, 3] = [[-1, -2.4, 0.3], [0.4, -2.5, -0.4], [0.9, -2.3, 0.8]]
     one, numbers = np.eye(4)[None], np.zeros(1, np.int32)
     scene = TraceScene()
     scene.update(
-        [TraceObject("ball", vertices, faces, *shades)],
+        [ball()],
         [
-            MeshState("wall", corners, square, one, numbers),
-            MeshState("plates", corners, square, places, np.arange(3, dtype=np.int32)),
+            MeshState("wall", corners, SQUARE, one, numbers),
+            MeshState("plates", corners, SQUARE, places, np.arange(3, dtype=np.int32)),
             MeshState(
-                "unseen", corners - np.float32([0, 5, 0]), square, one, numbers, visibility=Visibility(camera=False)
+                "unseen", corners - np.float32([0, 5, 0]), SQUARE, one, numbers, visibility=Visibility(camera=False)
             ),
         ],
     )
@@ -51,19 +59,17 @@ def instances() -> TraceScene:
 
 def twice() -> TraceScene:
     """A ball, a wall that is there twice, as two instances, and once more as another mesh."""
-    vertices, faces = sphere_mesh(4)
-    shades = np.full((len(vertices), 3), 0.5, np.float32), np.full(len(vertices), 0.6), np.zeros(len(vertices))
     corners = np.float32([[-2, 2, -2], [2, 2, -2], [2, 2, 2], [-2, 2, 2]])
     walls = [
-        MeshState(name, corners, np.int32([[0, 1, 2], [0, 2, 3]]), np.tile(np.eye(4), (n, 1, 1)), np.arange(n))
+        MeshState(name, corners, SQUARE, np.tile(np.eye(4), (n, 1, 1)), np.arange(n))
         for name, n in (("two", 2), ("third", 1))
     ]
     scene = TraceScene()
-    scene.update([TraceObject("ball", vertices, faces, *shades)], walls)
+    scene.update([ball()], walls)
     return scene
 
 
-def find(scene: TraceScene, camera: Camera, x0: int, y0: int, shape: tuple[int, int, int]) -> camera_hits.MeshHits:
+def find(scene: TraceScene, camera: Camera, x0: int, y0: int, shape: tuple[int, int, int]) -> MeshHits:
     settings = RenderSettings(subpixel_samples=shape[2], camera_sees="mesh", seed=5)
     return camera_hits.trace_camera(scene, camera_parameters(camera, settings, 2), x0, y0, shape, CAMERA)
 
@@ -93,7 +99,8 @@ def test_packets_find_what_single_rays_find(camera: Camera, subpixels: int, monk
 @pytest.mark.parametrize("subpixels", [1, 4, 8])
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 def test_surfaces_in_one_place_are_met_alike_in_every_tile(camera: Camera, subpixels: int) -> None:
-    whole, part = (find(twice(), camera, x0, y0, (61 - y0, 61 - x0, subpixels)) for x0, y0 in ((0, 0), (3, 1)))
+    scene = twice()
+    whole, part = (find(scene, camera, x0, y0, (61 - y0, 61 - x0, subpixels)) for x0, y0 in ((0, 0), (3, 1)))
     met = part.owner >= 0
     assert met.sum() > 1000
     for found, expected in zip(part.arrays, whole.arrays, strict=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from cards import DEVICE, IS_CARD, assert_same
 from drgs_blender.compute.jit import njit
 from drgs_blender.compute.warp.kernels import Launcher, ScratchArray, WarpKernel
 from drgs_blender.compute.warp.runtime import load_module, warp
-from drgs_blender.compute.warp.translate import Native, Translation
+from drgs_blender.compute.warp.translate import Native, Translation, replacing
 from drgs_blender.compute.warp.types import Array, Struct, TranslationError
 from drgs_blender.core.frame import World
 from drgs_blender.render import sampling
@@ -213,6 +214,17 @@ def rebound(a, b, n):  # type: ignore[no-untyped-def]
     a = a * b
     n += 2
     return a, n
+
+
+def test_a_constant_of_a_module_is_replaced_and_one_that_is_gone_is_missed() -> None:
+    here, sources = sys.modules[__name__], []
+    for given in ({}, {"constants": replacing(here, "_STEPS", 12345)}):
+        translation = Translation(NATIVES, **given)
+        translation.function(constants, ["float32", "float32", "int64"])
+        sources.append(translation.source)
+    assert ["12345" in source for source in sources] == [False, True]
+    with pytest.raises(AttributeError, match="_GONE"):
+        replacing(here, "_GONE", 1)
 
 
 @pytest.mark.parametrize("function", [promotions, loops, constants, choices, tuples, rebound])

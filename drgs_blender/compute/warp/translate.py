@@ -23,6 +23,27 @@ from .types import SCALARS, Struct, TranslationError, Type, given, shaped, spell
 #: A constant of a module, by the module's and its own name, as the device has it instead.
 Constants = Callable[[types.ModuleType, str, Any], Any]
 
+
+def replacing(module: types.ModuleType, name: str, number: int) -> Constants:
+    """`Constants` of which one differs on the device.
+
+    Parameters
+    ----------
+    module : module
+        Whose functions have the constant among their globals.
+    name : str
+    number : int
+        What the device has instead.
+
+    Raises
+    ------
+    AttributeError
+        The module has no such constant, so that nothing would be replaced.
+    """
+    getattr(module, name)
+    return lambda owner, asked, value: number if owner is module and asked == name else value
+
+
 _HEAD = '''"""Made of this package's sources; changes are lost."""
 
 import warp as wp

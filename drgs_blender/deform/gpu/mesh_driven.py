@@ -6,7 +6,6 @@ The functions here are translated and never run as they stand.
 from __future__ import annotations
 
 import weakref
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ import numpy as np
 from ...compute.warp.kernels import Launcher, WarpKernel
 from ...compute.warp.posed_surfels import DevicePosedSurfels
 from ...compute.warp.runtime import warp
+from ...compute.warp.translate import replacing
 from ...core.asset.model import BASE_CHANNELS, PosedSurfels
 from ...geometry.normals import face_normal, vertex_normal
 from .. import pose
@@ -76,15 +76,11 @@ def sum_corners(thread, stride, scratch, weighted, start, sign, out):  # type: i
         normals[v, 0], normals[v, 1], normals[v, 2] = sign * x, sign * y, sign * z
 
 
-def _constants(module: ModuleType, name: str, value: Any) -> Any:
-    """One surfel a block."""
-    return 1 if module is pose and name == "_BLOCK" else value
-
-
 # Exact: faces without area have to be found as the CPU finds them, or surfels near them turn elsewhere.
 WEIGH = WarpKernel(weigh_corners, (), {}, exact=True)
 SUM = WarpKernel(sum_corners, (), {}, exact=True)
-POSE = WarpKernel(pose.pose_surfels, (), {}, _constants, exact=True)
+# One surfel a block.
+POSE = WarpKernel(pose.pose_surfels, (), {}, replacing(pose, "_BLOCK", 1), exact=True)
 
 
 class _Tables(NamedTuple):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,41 +15,15 @@ from ..scene.interaction import nearest, position_at, surface_at
 from ..scene.ray import Hit, Ray
 from ..scene.see_through import MOST, nearest_there
 from ..scene.trace_scene import TraceScene
-from .camera_packets import BLOCK, put_hit, trace_packets
+from .camera_packets import trace_packets
 from .gbuffer import GBuffer, face_viewer
+from .mesh_hits import BLOCK, MeshHits, put_hit
 
 Array = np.ndarray
 
 #: Step of the third coordinate of a pixel's lattice, and what makes another hash of its first.
 _SILVER, _HASHED = 0.41421356237309503, 65521.0
 _BELOW_ONE = F(1.0 - 2.0**-24)
-
-
-@dataclass(slots=True)
-class MeshHits:
-    """First hits of meshes by camera rays through the sub-pixel samples of some rows.
-
-    Attributes
-    ----------
-    depth : (rows, width, subpixels) float32 array
-        Metres along the view axis.
-    owner : (rows, width, subpixels) int32 array
-        Object, or -1 where nothing is met; the other arrays are undefined there.
-    face, instance : (rows, width, subpixels) int32 array
-    where : (rows, width, subpixels, 5) float32 array
-        The hit's u and v, and its geometric normal as `surface_at` wants it.
-    """
-
-    depth: Array
-    owner: Array
-    face: Array
-    instance: Array
-    where: Array
-
-    @property
-    def arrays(self) -> tuple[Array, ...]:
-        """All of them."""
-        return self.depth, self.owner, self.face, self.instance, self.where
 
 
 def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: tuple[int, ...], mask: int) -> MeshHits:

@@ -13,41 +13,7 @@ from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
 from ..scene import embree as e
 from ..scene.interaction import numbered
 from ..scene.ray import Hit
-
-#: Samples or points of a block: whole packets.
-BLOCK = 256
-
-
-@njit
-def put_hit(at, hit, owners, out):  # type: ignore[no-untyped-def]
-    """Write what a sample's ray meets.
-
-    Parameters
-    ----------
-    at : tuple of int64
-        Row, column and number of the sample.
-    hit : Hit
-    owners, out : tuple
-        As of `camera_hits.trace_samples`.
-
-    Returns
-    -------
-    int32
-        The object, or -1.
-    """
-    y, x, k = at
-    face_object, instance_object = owners
-    depth, owner, face, instance, where = out
-    depth[y, x, k], face[y, x, k], instance[y, x, k] = hit.t, hit.face, hit.instance
-    where[y, x, k, 0], where[y, x, k, 1] = hit.u, hit.v
-    where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4] = hit.gx, hit.gy, hit.gz
-    who = np.int32(-1)
-    if hit.face >= 0 and hit.instance >= 0:
-        who = instance_object[hit.instance]
-    elif hit.face >= 0:
-        who = face_object[hit.face]
-    owner[y, x, k] = who
-    return who
+from .mesh_hits import BLOCK, put_hit
 
 
 @njit

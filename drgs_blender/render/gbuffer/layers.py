@@ -17,7 +17,8 @@ from ...compute.threads import ROWS, over_range
 from ..scene.ray_masks import CATCHER, HOLDOUT, ORDINARY
 from ..scene.trace_scene import TraceScene
 from ..surfels.raster import SurfelSamples
-from .camera_hits import MeshHits, trace_camera
+from .camera_hits import trace_camera
+from .mesh_hits import MeshHits
 
 Array = np.ndarray
 

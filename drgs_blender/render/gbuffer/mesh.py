@@ -10,9 +10,10 @@ from ...core.frame import Camera
 from ..camera import SUBPIXELS
 from ..scene.ray_masks import CAMERA
 from ..scene.trace_scene import TraceScene
-from .camera_hits import MeshHits, shade_mesh, trace_camera
+from .camera_hits import shade_mesh, trace_camera
 from .gbuffer import GBuffer, compact
 from .layers import lone
+from .mesh_hits import MeshHits
 
 Array = np.ndarray
 

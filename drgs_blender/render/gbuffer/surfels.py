@@ -46,9 +46,10 @@ from ..surfel_columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
 from ..surfels.captured import CapturedSamples
 from ..surfels.raster import SurfelSamples, rasterise
 from ..surfels.splats import Splats
-from .camera_hits import MeshHits, shade_mesh, trace_camera
+from .camera_hits import shade_mesh, trace_camera
 from .gbuffer import GBuffer, compact, face_viewer
 from .layers import combine
+from .mesh_hits import MeshHits
 from .surfel_rays import SurfelRays
 
 Array = np.ndarray

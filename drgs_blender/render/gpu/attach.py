@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from types import ModuleType
 from typing import Any
 
 from ...compute.warp.kernels import Launcher, WarpKernel
+from ...compute.warp.translate import replacing
 from ..gbuffer import surfels
 from ..scene.trace_scene import TraceScene
 from .native_functions import NATIVES
 from .scene_mirror import Mirror
 
-
-def _constants(module: ModuleType, name: str, value: Any) -> Any:
-    """One point a block."""
-    return 1 if module is surfels and name == "_BLOCK" else value
-
-
-ATTACH = WarpKernel(surfels.attach_points, (), NATIVES, _constants)
+#: One point a block.
+ATTACH = WarpKernel(surfels.attach_points, (), NATIVES, replacing(surfels, "_BLOCK", 1))
 
 
 def tie(launcher: Launcher, mirror: Mirror, scene: TraceScene, *arguments: Any) -> None:

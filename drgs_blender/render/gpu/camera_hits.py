@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from ...compute.warp.kernels import Launcher, WarpKernel
+from ...compute.warp.translate import replacing
 from ..gbuffer import camera_hits
-from ..gbuffer.camera_hits import MeshHits, arrays_of
+from ..gbuffer.camera_hits import arrays_of
 from ..gbuffer.gbuffer import GBuffer
+from ..gbuffer.mesh_hits import MeshHits
 from ..scene.trace_scene import TraceScene
 from .native_functions import NATIVES
 from .scene_mirror import Mirror
@@ -20,14 +21,12 @@ from .scene_mirror import Mirror
 Array = np.ndarray
 
 
-def _constants(module: ModuleType, name: str, value: Any) -> Any:
-    """One sample or point a block."""
-    return 1 if module is camera_hits and name == "_BLOCK" else value
+#: One sample or point a block.
+_CONSTANTS = replacing(camera_hits, "BLOCK", 1)
 
-
-TRACE = WarpKernel(camera_hits.trace_samples, (), NATIVES, _constants)
-TRACE_THROUGH = WarpKernel(camera_hits.trace_through_samples, (), NATIVES, _constants)
-SHADE = WarpKernel(camera_hits.shade_hits, (), NATIVES, _constants)
+TRACE = WarpKernel(camera_hits.trace_samples, (), NATIVES, _CONSTANTS)
+TRACE_THROUGH = WarpKernel(camera_hits.trace_through_samples, (), NATIVES, _CONSTANTS)
+SHADE = WarpKernel(camera_hits.shade_hits, (), NATIVES, _CONSTANTS)
 
 
 @dataclass(slots=True)

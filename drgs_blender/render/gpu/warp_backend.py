@@ -16,7 +16,8 @@ from ..backend import RenderBackend, T, needs_paths
 from ..denoise.demodulation import Signal
 from ..denoise.svgf_temporal import NoisyPicture
 from ..film.guides import Guides
-from ..gbuffer.camera_hits import MeshHits, shade_mesh
+from ..gbuffer.camera_hits import shade_mesh
+from ..gbuffer.mesh_hits import MeshHits
 from ..integrator.integrate import integrate
 from ..scene.trace_scene import TraceScene
 from ..shading_points import Radiance
