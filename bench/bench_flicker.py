@@ -1,6 +1,9 @@
-"""Does a sequence under a light that turns flicker? Noisy, denoised one by one, over time, and in a window; and Cycles.
+"""Does a sequence flicker? Noisy, denoised frame by frame, over time, and in a window; and Cycles.
 
-python bench/bench_flicker.py [--frames 8] [--size 256] [--samples 32] [--reference 1024] [--steps 1 4]
+python bench/bench_flicker.py [--part turning bending] [--frames 8] [--size 256] [--samples 32] [--reference 1024]
+    [--steps 1 4]
+
+In one part the light turns, in the other the object bends. Each writes its own section.
 """
 
 from __future__ import annotations
@@ -8,7 +11,8 @@ from __future__ import annotations
 import argparse
 import itertools
 import tempfile
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +21,13 @@ from flicker import flicker
 from judge import environments, foreground, frame_camera, psnr, run_cycles
 from ours import SESSION, pinhole
 from report import OUT, table, write_section
+from scipy.spatial.transform import Rotation
 from subjects import asset_path, save_mesh
 
 from drgs_blender.cli import frame_store
 from drgs_blender.cli.main import main as drgs
 from drgs_blender.core.asset.container import read_asset
-from drgs_blender.core.frame import Frame, MotionStep, ObjectState, RenderSettings, World
+from drgs_blender.core.frame import Frame, MotionStep, ObjectState, Pose, RenderSettings, World
 from drgs_blender.core.passes import TEMPORAL
 from drgs_blender.formats.registry import read_environment
 from drgs_blender.render.denoise.oidn import available
@@ -34,136 +39,192 @@ FOLDER = OUT / "flicker"
 TRIANGLES = 82000
 
 
-def frames(options: argparse.Namespace, step: float, environment: str) -> list[Frame]:
-    """The sequence: the world turns about the vertical axis, all else stands still."""
-    path = asset_path("cat", max_triangles=TRIANGLES)
-    key = SESSION.load_asset(path)
-    radiance = read_environment(environments() / f"{environment}.exr").radiance
-    camera = pinhole(frame_camera(read_asset(path).mesh.vertices, options.size, azimuth=-60, fill=0.66))
+@dataclass
+class Sequence:
+    """The same frames for both programs.
+
+    Attributes
+    ----------
+    name : str
+    frames : list of Frame
+    jobs : list of dict
+        For cycles_job.py, without samples; each frame has noise of its own.
+    vectors : (n, h, w, 2) array, optional
+        As `flicker` takes them; None where nothing moves.
+    """
+
+    name: str
+    frames: list[Frame]
+    jobs: list[dict[str, Any]]
+    vectors: Array | None = None
+
+
+def turning(options: argparse.Namespace, step: float, environment: str) -> Sequence:
+    """The world turns about the vertical axis, all else stands still."""
+    sequence = still(options, environment, f"turning-{step:g}")
+    for k, frame in enumerate(sequence.frames):
+        turn = Rotation.from_euler("z", step * k, degrees=True).as_matrix()
+        frame.world = World(frame.world.environment, turn)
+        sequence.jobs[k]["rotation_z"] = step * k
+    return sequence
+
+
+def bending(options: argparse.Namespace, step: float, environment: str) -> Sequence:
+    """The cat bends to the side, from upright, the top of its head by `step` degrees each frame; all else stands."""
+    sequence = still(options, environment, f"bending-{step:g}")
+    mesh, vectors = read_asset(subject()).mesh, []
+    for k, frame in enumerate(sequence.frames):
+        before, now = (bent(mesh.vertices, step * n) for n in (k - 1, k))
+        frame.objects[0].vertices = now
+        frame.previous = MotionStep(frame.camera, [Pose("cat", np.eye(4)[None], before)])
+        sequence.jobs[k]["mesh"] = str(FOLDER / f"{sequence.name}-{k}.npz")
+        save_mesh(Path(sequence.jobs[k]["mesh"]), replace(mesh, vertices=now))
+        vector = SESSION.render(replace(frame, settings=RenderSettings(1, film_transparent=True), passes=("Vector",)))
+        vectors.append(vector["Vector"][..., :2] * np.float32([1, -1]))
+    return replace(sequence, vectors=np.stack(vectors))
+
+
+def still(options: argparse.Namespace, environment: str, name: str) -> Sequence:
+    """Frames and jobs in which nothing moves yet."""
+    path, world = subject(), environments() / f"{environment}.exr"
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    mesh, key = read_asset(path).mesh, SESSION.load_asset(path)
+    view = frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.66)
+    camera, radiance = pinhole(view), read_environment(world).radiance
     settings = RenderSettings(options.samples, film_transparent=True)
-    out = []
-    for number in range(options.frames):
-        a = np.radians(step * number)
-        turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
-        world = World(radiance, turn)
-        out.append(
-            Frame(number, camera, [ObjectState("cat", key)], world, settings, previous=MotionStep(camera, [None]))
-        )
-    return out
+    save_mesh(FOLDER / "cat.npz", mesh)
+    shared = {"mesh": str(FOLDER / "cat.npz"), "environment": str(world), "bounces": 1, "camera": view}
+    frames, jobs = [], []
+    for k in range(options.frames):
+        rest = MotionStep(camera, [None])
+        frames.append(Frame(k, camera, [ObjectState("cat", key)], World(radiance), settings, previous=rest))
+        jobs.append(shared | {"seed": k, "out": str(FOLDER / f"{name}-{environment}-{k}.npy")})
+    return Sequence(f"{name}-{environment}", frames, jobs)
 
 
-def rendered(sequence: list[Frame], history: str = "", **settings: object) -> list[Array]:
-    """(h, w, 3) pictures of the sequence with some settings changed."""
+def subject() -> Path:
+    return asset_path("cat", max_triangles=TRIANGLES)
+
+
+def bent(vertices: Array, degrees: float) -> Array:
+    """(n, 3) float32: each point turned about the X axis through the middle of the base, the higher the further."""
+    low, high = vertices.min(0), vertices.max(0)
+    base = [*((low + high)[:2] / 2), low[2]]
+    angles = degrees * (vertices[:, 2] - low[2]) / (high - low)[2]
+    turned = Rotation.from_euler("x", angles[:, None], degrees=True)
+    return (turned.apply(vertices - base) + base).astype(np.float32)
+
+
+def rendered(frames: list[Frame], history: str = "", **settings: object) -> list[Array]:
+    """(h, w, 3) pictures of the frames with some settings changed."""
     out = []
-    for frame in sequence:
+    for frame in frames:
         changed = replace(frame, settings=replace(frame.settings, **settings), history=history)  # type: ignore[arg-type]
         out.append(SESSION.render(changed)["Combined"][..., :3])
     return out
 
 
-def jobs_of(options: argparse.Namespace, step: float, environment: str) -> list[dict[str, Any]]:
-    """The same sequence for Cycles, each frame with noise of its own."""
-    mesh, npz = read_asset(asset_path("cat", max_triangles=TRIANGLES)).mesh, FOLDER / "cat.npz"
-    FOLDER.mkdir(parents=True, exist_ok=True)
-    save_mesh(npz, mesh)
-    shared = {
-        "mesh": str(npz), "environment": str(environments() / f"{environment}.exr"), "bounces": 1,
-        "camera": frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.66),
-    }  # fmt: skip
-    return [
-        shared | {"rotation_z": step * k, "seed": k, "out": str(FOLDER / f"{environment}-{step:g}-{k}.npy")}
-        for k in range(options.frames)
-    ]
-
-
 def by_cycles(jobs: list[dict[str, Any]], samples: int, denoise: bool = False) -> Array:
-    """(n, h, w, 4) pictures of `jobs_of` a sequence."""
+    """(n, h, w, 4) pictures of the jobs of a sequence."""
     run_cycles([job | {"samples": samples, "denoise": denoise} for job in jobs], "flicker")
     return np.stack([np.load(job["out"]) for job in jobs])
 
 
-def rows_of(ways: dict[str, Array], truth: Array, mask: Array) -> list[tuple[str, ...]]:
+def rows_of(ways: dict[str, Array], truth: Array, mask: Array, vectors: Array | None) -> list[tuple[str, ...]]:
     """Cells of each way: flicker of its error and beyond the converged sequence's, PSNR from the third frame on."""
-    rest, rows = flicker(truth, mask), []
+    rest, rows = flicker(truth, mask, vectors), []
     for name, shown in ways.items():
         later = [psnr(a, b, m) for a, b, m in zip(shown[2:], truth[2:], mask[2:])]
-        error = flicker(shown, mask, converged=truth)
-        beyond = flicker(shown, mask) - rest
+        error = flicker(shown, mask, vectors, converged=truth)
+        beyond = flicker(shown, mask, vectors) - rest
         rows.append((name, f"{1e3 * error:.2f}", f"{1e3 * beyond:.2f}", f"{np.mean(later):.2f}"))
     return rows
 
 
-def in_windows(sequence: list[Frame]) -> tuple[list[Array], list[Array], list[Array]]:
+def in_windows(frames: list[Frame]) -> tuple[list[Array], list[Array], list[Array]]:
     """Noisy pictures, those of ``drgs denoise`` on the files of these, and coverage."""
     with tempfile.TemporaryDirectory() as folder:
         noisy, clean = (str(Path(folder) / name / "####.exr") for name in ("noisy", "clean"))
         Path(noisy).parent.mkdir()
         pictures, coverage = [], []
-        for frame in sequence:
+        for frame in frames:
             passes = SESSION.render(replace(frame, passes=TEMPORAL))
             path = Path(noisy.replace("####", f"{frame.noise_index:04d}"))
             frame_store.save(path, passes, frame, frame.noise_index, "")
             pictures.append(passes["Combined"][..., :3])
             coverage.append(passes["Coverage"][..., 0])
-        numbers = f"0-{len(sequence) - 1}"
+        numbers = f"0-{len(frames) - 1}"
         code = drgs(["denoise", noisy, "--frames", numbers, "--out", clean, "--passes", "Combined"])
         if code:
             raise SystemExit(code)
-        found = [read_frame(clean.replace("####", f"{f.noise_index:04d}"))[0]["Combined"][..., :3] for f in sequence]
+        found = [read_frame(clean.replace("####", f"{f.noise_index:04d}"))[0]["Combined"][..., :3] for f in frames]
     return pictures, found, coverage
 
 
-def compared(options: argparse.Namespace, step: float, environment: str) -> list[tuple[str, ...]]:
+def compared(options: argparse.Namespace, sequence: Sequence) -> list[tuple[str, ...]]:
     """Rows of one sequence, ours and those of Cycles."""
-    sequence = frames(options, step, environment)
-    noisy, windows, coverage = in_windows(sequence)
+    frames, vectors = sequence.frames, sequence.vectors
+    noisy, windows, coverage = in_windows(frames)
     # As many positions as there can be: those of few differ from frame to frame, which is flicker of ours.
     truth, again = (
-        np.stack(rendered(sequence, samples=options.reference, subpixel_samples=64, seed=seed)) for seed in (1000, 2000)
+        np.stack(rendered(frames, samples=options.reference, subpixel_samples=64, seed=seed)) for seed in (1000, 2000)
     )
     mask = np.stack([foreground(c, 1) for c in coverage])
     ways: dict[str, list[Array]] = {
         "converged, another seed": list(again),
         "noisy": noisy,
-        "SVGF, each frame alone": rendered(sequence, denoise="svgf"),
-        "SVGF, over time": rendered(sequence, f"{environment} {step}", denoise="svgf"),
+        "SVGF, each frame alone": rendered(frames, denoise="svgf"),
+        "SVGF, over time": rendered(frames, sequence.name, denoise="svgf"),
         "SVGF, window of 5": windows,
     }
     if available():
-        ways["OIDN, each frame alone"] = rendered(sequence, denoise="oidn")
-    rows = rows_of({name: np.stack(pictures) for name, pictures in ways.items()}, truth, mask)
-    jobs = jobs_of(options, step, environment)
-    theirs = by_cycles(jobs, options.reference)
+        ways["OIDN, each frame alone"] = rendered(frames, denoise="oidn")
+    rows = rows_of({name: np.stack(pictures) for name, pictures in ways.items()}, truth, mask, vectors)
+    theirs = by_cycles(sequence.jobs, options.reference)
     mask = np.stack([foreground(picture[..., 3], 1) for picture in theirs])
     cycles = {
-        "Cycles: noisy": by_cycles(jobs, options.samples),
-        "Cycles: OIDN, each frame alone": by_cycles(jobs, options.samples, denoise=True),
+        "Cycles: noisy": by_cycles(sequence.jobs, options.samples),
+        "Cycles: OIDN, each frame alone": by_cycles(sequence.jobs, options.samples, denoise=True),
     }
-    return [(f"{step:g}", environment, *row) for row in rows + rows_of(cycles, theirs, mask)]
+    return rows + rows_of(cycles, theirs, mask, vectors)
+
+
+#: Name of a part -> section, its title, what moves, and its sequences.
+PARTS: dict[str, tuple[str, str, str, Callable[[argparse.Namespace, float, str], Sequence]]] = {
+    "turning": ("flicker", "Flicker under a light that turns", "the world turns", turning),
+    "bending": (
+        "flicker-bending",
+        "Flicker of an object that bends",
+        "the object bends from upright, its top",
+        bending,
+    ),
+}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
+    parser.add_argument("--part", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--samples", type=int, default=32)
     parser.add_argument("--reference", type=int, default=1024)
     parser.add_argument("--steps", type=float, nargs="+", default=[1.0, 4.0], help="degrees a frame")
     options = parser.parse_args()
-    rows: list[tuple[str, ...]] = []
-    for step, environment in itertools.product(options.steps, ("city", "studio")):
-        rows += compared(options, step, environment)
     columns = ("Degrees", "World", "Denoiser", "Flicker of the error", "beyond the converged", "PSNR, dB")
-    body = (
-        f"cat, {options.size}x{options.size}, {options.samples} samples, {options.frames} frames, the world turns "
-        "by the degrees of the first column per frame. Flicker: mean absolute second difference in time of sRGB "
-        f"luminance, in thousandths: of the error, which is the difference from {options.reference} rays at "
-        f"64 places of a pixel, and of the picture, less that of the converged sequence, which blur lowers. PSNR: "
-        f"against {options.reference} rays, "
-        "foreground, sRGB, from the third frame on. Cycles: as many samples a pixel, against its own converged "
-        "sequence.\n\n" + table(columns, rows)
-    )
-    write_section("flicker", "Flicker under a light that turns", body)
+    for section, title, motion, sequence in (PARTS[part] for part in options.part):
+        rows: list[tuple[str, ...]] = []
+        for step, environment in itertools.product(options.steps, ("city", "studio")):
+            rows += [(f"{step:g}", environment, *r) for r in compared(options, sequence(options, step, environment))]
+        body = (
+            f"cat, {options.size}x{options.size}, {options.samples} samples, {options.frames} frames, {motion} "
+            "by the degrees of the first column per frame. Flicker: mean absolute second difference in time of sRGB "
+            "luminance on points of the surface, in thousandths: of the error, which is the difference from "
+            f"{options.reference} rays at 64 places of a pixel, and of the picture, less that of the converged "
+            f"sequence, which blur lowers. PSNR: against {options.reference} rays, "
+            "foreground, sRGB, from the third frame on. Cycles: as many samples a pixel, against its own converged "
+            "sequence.\n\n" + table(columns, rows)
+        )
+        write_section(section, title, body)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """What light costs: time to equal quality against Cycles and Mitsuba, what makes the time, and what it buys.
 
-python bench/bench_light.py [--part equal-psnr mitsuba denoised relmse cost memory efficiency cases denoisers
-    filter-glossy ablation] ...
+python bench/bench_light.py [--part equal-psnr mitsuba denoised relmse cost memory efficiency cases frames
+    denoisers filter-glossy ablation] ...
 
 Each part writes its own section. Everything runs on two processors, as far as the system allows that to be set.
 """
@@ -16,6 +16,7 @@ import light_cost
 import light_denoisers
 import light_efficiency
 import light_filter
+import light_frames
 import light_renderers
 import light_variance
 from light_cases import FOLDER
@@ -31,6 +32,7 @@ PARTS = {
     "memory": ("Light: memory of a large frame", light_cost.memory),
     "efficiency": ("Light: what denoiser, MIS and mesh bring", light_efficiency.efficiency),
     "cases": ("Light: noise of single cases", light_variance.variance),
+    "frames": ("Light: whole frames of all cases", light_frames.frames),
     "denoisers": ("Light: denoisers by samples", light_denoisers.denoisers),
     "filter-glossy": ("Light: Filter Glossy", light_filter.filter_glossy),
     "ablation": ("Light: inter-reflection, shadows and reflections", light_ablation.ablation),
@@ -61,6 +63,9 @@ def main() -> None:
     parser.add_argument("--cases-seeds", type=int, default=4)
     parser.add_argument("--cases-samples", type=int, nargs="+", default=(8, 32, 128, 512), help="of ours")
     parser.add_argument("--cases-spp", type=int, nargs="*", default=(8, 32, 128), help="of Cycles; none: without it")
+    parser.add_argument("--frames-size", type=int, nargs="+", default=(256, 512), help="of the pictures of part frames")
+    parser.add_argument("--frames-samples", type=int, nargs="+", default=(8, 32, 128), help="of ours")
+    parser.add_argument("--frames-spp", type=int, nargs="+", default=(8, 32, 128), help="of Cycles")
     parser.add_argument("--ablation-size", type=int, default=400, help="of the pictures of part ablation")
     parser.add_argument("--ablation-rays", type=int, default=512)
     add_publish(parser)

@@ -45,22 +45,20 @@ def chosen(options: argparse.Namespace) -> list[Case]:
     return cases
 
 
+def series(tiny: list[float], found: dict[int, list[tuple[Array, float]]]) -> tuple[Series, Reference]:
+    """Of the seconds of tiny pictures, and by number of samples the pictures that differ by their seed with theirs."""
+    reference = Reference.of(np.mean([picture for picture, _ in found[max(found)]], axis=0))
+    noise = [noise_of(*map(list, zip(*pictures, strict=True)), reference) for pictures in found.values()]  # type: ignore[arg-type]
+    return Series(tuple(found), noise, float(np.median(tiny))), reference
+
+
 def ours(case: Case, size: int, seeds: int, counts: tuple[int, ...]) -> tuple[Series, Reference]:
+    """In processor seconds."""
     session = Session()
     key = session.load_asset(case.files[0])
     session.render(case.frame(key, size, 8, 0))  # kernels and tables
     tiny = [timed(session, case.frame(key, TINY, 1, seed))[1] for seed in range(seeds)]
-    found = {}
-    for count in counts:
-        pictures, seconds = [], []
-        for seed in range(seeds):
-            picture, spent = timed(session, case.frame(key, size, count, seed))
-            pictures.append(picture)
-            seconds.append(spent)
-        found[count] = pictures, seconds
-    reference = Reference.of(np.mean(found[counts[-1]][0], axis=0))
-    noise = [noise_of(*found[count], reference) for count in counts]
-    return Series(counts, noise, float(np.median(tiny))), reference
+    return series(tiny, {n: [timed(session, case.frame(key, size, n, seed)) for seed in range(seeds)] for n in counts})
 
 
 def timed(session: Session, frame: Frame) -> tuple[Array, float]:
@@ -70,7 +68,11 @@ def timed(session: Session, frame: Frame) -> tuple[Array, float]:
     return picture, time.process_time() - begin
 
 
-def cycles(cases: list[Case], size: int, seeds: int, counts: tuple[int, ...]) -> list[Series]:
+def cycles(
+    cases: list[Case], size: int, seeds: int, counts: tuple[int, ...], clock: str = "processor_seconds"
+) -> list[Series]:
+    """In the seconds that cycles_job.py calls `clock`."""
+
     def out(case: Case, n: int, seed: int) -> Path:
         return FOLDER / f"cases-{case.name}-{n}-{seed}.npy"
 
@@ -78,17 +80,12 @@ def cycles(cases: list[Case], size: int, seeds: int, counts: tuple[int, ...]) ->
     # The first render of a process also loads the program: it does not count.
     tiny = [c.job(TINY, 1, seed, out(c, 0, seed)) for c in cases for seed in range(seeds)]
     jobs = [cases[0].job(TINY, 1, 0, FOLDER / "cases-first.npy"), *tiny, *jobs]
-    took = {result["out"]: result["processor_seconds"] for result in run_cycles(jobs, "light-cases")}
-    series = []
-    for case in cases:
-        pictures = {n: [np.load(out(case, n, seed)) for seed in range(seeds)] for n in counts}
-        reference = Reference.of(np.mean(pictures[counts[-1]], axis=0))
-        noise = [
-            noise_of(pictures[n], [took[str(out(case, n, seed))] for seed in range(seeds)], reference) for n in counts
-        ]
-        setup = float(np.median([took[str(out(case, 0, seed))] for seed in range(seeds)]))
-        series.append(Series(counts, noise, setup))
-    return series
+    took = {result["out"]: result[clock] for result in run_cycles(jobs, "light-cases")}
+
+    def found(case: Case, n: int) -> list[tuple[Array, float]]:
+        return [(np.load(path), took[str(path)]) for path in (out(case, n, seed) for seed in range(seeds))]
+
+    return [series([s for _, s in found(case, 0)], {n: found(case, n) for n in counts})[0] for case in cases]
 
 
 def variance(options: argparse.Namespace) -> str:

@@ -62,12 +62,17 @@ def time_ratios(
 
 @dataclass
 class Noise:
-    """What pictures of one number of samples are worth: dB, relative errors, and processor seconds (median)."""
+    """What pictures of one number of samples are worth: dB, relative errors, and seconds (median)."""
 
     decibels: float
     untrimmed: float
     trimmed: float
     seconds: float
+
+    @property
+    def shown(self) -> float:
+        """Mean squared error in sRGB."""
+        return float(10 ** (-self.decibels / 10))
 
 
 @dataclass
@@ -76,7 +81,7 @@ class Series:
 
     counts: tuple[int, ...]
     noise: list[Noise]
-    setup: float  # processor seconds of a picture of hardly any pixels
+    setup: float  # seconds of a picture of hardly any pixels
 
     def at(self, count: int) -> Noise:
         return self.noise[self.counts.index(count)]
@@ -87,7 +92,7 @@ class Series:
         return float(np.polyfit(np.log(self.counts) / np.log(4), [n.decibels for n in self.noise], 1)[0])
 
     def seconds(self, count: float) -> float:
-        """Processor seconds without the setup of a number of samples, linear between those that were measured.
+        """Seconds without the setup of a number of samples, linear between those that were measured.
 
         A sample costs more where there are few: sub-pixel positions do not grow as fast. So below the least number it
         costs as much as there, and beyond the largest as much as between the last two.
@@ -97,8 +102,8 @@ class Series:
             return spent[-1] + (spent[-1] - spent[-2]) / (counts[-1] - counts[-2]) * (count - counts[-1])
         return float(np.interp(count, [0, *counts], [0.0, *spent]))
 
-    def time_to(self, error: float) -> float:
-        """Processor seconds of sampling alone until the untrimmed relative error is `error`: log over log, linear."""
-        e = [n.untrimmed for n in self.noise]
+    def time_to(self, error: float, of: str = "untrimmed") -> float:
+        """Seconds of sampling alone until that error of `Noise` is `error`: log over log, linear."""
+        e = [getattr(n, of) for n in self.noise]
         slope, start = np.polyfit(np.log(e), np.log(self.counts), 1)
         return self.seconds(float(np.exp(start + slope * np.log(error))))
