@@ -127,8 +127,8 @@ class DrgsSceneSettings(LevelOfDetail, bpy.types.PropertyGroup):
     subpixel_samples: IntProperty(
         name="Sub-Pixel Samples",
         description="Positions per pixel among which samples are divided: edges and textures get smoother. 0 chooses: "
-        "an eighth of the samples, from 4 to 16, where surfels are visible to the camera; of meshes alone half, "
-        "up to 8, and of more than 32 a quarter, up to 64",
+        "where surfels are visible to the camera a quarter of the samples, from 4 to 8, and of more than 64 an eighth, "
+        "up to 16; of meshes alone half, up to 8, and of more than 32 a quarter, up to 64",
         min=0,
         soft_max=64,
         max=1024,

@@ -540,8 +540,8 @@ class RenderSettings:
             return self.subpixel_samples
         # Another one costs surfels more than a mesh, and they come filtered.
         count = self.sample_count
-        wanted = min(count // 8, 16) if self.camera_sees == "surfels" else max(min(count // 2, 8), count // 4)
-        return min(max(wanted, 4), 64, max(count, 1))
+        few, many = (count // 4, min(count // 8, 16)) if self.camera_sees == "surfels" else (count // 2, count // 4)
+        return min(max(min(few, 8), many, 4), 64, max(count, 1))
 
 
 @dataclass(slots=True)

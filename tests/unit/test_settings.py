@@ -32,6 +32,14 @@ def test_a_pixel_has_no_more_places_than_samples(samples: int, sees: str) -> Non
     assert RenderSettings(samples=samples, subpixel_samples=5).subpixel_count == 5
 
 
+@pytest.mark.parametrize("sees", ["surfels", "mesh"])
+def test_more_samples_never_leave_a_pixel_or_its_places_with_fewer(sees: str) -> None:
+    counts = np.arange(1, 600)
+    places = np.array([RenderSettings(samples=int(n), camera_sees=sees).subpixel_count for n in counts])  # type: ignore[arg-type]
+    assert (np.diff(places) >= 0).all()
+    assert (counts[counts >= 16] / places[counts >= 16] >= 2).all()
+
+
 @pytest.mark.parametrize("samples", [1, 2, 5])
 def test_few_samples_find_the_light_of_a_white_environment_in_the_mean(samples: int) -> None:
     """One sample per pixel is one, of whichever strategy: the mean over many pixels is the radiance all the same."""
