@@ -7,17 +7,17 @@ import json
 import logging
 import shutil
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image as Pillow
 
-from ..core.asset.archive import replace_by, replace_file
+from ..core.asset.archive import replace_file
 from ..core.errors import UsageError, WriteError, first_of
 from ..core.file_lock import FileLock
-from ..reconstruct.readers.layout import decode_mask
+from ..formats.images import write_image
+from ..reconstruct.readers.layout import UNFINISHED, decode_mask
 from .pictures import FOLDERS, MASKS, Picture, write_picture
 from .registration import Registration
 from .report import draw_cameras, write_report
@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 #: Files of a finished capture; the last is written last.
 REPORT, DRAWING, POINTS, CAMERAS = "capture.json", "capture.png", "sparse_points.ply", "transforms.json"
 #: Folder of what a run needs to go on; removed when the capture is complete.
-WORK = "registration"
+WORK = UNFINISHED
 #: In it: locked by the process that makes the capture.
 LOCK = "lock"
 #: In it: the key of the inputs that it belongs to.
@@ -190,7 +190,7 @@ def write_capture(
             masks.mkdir(exist_ok=True)
             target = masks / f"{written.stem}.png"
             drawn = Pillow.fromarray(np.asarray(decode_mask(picture.mask) * 255 + 0.5, np.uint8))
-            replace_by(target, partial(drawn.save, format="PNG"))
+            write_image(target, drawn)
             frame["mask_path"] = f"masks/{target.name}"
             if picture.mask_band:
                 frame["mask_band"] = round(picture.mask_band, 2)

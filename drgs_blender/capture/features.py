@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,7 +65,7 @@ def extract(database: Path, pictures: Path, masks: Path | None, photos: Sequence
     database, pictures : Path
         File; folder of the pictures.
     masks : Path, optional
-        Folder of masks, ``NAME.jpg.png``; features lie where they are white.
+        Folder of masks, ``NAME.jpg.png``; features lie where they are white, of pictures without one everywhere.
     photos : sequence of Photo
     tell, cancelled : callable
     affine : bool
@@ -98,15 +98,14 @@ def extract(database: Path, pictures: Path, masks: Path | None, photos: Sequence
         camera = next((names[photo.file] for photo in group if photo.file in names), -1)
         left = [photo for photo in group if photo.file not in names]
         done += len(group) - len(left)
-        for start in range(0, len(left), _BATCH):
+        for batch in _batches(left, masks):
             if cancelled():
                 raise Cancelled
             check_room(database.parent)
             tell("finding features", done / len(photos))
-            batch = left[start : start + _BATCH]
             reader = colmap.ImageReaderOptions()
             reader.camera_model = "SIMPLE_RADIAL"
-            if masks:
+            if masks and _mask_of(batch[0], masks).is_file():
                 reader.mask_path = str(masks)
             if camera >= 0:
                 reader.existing_camera_id = camera
@@ -122,6 +121,19 @@ def extract(database: Path, pictures: Path, masks: Path | None, photos: Sequence
                     camera = data.read_image_with_name(batch[0].file).camera_id
             done += len(batch)
     tell("finding features", 1.0)
+
+
+def _mask_of(photo: Photo, masks: Path) -> Path:
+    """Where COLMAP looks for the mask of a picture."""
+    return masks / f"{photo.file}.png"
+
+
+def _batches(photos: Sequence[Photo], masks: Path | None) -> Iterator[list[Photo]]:
+    """At most `_BATCH` pictures each, that all have a mask or all have none: COLMAP skips what lacks its mask."""
+    masked = [photo for photo in photos if masks and _mask_of(photo, masks).is_file()]
+    for some in (masked, [photo for photo in photos if photo not in masked]):
+        for start in range(0, len(some), _BATCH):
+            yield some[start : start + _BATCH]
 
 
 def check_room(folder: Path) -> None:

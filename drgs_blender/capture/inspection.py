@@ -179,13 +179,13 @@ def find_duplicates(looks: Sequence[Look]) -> dict[int, int]:
 
 
 def _same_or_bracketed(pictures: Sequence[Picture], looks: Sequence[Look], left_out: dict[str, Cause]) -> None:
-    """The same picture twice, of which the largest is kept; of exposure brackets all but the middle exposure."""
+    """The same picture twice, of which the largest is kept, or one with a mask; of brackets the middle exposure."""
     groups: dict[int, list[int]] = defaultdict(list)
     for copy, first in find_duplicates(looks).items():
         groups[first].append(copy)
     taken = np.zeros(len(pictures), bool)
     for first, copies in groups.items():
-        kept = max([first, *copies], key=lambda i: (pictures[i].size[0], -i))
+        kept = max([first, *copies], key=lambda i: (pictures[i].size[0], pictures[i].mask is not None, -i))
         for j in {first, *copies} - {kept}:
             left_out[pictures[j].path.name] = Cause(Reason.DUPLICATE, pictures[kept].path.name)
         taken[[first, *copies]] = True

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import logging
 import os
 import re
@@ -23,6 +22,7 @@ from ..core.color import linear_to_srgb, to_unit
 from ..core.errors import AssetError, first_of
 from ..core.file_types import VIDEOS
 from ..formats.exr import write_exr_picture
+from ..formats.images import write_image
 from ..reconstruct.readers.layout import PICTURES, decode_mask, find_mask, load_picture
 from . import libraries
 from .camera_raw import RAW, decode_raw, read_raw_metadata
@@ -361,13 +361,11 @@ def write_picture(picture: Picture, folder: Path) -> Path:
     pixels = decode(picture)
     if pixels.dtype == np.uint8 and suffix in (".jpg", ".jpeg"):
         target = folder / f"{picture.name}.jpg"
-        encoded = io.BytesIO()
-        Pillow.fromarray(pixels).save(encoded, "JPEG", quality=_QUALITY, subsampling=0)
-        replace_by(target, lambda path: path.write_bytes(encoded.getvalue()))
+        write_image(target, Pillow.fromarray(pixels), "JPEG", quality=_QUALITY, subsampling=0)
         return target
     if pixels.dtype == np.uint8:
         target = folder / f"{picture.name}.png"
-        replace_by(target, lambda path: Pillow.fromarray(pixels).save(path, "PNG"))
+        write_image(target, Pillow.fromarray(pixels))
         return target
     if pixels.dtype.kind == "f":
         if float((pixels[..., :3].max(axis=2) > 1).mean()) > _SPECKS:

@@ -12,8 +12,8 @@ import numpy as np
 from PIL import Image as Pillow
 
 from ..core.arrays import Array
-from ..core.asset.archive import replace_by
 from ..core.errors import AssetError, Cancelled, DeviceError, first_of
+from ..formats.images import write_image
 from ..reconstruct.readers.layout import decode_mask
 from .features import Photo, Tell
 from .inspection import Look, look
@@ -164,8 +164,8 @@ def _small(picture: Picture, copy: Path, mask_copy: Path, size: int) -> tuple[Ar
         if mask is not None:
             drawn = Pillow.fromarray(np.asarray(mask > 0.5).astype(np.uint8) * 255)
             drawn = drawn.resize((colour.shape[1], colour.shape[0]), Pillow.Resampling.NEAREST)
-            replace_by(mask_copy, lambda path: drawn.save(path, "PNG"))
-        replace_by(copy, lambda path: Pillow.fromarray(colour).save(path, "JPEG", quality=95, subsampling=0))
+            write_image(mask_copy, drawn)
+        write_image(copy, Pillow.fromarray(colour), "JPEG", quality=95, subsampling=0)
     with Pillow.open(copy) as image:
         small = np.asarray(image.convert("RGB"))
     if not mask_copy.is_file():

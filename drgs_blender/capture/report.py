@@ -11,8 +11,9 @@ from PIL import Image as Pillow
 from PIL import ImageDraw
 
 from ..core.arrays import Array
-from ..core.asset.archive import replace_by, replace_file
+from ..core.asset.archive import replace_file
 from ..core.errors import printable
+from ..formats.images import write_image
 from .registration import Registration
 
 #: Pixels of one of the two drawings; margin.
@@ -63,7 +64,7 @@ def draw_cameras(path: Path, found: Registration, said: list[str]) -> None:
         draw.text((index * _SIDE + _MARGIN, 12), title, fill=_TEXT)
     for line, text in enumerate(said):
         draw.text((_MARGIN, _SIDE + 18 * line), printable(text), fill=_TEXT)
-    replace_by(path, lambda temporary: page.save(temporary, "PNG"))
+    write_image(path, page)
 
 
 def _frustum(draw: ImageDraw.ImageDraw, matrix: Array, width: float, height: float, size: float, place: Any) -> None:

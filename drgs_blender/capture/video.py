@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,8 @@ from PIL import Image as Pillow
 from scipy.ndimage import laplace
 
 from ..core.arrays import Array
-from ..core.asset.archive import replace_by
 from ..core.errors import AssetError, Cancelled
+from ..formats.images import write_image
 from . import libraries
 
 logger = logging.getLogger(__name__)
@@ -84,7 +83,7 @@ def extract_frames(
         if number in chosen:
             path = folder / f"frame_{number:06d}.jpg"
             shown = Pillow.fromarray(_upright(frame))
-            replace_by(path, partial(shown.save, format="JPEG", quality=_QUALITY, subsampling=0))
+            write_image(path, shown, "JPEG", quality=_QUALITY, subsampling=0)
             paths.append(path)
             tell("writing frames", 0.6 + 0.4 * len(paths) / len(chosen))
     logger.info("%s: %d of %d frames are used", video, len(paths), len(samples))

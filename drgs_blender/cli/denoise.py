@@ -119,6 +119,10 @@ def denoise(args: argparse.Namespace) -> int:
                 if repeated and not same_noise:
                     lines.note("neighbours have the same noise, which stays; switch on Animated Seed")
                 same_noise |= repeated
+                if others := source.other_sizes(number):
+                    lines.note(
+                        f"{path.name} is of another size than its neighbours {others}: it is denoised without them"
+                    )
                 known = ("frame", "seed", "camera")
                 kept = {k: v for k, v in middle.metadata.items() if k in known or k.startswith(METADATA)}
                 extra = {frame_store.SETTINGS: settings, "denoise": f"svgf, window of {args.window}"}
@@ -180,6 +184,11 @@ class _Source:
                 raise AssetError(str(path), f"is frame {noisy.metadata['frame']}", "Give it the name of its number")
             self._held[number] = checksum, noisy
         return self._held[number][1]
+
+    def other_sizes(self, number: int) -> str:
+        """Names of the frames in the window of one that have another size, which cannot help."""
+        frames = {k: self.frame(k).picture.variance.shape[:2] for k in self._window(number) if k is not None}
+        return ", ".join(frame_path(self._template, k).name for k in frames if frames[k] != frames[number])
 
     def denoise(self, number: int, passes: tuple[str, ...] | None) -> tuple[NoisyFrame, dict[str, np.ndarray], bool]:
         """The noisy frame, its denoised passes, and whether a neighbour has the very same noise."""

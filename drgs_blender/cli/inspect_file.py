@@ -115,7 +115,7 @@ def inspect_capture(path: Path, axes: str = "opengl", up: str | None = None) -> 
         "kind": "capture",
         "format": find_layout(path).name,
         "photographs": len(cameras),
-        "left_out": sum(one["test"] for one in cameras),
+        "test_views": sum(one["test"] for one in cameras),
         "masks": sum(one["mask"] is not None or _has_alpha(Path(one["image"])) for one in cameras),
         "points": 0 if layout.points is None else len(layout.points),
         "guessed": layout.guessed,

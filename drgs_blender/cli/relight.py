@@ -288,8 +288,12 @@ _Pose = tuple[np.ndarray | None, Particles | None]
 
 def _poses(args: argparse.Namespace) -> tuple[Sequence[tuple[int, Callable[[], _Pose]]], tuple[float, float]]:
     """Number of each picture with what gives its pose, and `tear` and `grain` of the object."""
-    if args.cache is None and args.driven_by == "particles":
-        raise UsageError("--driven-by particles", "needs the particles of a simulation", "Give them with --cache")
+    if args.cache is None:
+        if args.driven_by == "particles":
+            raise UsageError("--driven-by particles", "needs the particles of a simulation", "Give them with --cache")
+        for option, given in (("--inside", args.inside != Inside()), ("--surface", args.surface != "automatic")):
+            if given:
+                raise UsageError(option, "is of the matter of a simulation", "Give one with --cache, or leave it out")
     if is_point_cache(args.vertices) and args.orbit is None:
         poses = read_poses(args.vertices, parse_frames(args.frames) if args.frames else None)
         check_template(str(args.out), [frame for frame, _ in poses])

@@ -130,6 +130,28 @@ def load_image(path: Path) -> Array:
 
 def write_png(path: Path, pixels: Array) -> None:
     """Write a PNG file, atomically; `pixels` are (h, w, 3 or 4) uint8, sRGB, straight alpha."""
+    write_image(path, Pillow.fromarray(pixels))
+
+
+def write_image(path: Path, image: Pillow.Image, kind: str = "PNG", **options: object) -> None:
+    """Write an image file, atomically.
+
+    It is encoded in memory: Pillow does not tell of a full disk where it writes into a file itself.
+
+    Parameters
+    ----------
+    path : Path
+    image : PIL.Image.Image
+    kind : str
+        Pillow's name of the format.
+    **options : object
+        Of Pillow's `save`.
+
+    Raises
+    ------
+    WriteError
+        Naming `path`, whatever stopped the write.
+    """
     encoded = io.BytesIO()
-    Pillow.fromarray(pixels).save(encoded, "PNG")
+    image.save(encoded, kind, **options)
     replace_file(path, [encoded.getvalue()])

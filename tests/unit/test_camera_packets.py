@@ -96,7 +96,7 @@ def test_packets_find_what_single_rays_find(camera: Camera, subpixels: int, monk
         np.testing.assert_array_equal(found[met], expected[met])
 
 
-@pytest.mark.parametrize("subpixels", [1, 4, 8])
+@pytest.mark.parametrize("subpixels", [1, 4, 8, 12])
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 def test_surfaces_in_one_place_are_met_alike_in_every_tile(camera: Camera, subpixels: int) -> None:
     scene = twice()

@@ -197,6 +197,13 @@ def test_blurred_pictures_and_duplicates_are_left_out(caplog):
     assert "3.jpg" in caplog.text and "7.jpg" in caplog.text
 
 
+def test_of_two_alike_the_one_with_a_mask_is_kept():
+    pictures, seen = looks([texture(k if k != 7 else 2) for k in range(10)])
+    pictures[7].mask = Path("masks/7.png")
+    _, left_out = inspect(pictures, seen, "photos")
+    assert left_out == {"2.jpg": Cause(Reason.DUPLICATE, "7.jpg")}
+
+
 def test_sharp_pictures_of_different_contrast_are_kept():
     images = [texture(k) for k in range(6)]
     images[1] = Image.eval(images[1], lambda v: 100 + v // 5)

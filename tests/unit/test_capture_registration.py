@@ -11,7 +11,7 @@ import pytest
 from PIL import Image, ImageFilter
 
 from drgs_blender.capture import capture_folder, features, libraries, pipeline, soundness
-from drgs_blender.capture.features import Photo, pairs
+from drgs_blender.capture.features import Photo, extract, pairs
 from drgs_blender.capture.left_out import Cause, Reason, tell_left_out
 from drgs_blender.capture.pictures import Picture
 from drgs_blender.capture.pipeline import Settings, make_capture
@@ -170,6 +170,28 @@ def synthetic(colmap, database, cameras: int, points: int = 400):
     names = sorted(truth.image(number).name for number in truth.reg_image_ids())
     camera = next(iter(truth.cameras.values()))
     return truth, [Photo(name, ("one",), None, (camera.width, camera.height)) for name in names]
+
+
+@pytest.mark.parametrize("bare", [0, 1])
+def test_pictures_without_a_mask_among_masked_ones_have_features_everywhere(colmap, tmp_path, bare):
+    pictures, masks = tmp_path / "pictures", tmp_path / "masks"
+    pictures.mkdir()
+    masks.mkdir()
+    photos = []
+    for k in range(3):
+        noise = np.random.default_rng(k).integers(0, 255, (30, 40, 3), np.uint8)
+        Image.fromarray(noise).resize((320, 240), Image.Resampling.BICUBIC).save(pictures / f"{k}.jpg")
+        photos.append(Photo(f"{k}.jpg", ("one",), None, (320, 240)))
+        if k != bare:
+            left = np.zeros((240, 320), np.uint8)
+            left[:, :160] = 255
+            Image.fromarray(left).save(masks / f"{k}.jpg.png")
+    extract(tmp_path / "database.db", pictures, masks, photos, tell, never)
+    with colmap.Database.open(str(tmp_path / "database.db")) as data:
+        images = {image.name: image for image in data.read_all_images()}
+        right = {name: data.read_keypoints(image.image_id)[:, 0].max() > 170 for name, image in images.items()}
+    assert right == {f"{k}.jpg": k == bare for k in range(3)}
+    assert len({image.camera_id for image in images.values()}) == 1
 
 
 def test_cameras_are_found_from_matches(colmap, tmp_path):

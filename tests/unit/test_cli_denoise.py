@@ -141,6 +141,18 @@ def test_one_frame_alone_is_what_the_engine_denoises_alone(denoise, rendered, tm
     assert set(found) == set(TEMPORAL) - {"Variance", "Previous Position"} and metadata["frame"] == "4"
 
 
+def test_neighbours_of_another_size_are_named(denoise, rendered, tmp_path):
+    mixed = tmp_path / "mixed"
+    mixed.mkdir()
+    for number in range(1, 4):
+        shutil.copy(rendered / "noisy" / f"{number:04d}.exr", mixed)
+    assert not any("size" in line for line in denoise("2", source=mixed)[1])
+    pictures, metadata = read_frame(mixed / "0003.exr")
+    frame_store.write_frame(mixed / "0003.exr", {k: v[:-4] for k, v in pictures.items()}, metadata)
+    code, lines, _ = denoise("2", "--overwrite", source=mixed)
+    assert code == 0 and any("0002.exr is of another size than its neighbours 0003.exr" in line for line in lines)
+
+
 def test_frames_beyond_a_cut_take_no_part(denoise, rendered, tmp_path):
     denoise(str(CUT - 1))
     shorter = tmp_path / "shorter"

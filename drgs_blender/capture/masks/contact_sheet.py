@@ -10,7 +10,7 @@ from PIL import Image as Pillow
 from PIL import ImageDraw
 
 from ...core.arrays import Array
-from ...core.asset.archive import replace_by
+from ...formats.images import write_image
 from .hull_check import Fit
 from .mask_view import MaskView
 
@@ -35,4 +35,4 @@ def draw_contact_sheet(path: Path, views: Sequence[MaskView], masks: Sequence[Ar
         draw.rectangle((left + 1, top + 1, left + width - 2, top + height - 2), outline=colour, width=2)
         text = f"{fit.name[:22]}  +{fit.outside:.0%} -{fit.missing:.0%}"
         draw.text((left + 6, top + 5), text, fill=colour)
-    replace_by(path, lambda temporary: page.save(temporary, "PNG"))
+    write_image(path, page)

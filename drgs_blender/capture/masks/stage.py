@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,8 @@ import numpy as np
 from PIL import Image as Pillow
 
 from ...core.arrays import Array
-from ...core.asset.archive import replace_by
 from ...core.errors import AssetError, DeviceError, first_of
+from ...formats.images import write_image
 from .. import libraries
 from ..features import Tell
 from ..pictures import Picture
@@ -154,7 +153,7 @@ def make_or_check(mode: str, found: Registration, by_file: dict[str, Picture], c
     for file, picture, mask in zip(files, pictures, drawn, strict=True):
         picture.mask = work / f"{file}.png"
         large = Pillow.fromarray(mask).resize(picture.size, Pillow.Resampling.BILINEAR)
-        replace_by(picture.mask, partial(large.save, format="PNG"))
+        write_image(picture.mask, large)
     doubtful = [str(fit) for fit in fits if fit.doubtful and not fit.wrong]
     lines = [f"masks: made for {len(views)} pictures; look at {sheet.name}"]
     return Masked(fits, lines + _doubts(doubtful, subject, sheet))

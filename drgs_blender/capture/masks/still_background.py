@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,8 @@ from PIL import Image as Pillow
 from scipy.ndimage import binary_fill_holes, binary_propagation, label
 
 from ...core.arrays import Array
-from ...core.asset.archive import replace_by
 from ...core.errors import Cancelled
+from ...formats.images import write_image
 from ..features import Photo, Tell
 from .ground_picture import exposure_gain
 
@@ -139,7 +138,7 @@ def write_turned(found: StillBackground, folder: Path, photos: Sequence[Photo]) 
     for photo in photos:
         turned = found.turned.get(photo.file, np.zeros((1, 1), bool))
         mask = Pillow.fromarray(turned.astype(np.uint8) * 255).resize(photo.size, Pillow.Resampling.NEAREST)
-        replace_by(folder / f"{photo.file}.png", partial(mask.save, format="PNG"))
+        write_image(folder / f"{photo.file}.png", mask)
     return folder
 
 

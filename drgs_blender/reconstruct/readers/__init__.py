@@ -20,7 +20,7 @@ from ..memory_budget import check_fits
 from . import colmap, llff, nero, tensoir, transforms
 from .camera_overlap import check_overlap
 from .exposures import find_gains
-from .layout import Layout
+from .layout import UNFINISHED, Layout
 from .lens import Lens
 from .photograph_loading import cut_out, find_background, load_photograph
 from .usable_photographs import usable
@@ -220,6 +220,10 @@ def find_layout(path: Path) -> Reader:
         raise AssetError(str(path), f"cannot be read: {error.strerror or error}", "Check its permissions") from error
     if captures:
         raise AssetError(str(path), f"is no capture, but holds some: {first_of(captures)}", "Give one of them")
+    if any(one.name == UNFINISHED for one in inner):
+        raise AssetError(
+            str(path), "is a capture that is not finished", "Give the drgs capture command again: it goes on"
+        )
     raise AssetError(str(path), "is no capture", f"{understood}. Photographs without cameras: drgs capture")
 
 
