@@ -48,11 +48,12 @@ def frames(options: argparse.Namespace) -> str:
     columns += [f"time Cycles / ours, {name}" for name in MEASURES.values()]
     return (
         f"{seeds} seeds, noise by what they differ, materials and lights as in *Light: noise of single cases*. Seconds "
-        "by the clock, median, from arrays in memory to pixels: scene, environment map and acceleration structure are "
-        "made again for each picture, program and kernels were loaded before. Time until a frame has the noise that "
-        f"Cycles has at {', '.join(map(str, spp))} spp: the setup, that of a picture of {TINY}x{TINY} pixels, and "
-        "sampling, log(samples) linear over log(noise). Median / worst of the cases:\n\n"
-        + "\n".join(verdicts)
-        + "\n\n"
-        + table(("Size", "Case", *columns), rows)
+        "by the clock, median, to pixels in memory (ours, with the map's file read) or in a file (Cycles): scene, "
+        "environment map and acceleration structure are made again for each picture, program and kernels were loaded "
+        f"before. Time until a frame has the noise that Cycles has at {', '.join(map(str, spp))} spp: the setup, that "
+        f"of a picture of {TINY}x{TINY} pixels, and sampling, log(samples) linear over log(noise). The variance is "
+        "relative to the mean of the same pictures with most samples, in which a bright dot lowers its own weight: "
+        "where few pixels make the noise (statue, glossy, facing), three seeds say little, and more of *Light: noise "
+        "of single cases* show less. Median / worst of the "
+        "cases:\n\n" + "\n".join(verdicts) + "\n\n" + table(("Size", "Case", *columns), rows)
     )

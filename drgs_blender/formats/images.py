@@ -141,7 +141,7 @@ def write_image(path: Path, image: Pillow.Image, kind: str = "PNG", **options: o
     Parameters
     ----------
     path : Path
-    image : PIL.Image.Image
+    image : Image
     kind : str
         Pillow's name of the format.
     **options : object

@@ -209,6 +209,11 @@ def test_histories_are_told_apart_and_end_where_they_do_not_fit(session, make_fr
     assert count(camera=smaller) == 0
     assert count() == 0
     assert count(passes=("Combined", "DiffDir")) == 0
+    assert count() == 0 and count() == 1
+    for region in ((4, 4, 24, 24), (8, 6, 28, 26)):  # of one size
+        assert count(camera=replace(still_frame(make_frame, 9).camera, region=region)) == 0
+    assert count() == 0
+    assert count(settings=replace(still_frame(make_frame, 9).settings, camera_sees="mesh")) == 0
     for name in "abcd":
         count(history=name)
     assert count() == 0  # only the last few names are kept

@@ -12,7 +12,7 @@ from drgs_blender.render.denoise.demodulation import LIGHT, PAD, SOURCE, Signal
 from drgs_blender.render.denoise.kept_light import SETTLED, to_trace
 from drgs_blender.render.denoise.svgf_spatial import prepare
 from drgs_blender.render.denoise.svgf_temporal import NoisyPicture, denoise_next
-from drgs_blender.render.denoise.svgf_window import window
+from drgs_blender.render.denoise.svgf_window import _neighbours, window
 from drgs_blender.render.film.guides import Guides
 from drgs_blender.render.film.motion_vectors import Motion, MotionFilm, SceneState, previous_positions, project
 from drgs_blender.render.film.motion_vectors import motion as motion_of
@@ -361,6 +361,34 @@ def test_window_does_not_mix_what_is_hidden_in_other_frames() -> None:
     on_box = pictures[2].guides.object == 1
     albedo = pictures[2].guides.albedo[..., 0]
     assert np.abs(found / albedo - np.where(on_box, 0.5, 3.0)).max() < 0.15
+
+
+def test_window_follows_what_grows_and_comes_nearer() -> None:
+    """Places and world positions two frames before and after, of a wall that grows by a tenth and comes by 20 mm."""
+    grown, near = 1.1, 0.02
+    x, y = np.meshgrid(np.arange(W) + 0.5 - W / 2, np.arange(H) + 0.5 - H / 2)
+    from_centre = np.stack([x, y], -1)
+
+    def at(frame: float) -> np.ndarray:
+        """World position of what the middle frame has in each pixel."""
+        scale = grown ** (frame - 2)
+        return np.stack([x * PITCH * scale, np.full_like(x, -near * frame), -y * PITCH * scale], -1)
+
+    pictures = []
+    for k in range(5):
+        guides = wall()
+        guides.position[..., 1] = -near * k
+        motion = still(guides)
+        motion.vector[:] = from_centre * (1 / grown - 1)
+        motion.previous[..., ::2] /= grown
+        motion.previous[..., 1] += near
+        pictures.append(picture(guides, 2.0, 0.0, k, motion))
+    found = [(one, vector.copy(), expected.copy()) for _, one, vector, expected in _neighbours(pictures)]
+    inner = slice(12, -12), slice(16, -16)
+    for frame, (one, vector, expected) in zip((1, 0, 3, 4), found, strict=True):
+        assert one is pictures[frame]
+        np.testing.assert_allclose(vector[inner], (from_centre * (grown ** (frame - 2) - 1))[inner], atol=0.11)
+        np.testing.assert_allclose(expected[inner], at(frame)[inner], atol=0.6 * PITCH)
 
 
 def test_window_depends_on_its_frames_alone() -> None:
