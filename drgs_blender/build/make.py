@@ -87,8 +87,8 @@ def make_asset(
         mesh, pretrained, density=density, detail=detail if detail.any else None, most=max_surfels
     )
     left = report["surfels"].get("hidden_pieces", 0)
-    # Where two defaults meet, which the user did not choose, there is nothing to say, unless the limit is passed.
-    if len(surfels) >= max_surfels and (left > 0 or (left < 0 and (is_chosen or len(surfels) > max_surfels))):
+    # Where two defaults meet, which the user did not choose, there is nothing to say.
+    if len(surfels) >= max_surfels and (left > 0 or (left < 0 and is_chosen)):
         report["surfels"]["notes"] = [_surfel_note(len(surfels), left, max_surfels, density)]
     provenance = {"mesh": plain_name(name), "made": "surfels attached to the mesh", "report": report}
     return Asset(surfels, mesh, binding, read_environment_of(environment), provenance)

@@ -141,6 +141,8 @@ def _inside(text: str) -> Inside | None:
 def run(args: argparse.Namespace) -> int:
     """Render."""
     check_suffix(args.out, (".exr", ".png"))
+    if args.out.suffix.lower() == ".png" and set(args.passes) != {"Combined"}:
+        raise UsageError("--passes", "are not in a PNG file, which has Combined alone", "Write EXR, or leave them out")
     given = _given_camera(args)
     settings = sampling.override(RenderSettings(), args)
     sampling.check_size(given or framing_camera(np.zeros((1, 3)), size=args.size or SIZE), args.passes)

@@ -56,7 +56,8 @@ def add_arguments(
     add(
         "--noise-threshold",
         "noise_threshold",
-        "stop sampling a pixel below this error, as Cycles defines it; 0 never stops",
+        "stop sampling a pixel below this error, as Cycles defines it; 0 never stops, which is faster where few "
+        "pixels would stop early",
         type=at_least_zero,
     )
     add(

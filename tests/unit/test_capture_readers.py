@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from drgs_blender.capture.capture_folder import WORK
 from drgs_blender.cli.main import main
 from drgs_blender.core.color import linear_to_srgb, srgb_to_linear
 from drgs_blender.core.errors import AssetError, UsageError
@@ -61,7 +62,7 @@ def test_inspect_says_where_photographs_were_taken(tmp_path, capsys, layout):
     said = json.loads(capsys.readouterr().out)
     capture = read_capture(scene.folder)
     assert said["kind"] == "capture" and said["photographs"] == len(capture.views) == len(scene.cameras)
-    assert said["left_out"] == sum(view.test for view in capture.views)
+    assert said["test_views"] == sum(view.test for view in capture.views)
     for camera, view in zip(said["cameras"], capture.views, strict=True):
         assert Path(camera["image"]).is_file() and camera["name"] == view.name
         np.testing.assert_allclose(camera["matrix_world"], view.camera.matrix_world, atol=1e-9)
@@ -606,6 +607,8 @@ def test_damaged_files_are_refused_by_name(tmp_path):
     assert_refused(tmp_path / "nothing", "does not exist")
     assert_refused(tmp_path / ("a" * 300), "cannot be read: File name too long")
     assert_refused(tmp_path, "is no capture", "COLMAP")
+    (tmp_path / WORK).mkdir()
+    assert_refused(tmp_path, "is a capture that is not finished", "drgs capture command again")
     file = tmp_path / "transforms.json"
     for text, word in (
         ("{", "not JSON"),

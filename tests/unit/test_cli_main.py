@@ -81,6 +81,14 @@ def test_usage_errors_exit_64(arguments, capsys):
 
 
 @pytest.mark.parametrize(
+    "option", ["--inside=1,0,0", "--inside=open", "--surface=mesh", "--surface=particles", "--passes=all"]
+)
+def test_options_of_relight_without_effect_are_refused_by_name(option, capsys):
+    assert main(["relight", "a.drgs", "--out", "o.png", option]) == errors.EXIT_USAGE
+    assert f"drgs: {option.partition('=')[0]}: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("raised", "code"),
     [
         (errors.AssetError("a.drgs", "is damaged", "Restore it"), 65),
