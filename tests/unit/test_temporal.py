@@ -391,6 +391,33 @@ def test_window_follows_what_grows_and_comes_nearer() -> None:
         np.testing.assert_allclose(expected[inner], at(frame)[inner], atol=0.6 * PITCH)
 
 
+@pytest.mark.parametrize(("roughness", "stripes"), [(0.15, 0.2), (0.5, 0.0)])
+def test_window_leaves_reflections_that_glide_and_gathers_broad_lobes(roughness: float, stripes: float) -> None:
+    """A plate turns by five degrees a frame; on a polished one stripes of four pixels glide by one and a half."""
+
+    def shine(frame: int) -> np.ndarray:
+        return 0.3 + stripes * np.sin(np.pi / 2 * (np.arange(W) + 1.5 * frame))
+
+    pictures = []
+    for k in range(-2, 3):
+        guides, angle, before = wall(), np.radians(5.0 * k), np.radians(5.0 * (k - 1))
+        guides.normal[:] = [np.sin(angle), -np.cos(angle), 0]
+        guides.position[..., 1] = -np.tan(angle) * guides.position[..., 0]
+        guides.roughness[:] = roughness
+        motion = still(guides)
+        motion.previous[..., 1] = -np.tan(before) * guides.position[..., 0]
+        one = picture(guides, 0.0, 0.0, k + 2, motion)
+        noise = 0.03 * np.random.default_rng(k + 2).normal(size=(H, W))
+        one.components[:, :, 2] = (shine(k) + noise)[..., None]
+        one.variance[..., 1] = 0.03**2
+        pictures.append(one)
+    together, alone = (
+        np.abs(window(some)[8:-8, 12:-12, 2, 0] - shine(0)[12:-12]).mean()
+        for some in (pictures, [None, None, pictures[2], None, None])
+    )
+    assert together < (1.05 if stripes else 0.9) * alone
+
+
 def test_window_depends_on_its_frames_alone() -> None:
     """Whoever renders a frame, and in which run, gets the same bits; the frames' order of creation is irrelevant."""
     pictures = [picture(wall(k), 2.0, 0.3, k, moved(wall(k), 1.0)) for k in range(7)]
