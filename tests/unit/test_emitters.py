@@ -12,6 +12,7 @@ from test_light_sampler import irradiance, light
 from test_surface import matrix, mesh_state
 
 from drgs_blender.compute.jit import njit
+from drgs_blender.core.color import LUMINANCE
 from drgs_blender.core.frame import MeshState, Visibility, World
 from drgs_blender.core.materials import Image, Material, Texture
 from drgs_blender.render.integrator.integrate import integrate
@@ -228,6 +229,18 @@ def test_furnace(rings: int, counts: tuple[int, int, int]) -> None:
     below = light_of([shell], False, counts=(16, 16, 0), count=2000)
     assert_equal_light(within, below)
     assert_equal_light(within, under)
+
+
+def test_moments_are_of_all_the_light_that_a_point_has() -> None:
+    """Sums of samples' luminance: of sky, of what glows and is sampled or met by rays, and of indirect light."""
+    panels = [panel(place((0, 0.4, 0.8), 0.4)), mesh_state(SQUARE, FACES, place((0.5, 0, 0.5), 0.3), materials=[GLOW])]
+    seen = points(500, albedo=0.8, roughness=0.4, origin=(0.3, 0.1, 0.0))
+    scene = scene_of(*panels, mesh_state(SQUARE, FACES, place((0, 0, -0.5))))
+    sky, lamps = EnvironmentLight(World(strength=0.3)), Lights([], np.zeros(3), 3.0, Emitters(scene))
+    found = integrate(scene, sky, seen, settings(16, 8, 8, bounces=2, shading_model="principled"), 0, lamps)
+    light = found.components.reshape(-1, 2, 2, 3).sum(axis=2) @ LUMINANCE
+    assert (light > 0).all()
+    np.testing.assert_allclose(found.moments[:, [1, 3]], light, rtol=1e-4)
 
 
 def test_textures_are_looked_up_where_the_light_comes_from() -> None:

@@ -11,7 +11,16 @@ from drgs_blender.render.camera import camera_parameters, camera_ray
 from drgs_blender.render.denoise.demodulation import LIGHT, PAD, SOURCE, Signal
 from drgs_blender.render.denoise.kept_light import SETTLED, to_trace
 from drgs_blender.render.denoise.svgf_spatial import prepare
-from drgs_blender.render.denoise.svgf_temporal import NoisyPicture, denoise_next
+from drgs_blender.render.denoise.svgf_temporal import (
+    BIAS,
+    NOW,
+    PAST,
+    RADIUS,
+    NoisyPicture,
+    denoise_next,
+    find_change,
+    warp,
+)
 from drgs_blender.render.denoise.svgf_window import _neighbours, window
 from drgs_blender.render.film.guides import Guides
 from drgs_blender.render.film.motion_vectors import Motion, MotionFilm, SceneState, previous_positions, project
@@ -229,6 +238,18 @@ def test_the_variance_it_reports_is_the_one_it_has() -> None:
     signal = gathered([picture(guides, 2.0, 0.5, k, still(guides)) for k in range(6)])
     reported = signal.light[:, 2, PAD : PAD + W].mean()
     assert abs(reported / diffuse(signal).var() - 1) < 0.15
+
+
+def test_noise_alone_counts_as_hardly_any_change() -> None:
+    """The square of a normal error beyond its variance, where it is beyond, is .484 of that variance in the mean."""
+    guides = wall()
+    now, before = (
+        prepare(p.components, p.variance, guides, False) for p in (picture(guides, 2, 0.3, k) for k in (0, 1))
+    )
+    past, source = warp(before, now, np.zeros((H, W, 2), np.float32), guides.position)
+    change = find_change(now, past, source)[8:-8, :, PAD + 8 : PAD + W - 8]
+    expected = 0.484 * (change[:, NOW] + change[:, PAST]) / (2 * RADIUS + 1) ** 2
+    assert change[:, BIAS].mean() == pytest.approx(expected.mean(), rel=0.15)
 
 
 @pytest.mark.parametrize("pixels", [3.0, 2.4])
