@@ -125,7 +125,8 @@ def _check(edit: Edit, subject: str) -> None:
             subject, f"{int((~np.isfinite(edit.vertices)).any(axis=1).sum())} vertices are not finite", "Correct them"
         )
     if m and (edit.faces.min() < 0 or edit.faces.max() >= n):
-        raise AssetError(subject, f"faces refer to vertex {int(edit.faces.max())} of {n}", _REMEDY)
+        wrong = int(edit.faces[(edit.faces < 0) | (edit.faces >= n)][0])
+        raise AssetError(subject, f"faces refer to vertex {wrong} of {n}", _REMEDY)
 
 
 def follow(cut: Asset, vertices: Array) -> tuple[Surfels, Binding]:

@@ -51,10 +51,10 @@ def _axes(turn: float) -> np.ndarray:
 
 
 def sees_any(camera: Camera, points: np.ndarray) -> bool:
-    """Whether any of (n, 3) world points is in the picture of a perspective or orthographic camera."""
+    """Whether any of (n, 3) world points is in picture and clip range of a perspective or orthographic camera."""
     local = (points - camera.matrix_world[:3, 3]) @ camera.matrix_world[:3, :3]
     depth = np.ones(len(local)) if camera.orthographic else -local[:, 2]
-    ahead = -local[:, 2] > 0
+    ahead = (-local[:, 2] > max(camera.clip_start, 0.0)) & (-local[:, 2] < camera.clip_end)
     safe = np.where(ahead, depth, 1.0)
     x, y = camera.cx + camera.fx * local[:, 0] / safe, camera.cy - camera.fy * local[:, 1] / safe
     return bool((ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)).any())

@@ -174,8 +174,8 @@ def run(args: argparse.Namespace) -> int:
         shape = shape if len(shape) else asset.surfels.centre
         camera = given or framing_camera(shape, 360.0 * (number - 1) / (args.orbit or 1), args.size or SIZE)
         if not warned and not camera.panorama and not sees_any(camera, shape):
-            logger.warning("%s is not in the picture: it lies %s. Point the camera there, or leave --camera out",
-                           args.asset.stem, place_of(shape))  # fmt: skip
+            logger.warning("%s is not in the picture: it lies %s. Point the camera there (its clip range too), or "
+                           "leave --camera out", args.asset.stem, place_of(shape))  # fmt: skip
             warned = True
         if not warned and not args.captured and (size := size_around(camera.matrix_world[:3, 3], shape)) is not None:
             logger.warning("the camera is inside %s (a box of %s m): move it back", args.asset.stem, size)

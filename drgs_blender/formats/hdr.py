@@ -26,7 +26,7 @@ def read_hdr(path: Path) -> tuple[Array, dict[str, str]]:
     """
     subject = str(path)
     data = path.read_bytes()
-    match = re.search(rb"\n\r?\n([+-][XY]) (\d{1,6}) ([+-][XY]) (\d{1,6})\n", data[: 1 << 16].replace(b"\r\n", b"\n"))
+    match = re.search(rb"\n\r?\n([+-][XY]) (\d{1,12}) ([+-][XY]) (\d{1,12})\n", data[: 1 << 16].replace(b"\r\n", b"\n"))
     if not data.startswith((b"#?RADIANCE", b"#?RGBE", b"#?")) or match is None:
         raise AssetError(subject, "has no complete Radiance header", _DAMAGED)
     text = data[: match.start()].decode("latin-1")

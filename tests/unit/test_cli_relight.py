@@ -314,6 +314,9 @@ def test_an_object_outside_the_picture_is_told(folder, relight, tmp_path, capsys
     relight("--camera", str(tmp_path / "away.json"))
     said = capsys.readouterr().err
     assert "lit is not in the picture: it lies between (-1, -1, -1) and (1, 1, 1) m" in said
+    (tmp_path / "near.json").write_text(json.dumps(FRONT | {"fov_x": 30, "clip_start": 0.1, "clip_end": 0.2}))
+    relight("--camera", str(tmp_path / "near.json"))
+    assert "not in the picture" in capsys.readouterr().err
     relight()
     assert "not in the picture" not in capsys.readouterr().err
 

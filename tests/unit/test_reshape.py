@@ -100,6 +100,7 @@ def test_a_hole_is_closed_with_surfels_of_the_materials_around(ball: Asset) -> N
     ("change", "message"),
     [
         ({"faces": np.int32([[0, 1, 99999]]), "face": np.int32([0])}, "refer to vertex 99999"),
+        ({"faces": np.int32([[0, 1, -1]]), "face": np.int32([0])}, "refer to vertex -1 "),
         ({"face": np.int32([0])}, "face have shape"),
         ({"vertices": np.full((642, 3), np.nan, np.float32)}, "642 vertices are not finite"),
         ({"face": np.full(1280, -1, np.int32)}, "no face of its asset left"),

@@ -251,7 +251,8 @@ class Mesh:
         if self.faces.ndim != 2 or self.faces.shape[1] != 3:
             raise AssetError("mesh faces", f"have shape {self.faces.shape}, expected (-1, 3)")
         if len(self.faces) and (self.faces.min() < 0 or self.faces.max() >= n):
-            raise AssetError("mesh faces", f"refer to vertex {int(self.faces.max())} but there are only {n} vertices")
+            wrong = int(self.faces[(self.faces < 0) | (self.faces >= n)][0])
+            raise AssetError("mesh faces", f"refer to vertex {wrong} but there are only {n} vertices, from 0 on")
         self.albedo = as_float(self.albedo, (n, 3), "mesh albedo")
         self.roughness = as_float(self.roughness, (n,), "mesh roughness")
         self.metallic = as_float(self.metallic, (n,), "mesh metallic")
