@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from flicker import flicker
+from flicker import flicker, to_frame_before
 from judge import environments, foreground, frame_camera, psnr, run_cycles
 from ours import SESSION, pinhole
 from report import OUT, table, write_section
@@ -79,8 +79,8 @@ def bending(options: argparse.Namespace, step: float, environment: str) -> Seque
         frame.previous = MotionStep(frame.camera, [Pose("cat", np.eye(4)[None], before)])
         sequence.jobs[k]["mesh"] = str(FOLDER / f"{sequence.name}-{k}.npz")
         save_mesh(Path(sequence.jobs[k]["mesh"]), replace(mesh, vertices=now))
-        vector = SESSION.render(replace(frame, settings=replace(frame.settings, samples=1), passes=("Vector",)))
-        vectors.append(vector["Vector"][..., :2] * np.float32([1, -1]))
+        moved = replace(frame, settings=replace(frame.settings, samples=1), passes=("Vector",))
+        vectors.append(to_frame_before(SESSION.render(moved)))
     return replace(sequence, vectors=np.stack(vectors))
 
 

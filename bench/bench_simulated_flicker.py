@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from bench_asset import FOLDER
 from bench_simulated_relit import rendered, simulated
-from flicker import flicker
+from flicker import flicker, to_frame_before
 from judge import foreground
 from other_methods import Baked
 from report import OUT, table, write_section
@@ -42,7 +42,7 @@ def motion(session: Session, key: str, camera: Camera, before: Array, now: Array
         passes=("Vector", "Coverage"), previous=MotionStep(camera, [Pose("truth", np.eye(4)[None], before)]),
     )  # fmt: skip
     pictures = session.render(frame)
-    return pictures["Vector"][..., :2] * np.float32([1, -1]), pictures["Coverage"][..., 0]
+    return to_frame_before(pictures), pictures["Coverage"][..., 0]
 
 
 def measured(name: str, scenes: Path, first: int, last: int, samples: int) -> list[list[object]]:

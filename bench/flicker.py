@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from judge import to_srgb
 from scipy.ndimage import map_coordinates
@@ -9,6 +11,11 @@ from scipy.ndimage import map_coordinates
 from drgs_blender.core.color import LUMINANCE
 
 Array = np.ndarray
+
+
+def to_frame_before(passes: Mapping[str, Array]) -> Array:
+    """(h, w, 2) `flicker`'s vectors, of passes with ``Vector``, whose Y points up."""
+    return passes["Vector"][..., :2] * np.float32([1, -1])
 
 
 def flicker(pictures: Array, mask: Array, vectors: Array | None = None, *, converged: Array | None = None) -> float:

@@ -18,7 +18,7 @@ def ours(case: Case, size: int, seeds: int, counts: tuple[int, ...]) -> Series:
     """In seconds by the clock; everything is built anew for each picture."""
     case.picture(size, 8)  # kernels and pages of files
     tiny = [case.picture(TINY, 1, seed)[1] for seed in range(seeds)]
-    return series(tiny, {n: [case.picture(size, n, seed) for seed in range(seeds)] for n in counts})[0]
+    return series(tiny, {n: [case.picture(size, n, seed) for seed in range(seeds)] for n in counts})
 
 
 def ratios(a: Series, b: Series, of: str) -> list[float]:

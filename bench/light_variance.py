@@ -45,14 +45,14 @@ def chosen(options: argparse.Namespace) -> list[Case]:
     return cases
 
 
-def series(tiny: list[float], found: dict[int, list[tuple[Array, float]]]) -> tuple[Series, Reference]:
+def series(tiny: list[float], found: dict[int, list[tuple[Array, float]]]) -> Series:
     """Of the seconds of tiny pictures, and by number of samples the pictures that differ by their seed with theirs."""
     reference = Reference.of(np.mean([picture for picture, _ in found[max(found)]], axis=0))
     noise = [noise_of(*map(list, zip(*pictures, strict=True)), reference) for pictures in found.values()]  # type: ignore[arg-type]
-    return Series(tuple(found), noise, float(np.median(tiny))), reference
+    return Series(tuple(found), noise, float(np.median(tiny)))
 
 
-def ours(case: Case, size: int, seeds: int, counts: tuple[int, ...]) -> tuple[Series, Reference]:
+def ours(case: Case, size: int, seeds: int, counts: tuple[int, ...]) -> Series:
     """In processor seconds."""
     session = Session()
     key = session.load_asset(case.files[0])
@@ -85,14 +85,14 @@ def cycles(
     def found(case: Case, n: int) -> list[tuple[Array, float]]:
         return [(np.load(path), took[str(path)]) for path in (out(case, n, seed) for seed in range(seeds))]
 
-    return [series([s for _, s in found(case, 0)], {n: found(case, n) for n in counts})[0] for case in cases]
+    return [series([s for _, s in found(case, 0)], {n: found(case, n) for n in counts}) for case in cases]
 
 
 def variance(options: argparse.Namespace) -> str:
     """The part's text."""
     cases, size, seeds = chosen(options), options.cases_size, options.cases_seeds
     counts, spp = tuple(options.cases_samples), tuple(options.cases_spp)
-    own = [ours(case, size, seeds, counts)[0] for case in cases]
+    own = [ours(case, size, seeds, counts) for case in cases]
     theirs = cycles(cases, size, seeds, spp) if spp else [None] * len(cases)
     rows, ratios, below = [], [], 0
     for case, a, b in zip(cases, own, theirs, strict=True):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..core.arrays import outside
 from ..core.asset.model import (
     BASE_CHANNELS,
     MATERIAL_CHANNELS,
@@ -124,8 +125,7 @@ def _check(edit: Edit, subject: str) -> None:
         raise AssetError(
             subject, f"{int((~np.isfinite(edit.vertices)).any(axis=1).sum())} vertices are not finite", "Correct them"
         )
-    if m and (edit.faces.min() < 0 or edit.faces.max() >= n):
-        wrong = int(edit.faces[(edit.faces < 0) | (edit.faces >= n)][0])
+    if (wrong := outside(edit.faces, n)) is not None:
         raise AssetError(subject, f"faces refer to vertex {wrong} of {n}", _REMEDY)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..core.arrays import outside
 from ..core.asset.model import MATERIAL_CHANNELS, Array, Asset, Mesh, SourceVertices
 from ..core.bare_faces import REACH
 from ..core.errors import AssetError
@@ -91,8 +92,8 @@ def _check(vertices: Array, faces: Array, name: str) -> None:
         raise AssetError(name, "has no faces", "Choose a mesh with a surface")
     if lost := int((~np.isfinite(vertices)).any(axis=1).sum()):
         raise AssetError(name, f"has {lost} vertices that are not finite", "Correct them")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise AssetError(name, f"has faces of vertex {int(faces.max())} of {len(vertices)}", "Write it again")
+    if (wrong := outside(faces, len(vertices))) is not None:
+        raise AssetError(name, f"has faces of vertex {wrong} of {len(vertices)}", "Write it again")
 
 
 def _agreement(asset: Asset) -> float | None:

@@ -17,7 +17,7 @@ from ..core.asset.archive import replace_file
 from ..core.errors import UsageError, WriteError, first_of
 from ..core.file_lock import FileLock
 from ..formats.images import write_image
-from ..reconstruct.readers.layout import UNFINISHED, decode_mask
+from ..reconstruct.readers.layout import WORK, decode_mask
 from .pictures import FOLDERS, MASKS, Picture, write_picture
 from .registration import Registration
 from .report import draw_cameras, write_report
@@ -26,9 +26,7 @@ logger = logging.getLogger(__name__)
 
 #: Files of a finished capture; the last is written last.
 REPORT, DRAWING, POINTS, CAMERAS = "capture.json", "capture.png", "sparse_points.ply", "transforms.json"
-#: Folder of what a run needs to go on; removed when the capture is complete.
-WORK = UNFINISHED
-#: In it: locked by the process that makes the capture.
+#: In `WORK`: locked by the process that makes the capture.
 LOCK = "lock"
 #: In it: the key of the inputs that it belongs to.
 INPUTS = "inputs"

@@ -98,14 +98,14 @@ def extract(database: Path, pictures: Path, masks: Path | None, photos: Sequence
         camera = next((names[photo.file] for photo in group if photo.file in names), -1)
         left = [photo for photo in group if photo.file not in names]
         done += len(group) - len(left)
-        for batch in _batches(left, masks):
+        for batch, masked in _batches(left, masks):
             if cancelled():
                 raise Cancelled
             check_room(database.parent)
             tell("finding features", done / len(photos))
             reader = colmap.ImageReaderOptions()
             reader.camera_model = "SIMPLE_RADIAL"
-            if masks and _mask_of(batch[0], masks).is_file():
+            if masked:
                 reader.mask_path = str(masks)
             if camera >= 0:
                 reader.existing_camera_id = camera
@@ -123,17 +123,19 @@ def extract(database: Path, pictures: Path, masks: Path | None, photos: Sequence
     tell("finding features", 1.0)
 
 
-def _mask_of(photo: Photo, masks: Path) -> Path:
-    """Where COLMAP looks for the mask of a picture."""
-    return masks / f"{photo.file}.png"
+def mask_file(masks: Path, file: str) -> Path:
+    """Where COLMAP looks for the mask of the picture `file`, in the folder `masks`."""
+    return masks / f"{file}.png"
 
 
-def _batches(photos: Sequence[Photo], masks: Path | None) -> Iterator[list[Photo]]:
-    """At most `_BATCH` pictures each, that all have a mask or all have none: COLMAP skips what lacks its mask."""
-    masked = [photo for photo in photos if masks and _mask_of(photo, masks).is_file()]
-    for some in (masked, [photo for photo in photos if photo not in masked]):
+def _batches(photos: Sequence[Photo], masks: Path | None) -> Iterator[tuple[list[Photo], bool]]:
+    """At most `_BATCH` pictures each, and whether all have a mask or none has: COLMAP skips what lacks its mask."""
+    groups: dict[bool, list[Photo]] = {True: [], False: []}
+    for photo in photos:
+        groups[masks is not None and mask_file(masks, photo.file).is_file()].append(photo)
+    for masked, some in groups.items():
         for start in range(0, len(some), _BATCH):
-            yield some[start : start + _BATCH]
+            yield some[start : start + _BATCH], masked
 
 
 def check_room(folder: Path) -> None:

@@ -22,7 +22,7 @@ from ..core.color import linear_to_srgb, to_unit
 from ..core.errors import AssetError, first_of
 from ..core.file_types import VIDEOS
 from ..formats.exr import write_exr_picture
-from ..formats.images import write_image
+from ..formats.images import write_image, write_png
 from ..reconstruct.readers.layout import PICTURES, decode_mask, find_mask, load_picture
 from . import libraries
 from .camera_raw import RAW, decode_raw, read_raw_metadata
@@ -365,7 +365,7 @@ def write_picture(picture: Picture, folder: Path) -> Path:
         return target
     if pixels.dtype == np.uint8:
         target = folder / f"{picture.name}.png"
-        write_image(target, Pillow.fromarray(pixels))
+        write_png(target, pixels)
         return target
     if pixels.dtype.kind == "f":
         if float((pixels[..., :3].max(axis=2) > 1).mean()) > _SPECKS:

@@ -15,7 +15,7 @@ from ..core.arrays import Array
 from ..core.errors import AssetError, Cancelled, DeviceError, first_of
 from ..formats.images import write_image
 from ..reconstruct.readers.layout import decode_mask
-from .features import Photo, Tell
+from .features import Photo, Tell, mask_file
 from .inspection import Look, look
 from .left_out import Cause, Reason
 from .marker_sheet import detect
@@ -86,7 +86,7 @@ def prepare(pictures: Sequence[Picture], work: Path, size: int, seek_markers: bo
             raise Cancelled
         tell("reading pictures", index / len(pictures))
         try:
-            small, mask = _small(picture, folder / file, masks / f"{file}.png", size)
+            small, mask = _small(picture, folder / file, mask_file(masks, file), size)
         except AssetError as error:
             reason = Reason.EMPTY_MASK if isinstance(error, EmptyMask) else Reason.UNREADABLE
             result.broken[picture.path.name] = Cause(reason, error.problem)

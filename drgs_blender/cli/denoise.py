@@ -186,9 +186,9 @@ class _Source:
         return self._held[number][1]
 
     def other_sizes(self, number: int) -> str:
-        """Names of the frames in the window of one that have another size, which cannot help."""
-        frames = {k: self.frame(k).picture.variance.shape[:2] for k in self._window(number) if k is not None}
-        return ", ".join(frame_path(self._template, k).name for k in frames if frames[k] != frames[number])
+        """Names of the frames in the window of `denoise`'s last one that have another size, which cannot help."""
+        sizes = {k: noisy.picture.variance.shape[:2] for k, (_, noisy) in sorted(self._held.items())}
+        return ", ".join(frame_path(self._template, k).name for k in sizes if sizes[k] != sizes[number])
 
     def denoise(self, number: int, passes: tuple[str, ...] | None) -> tuple[NoisyFrame, dict[str, np.ndarray], bool]:
         """The noisy frame, its denoised passes, and whether a neighbour has the very same noise."""

@@ -1,4 +1,4 @@
-"""Bitwise equality of arrays, read-only arrays, and arrays that another process can map."""
+"""Bitwise equality of arrays, their range, read-only arrays, and arrays that another process can map."""
 
 from __future__ import annotations
 
@@ -38,6 +38,14 @@ def same_bits(a: Array, b: Array) -> bool:
         return False
     word = np.uint64 if a.nbytes % 8 == 0 else np.uint8
     return bool(np.array_equal(a.reshape(-1).view(word), b.reshape(-1).view(word)))
+
+
+def outside(numbers: Array, high: int, low: int = 0) -> int | None:
+    """The worst of integers that are not in low .. high - 1; None where all are."""
+    if not numbers.size:
+        return None
+    least, most = int(numbers.min()), int(numbers.max())
+    return least if least < low else most if most >= high else None
 
 
 def frozen(array: Array) -> bool:

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..compute.jit import njit, plain
 from ..compute.threads import ELEMENTS, checkpoint, over_range
+from ..core.arrays import outside
 from ..core.asset.model import BASE_CHANNELS, Binding, Mesh, PosedSurfels, Surfels, neutral_values
 from ..core.asset.part import taken, taken_binding
 from ..core.errors import AssetError
@@ -92,7 +93,7 @@ class MeshDriven:
             raise AssetError(
                 "binding", f"is of {len(binding.face)} surfels but there are {len(surfels)}", "Bind the surfels again"
             )
-        if len(binding.face) and (binding.face.min() < 0 or binding.face.max() >= len(mesh.faces)):
+        if outside(binding.face, len(mesh.faces)) is not None:
             raise AssetError(
                 "binding", f"refers to a face that the mesh of {len(mesh.faces)} faces lacks", "Bind the surfels again"
             )

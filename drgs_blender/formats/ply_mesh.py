@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..compute.jit import njit
+from ..core.arrays import outside
 from ..core.color import srgb_to_linear, to_unit
 from ..core.errors import AssetError
 from .files import MeshFile
@@ -39,8 +40,8 @@ def read_ply_mesh(path: Path) -> MeshFile:
     vertices = _floats(vertex, ("x", "y", "z"))
     notes: list[str] = []
     faces, corner_uvs = _faces(elements, notes, subject)
-    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise AssetError(subject, f"has faces that refer to vertex {int(faces.max())} of {len(vertices)}", _DAMAGED)
+    if (wrong := outside(faces, len(vertices))) is not None:
+        raise AssetError(subject, f"has faces that refer to vertex {wrong} of {len(vertices)}", _DAMAGED)
     mesh = MeshFile(vertices, faces, corner_uvs=corner_uvs, notes=notes)
     columns = vertex.columns
     if all(n in columns for n in ("nx", "ny", "nz")):

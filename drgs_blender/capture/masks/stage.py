@@ -15,7 +15,7 @@ from ...core.arrays import Array
 from ...core.errors import AssetError, DeviceError, first_of
 from ...formats.images import write_image
 from .. import libraries
-from ..features import Tell
+from ..features import Tell, mask_file
 from ..pictures import Picture
 from ..registration import Registration
 from ..world_alignment import GUESSED, LOWEST
@@ -134,7 +134,7 @@ def make_or_check(mode: str, found: Registration, by_file: dict[str, Picture], c
     files = sorted(found.matrices)
     views = [_view(file, by_file[file], found, copies) for file in files]
     if given is not None:
-        there = sum((given / f"{file}.png").is_file() for file in files)
+        there = sum(mask_file(given, file).is_file() for file in files)
         if mode != "given" and there < len(files):
             logger.warning(ONLY_SOME, subject, there, len(files))
         elif mode not in MODES:
@@ -194,7 +194,7 @@ def _check_given(cv2: Any, views: list[MaskView], files: list[str], given: Path,
     """Figures of given masks; AssetError where one cuts the object."""
     parts, masks = [], []
     for file, view in zip(files, views, strict=True):
-        path = given / f"{file}.png"
+        path = mask_file(given, file)
         if not path.is_file():
             continue
         small = whole(view)

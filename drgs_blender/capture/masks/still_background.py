@@ -20,7 +20,7 @@ from scipy.ndimage import binary_fill_holes, binary_propagation, label
 from ...core.arrays import Array
 from ...core.errors import Cancelled
 from ...formats.images import write_image
-from ..features import Photo, Tell
+from ..features import Photo, Tell, mask_file
 from .ground_picture import exposure_gain
 
 #: Pixels of the longer side at which pictures are compared.
@@ -138,7 +138,7 @@ def write_turned(found: StillBackground, folder: Path, photos: Sequence[Photo]) 
     for photo in photos:
         turned = found.turned.get(photo.file, np.zeros((1, 1), bool))
         mask = Pillow.fromarray(turned.astype(np.uint8) * 255).resize(photo.size, Pillow.Resampling.NEAREST)
-        write_image(folder / f"{photo.file}.png", mask)
+        write_image(mask_file(folder, photo.file), mask)
     return folder
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import outside
 from ..errors import AssetError, VersionError
 from ..version import __version__
 from .archive import read_archive, write_archive
@@ -332,9 +333,8 @@ def _fields(part: Surfels | Mesh | Binding | Environment | SourceVertices, famil
 
 
 def _check_indices(indices: Array, limit: int, where: str, what: str) -> None:
-    if indices.size and (indices.min() < 0 or indices.max() >= limit):
-        worst = indices.min() if indices.min() < 0 else indices.max()
-        raise AssetError(where, f"refers to number {int(worst)} of {limit} {what}", _RESTORE)
+    if (wrong := outside(indices, limit)) is not None:
+        raise AssetError(where, f"refers to number {wrong} of {limit} {what}", _RESTORE)
 
 
 def _check_values(array: Array, name: str, where: str) -> None:

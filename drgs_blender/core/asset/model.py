@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import outside
 from ..errors import AssetError
 from .textures import MeshTextures
 
@@ -250,8 +251,7 @@ class Mesh:
         self.faces = np.ascontiguousarray(self.faces, dtype=np.int32)
         if self.faces.ndim != 2 or self.faces.shape[1] != 3:
             raise AssetError("mesh faces", f"have shape {self.faces.shape}, expected (-1, 3)")
-        if len(self.faces) and (self.faces.min() < 0 or self.faces.max() >= n):
-            wrong = int(self.faces[(self.faces < 0) | (self.faces >= n)][0])
+        if (wrong := outside(self.faces, n)) is not None:
             raise AssetError("mesh faces", f"refer to vertex {wrong} but there are only {n} vertices, from 0 on")
         self.albedo = as_float(self.albedo, (n, 3), "mesh albedo")
         self.roughness = as_float(self.roughness, (n,), "mesh roughness")

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import outside
 from ..errors import AssetError
 from .model import OPTIONAL_CHANNELS, SURFEL_CHANNELS, Array, Asset, Binding, Mesh, Surfels
 
@@ -119,8 +120,8 @@ def _check(asset: Asset, part: Part, subject: str) -> None:
         fits = rows.dtype.kind == "i" and rows.ndim == len(shape)
         if not fits or any(wanted not in (-1, found) for wanted, found in zip(shape, rows.shape, strict=True)):
             raise AssetError(subject, f"{name} of its part have shape {rows.shape} and type {rows.dtype}", _REMEDY)
-        if rows.size and (rows.min() < 0 or rows.max() >= count):
-            raise AssetError(subject, f"{name} of its part refer to number {int(rows.max())} of {count}", _REMEDY)
+        if (wrong := outside(rows, count)) is not None:
+            raise AssetError(subject, f"{name} of its part refer to number {wrong} of {count}", _REMEDY)
 
 
 def _surfels_of(face: Array, part: Part, faces: int) -> tuple[Array, Array]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import outside
 from ..errors import AssetError
 
 Array = np.ndarray
@@ -94,9 +95,8 @@ class MeshTextures:
             ("slots", self.slots, -1, len(self.images)),
             ("extensions", self.extensions, 0, len(EXTENSIONS)),
         ):
-            if values.size and (values.min() < low or values.max() >= high):
-                worst = values.min() if values.min() < low else values.max()
-                raise AssetError(f"textures {name}", f"refer to number {int(worst)} of {high}", _REMEDY)
+            if (wrong := outside(values, high, low)) is not None:
+                raise AssetError(f"textures {name}", f"refer to number {wrong} of {high}", _REMEDY)
 
     @property
     def optional(self) -> tuple[str, ...]:

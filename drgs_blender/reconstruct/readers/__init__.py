@@ -20,7 +20,7 @@ from ..memory_budget import check_fits
 from . import colmap, llff, nero, tensoir, transforms
 from .camera_overlap import check_overlap
 from .exposures import find_gains
-from .layout import UNFINISHED, Layout
+from .layout import WORK, Layout
 from .lens import Lens
 from .photograph_loading import cut_out, find_background, load_photograph
 from .usable_photographs import usable
@@ -220,7 +220,7 @@ def find_layout(path: Path) -> Reader:
         raise AssetError(str(path), f"cannot be read: {error.strerror or error}", "Check its permissions") from error
     if captures:
         raise AssetError(str(path), f"is no capture, but holds some: {first_of(captures)}", "Give one of them")
-    if any(one.name == UNFINISHED for one in inner):
+    if (path / WORK).is_dir():
         raise AssetError(
             str(path), "is a capture that is not finished", "Give the drgs capture command again: it goes on"
         )

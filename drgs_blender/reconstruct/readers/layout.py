@@ -20,8 +20,8 @@ from .lens import Lens
 
 Array = np.ndarray
 
-#: Folder in a capture that `drgs capture` has not finished: what it needs to go on.
-UNFINISHED = "registration"
+#: Folder of what `drgs capture` needs to go on; removed when the capture is complete.
+WORK = "registration"
 #: Camera axes: OpenCV's (x right, y down, z forward) to Blender's and OpenGL's (y up, z backward), applied from the
 #: right to a camera-to-world matrix.
 OPENCV_TO_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])

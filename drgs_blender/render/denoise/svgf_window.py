@@ -226,6 +226,7 @@ def _turn(y0, y1, guide, spans, vector, expected, other, out):  # type: ignore[n
             cosine = both / np.sqrt(max(here * there, np.float32(1e-12)))
             roughness = max(guide[y, ROUGHNESS, c], np.float32(LEAST_ROUGHNESS))
             width = np.float32(LOBES) * roughness * roughness
+            # Of a small angle t, the square of 2 t is 8 (1 - cos t).
             out[y, c] = np.exp(-np.float32(8.0) * max(one - cosine, zero) / (width * width))
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ...compute.jit import plain
 from ...compute.threads import ELEMENTS, over_range
+from ...core.arrays import outside
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
 from ...core.frame import MeshState, Visibility
@@ -221,7 +222,7 @@ def own_faces(item: TraceObject | MeshState) -> Array:
     """(m, 3) int32 faces of `item`; UsageError when they refer to vertices that do not exist."""
     faces = np.ascontiguousarray(item.faces, np.int32).reshape(-1, 3)
     n = len(item.vertices)
-    if len(faces) and (faces.min() < 0 or faces.max() >= n):
+    if outside(faces, n) is not None:
         raise UsageError(item.name, f"faces refer to vertices outside 0..{n - 1}", "Check the mesh's indices")
     return faces
 
