@@ -19,7 +19,7 @@ from ..gbuffer.gbuffer import GBuffer
 from ..sampling import F
 from ..shading_points import CATCHER, SECOND, UNLIT
 from .demodulation import PAD, SOURCE, Signal
-from .svgf_temporal import is_same_surface
+from .svgf_reprojection import is_same_surface
 
 Array = np.ndarray
 

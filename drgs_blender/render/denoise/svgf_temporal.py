@@ -1,8 +1,7 @@
 """Temporal SVGF: reprojection of the last frame's light to this frame's surfaces, and its mixture with the new light.
 
-Pictures are compared on demodulated light, so texture moves with its surface and never ghosts. Every pixel looks up
-where its surface was (`motion`); of the four pixels around that place those count that show the same object, lie on the
-tangent plane there and are turned alike. Where none does, a surface has just come into view and starts over.
+Pictures are compared on demodulated light, so texture moves with its surface and never ghosts. The past is looked up
+where the surface was (`svgf_reprojection`); where it has none, a surface has just come into view and starts over.
 
 This half is recursive, for a picture that follows the user; `svgf_window` has another for final frames. The present's
 weight is not a count of frames but Kalman's gain: with v the variance of this frame and h that of the past, both known
@@ -14,32 +13,30 @@ weight of the present.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from ...compute.jit import inlined, njit
+from ...compute.jit import njit
 from ...compute.threads import ROWS, over_range
 from ..film.motion_vectors import Motion, SceneState
-from ..sampling import ONE, ZERO, F
+from ..sampling import ONE, ZERO
 from .demodulation import (
+    CERTAINTY,
     LEVELS,
     LIGHT,
     LUMINANCE,
-    NORMAL,
     PAD,
-    POSITION,
     SOURCE,
     SURFACE,
     TILE,
     VARIANCE,
-    WIDTH,
     Guides,
     Signal,
     modulate,
 )
+from .svgf_reprojection import warp
 from .svgf_residual import restore, rows_of
 from .svgf_spatial import FEW_TAPS, TAPS, prepare, smooth
 
@@ -50,10 +47,6 @@ Array = np.ndarray
 LEAST_GAIN = (0.2, 0.6)
 #: Levels of the spatial filter where only the camera moves: the past has averaged enough.
 TURNED_LEVELS = 3
-#: Distance from the tangent plane, in pixel widths, up to which a pixel of another frame shows the same surface.
-SAME_PLANE = 2.0
-#: Cosine of the angle by which its normal may differ; surfaces turn between frames.
-SAME_NORMAL = 0.7
 #: Taps of the neighbourhood in which change is looked for: (2 R + 1)^2, `SPACING` pixels apart.
 RADIUS, SPACING = 2, 2
 #: Planes of what `find_change` returns, two lobes each: mean variance now and before, square of the change.
@@ -160,127 +153,11 @@ def accumulate(history: Signal, signal: Signal, motion: Motion, still: bool = Fa
     return Signal(guide, light, signal.spans)
 
 
-def warp(other: Signal, signal: Signal, vector: Array, expected: Array) -> tuple[Array, Array]:
-    """Light of another picture on the surfaces of `signal`, and its ``SOURCE`` (h, w + 2 PAD), NaN where it has none.
-
-    Parameters
-    ----------
-    other, signal : Signal
-    vector : (h, w, 2) float32 array
-        Pixels: where the surfaces of `signal` are in the other picture, see `Motion.vector`.
-    expected : (h, w, 3) float32 array
-        World, m: the place of these surfaces then, see `Motion.previous`.
-    """
-    light = np.zeros_like(signal.light)
-    source = np.full((len(light), light.shape[2]), np.nan, np.float32)
-    over_range(
-        _look_up,
-        len(light),
-        signal.guide,
-        signal.spans,
-        vector,
-        expected,
-        other.guide,
-        other.light,
-        light,
-        source,
-        fewest=ROWS,
-    )
-    return light, source
-
-
 def find_change(signal: Signal, past: Array, source: Array) -> Array:
     """Difference of two pictures beyond their noise, (h, CHANGES, w + 2 PAD) float32."""
     out = np.zeros((len(past), CHANGES, past.shape[2]), np.float32)
     over_range(_compare, len(past), signal.guide, signal.spans, signal.light, past, source, out, fewest=ROWS)
     return out
-
-
-@njit
-def _look_up(y0, y1, guide, spans, vector, expected, other, other_light, out, source):  # type: ignore[no-untyped-def]
-    for y in range(y0, y1):
-        for x in range(spans[y, 0], spans[y, 1]):
-            look_up_pixel(y, x, guide, vector, expected, other, other_light, out, source)
-
-
-@inlined
-def is_same_surface(other, y, c, px, py, pz, nx, ny, nz):  # type: ignore[no-untyped-def]
-    """Whether a pixel of another frame shows a surface.
-
-    Parameters
-    ----------
-    other : (h, GUIDES, w + 2 PAD) float32 array
-        Guide of that frame.
-    y, c : int64
-        Row and padded column of the pixel.
-    px, py, pz, nx, ny, nz : float32
-        Place and normal of the surface, world space.
-
-    Returns
-    -------
-    bool
-    """
-    ox, oy, oz = other[y, NORMAL, c], other[y, NORMAL + 1, c], other[y, NORMAL + 2, c]
-    away = (
-        ox * (px - other[y, POSITION, c])
-        + oy * (py - other[y, POSITION + 1, c])
-        + oz * (pz - other[y, POSITION + 2, c])
-    )
-    alike = ox * nx + oy * ny + oz * nz
-    return abs(away) * other[y, WIDTH, c] < F(SAME_PLANE) and not alike < SAME_NORMAL
-
-
-@njit
-def look_up_pixel(y, x, guide, vector, expected, other, other_light, out, source):  # type: ignore[no-untyped-def]
-    """Reprojection of a pixel: the other picture's light, bilinear over those of four pixels that show its surface.
-
-    Parameters
-    ----------
-    y, x : int64
-        Pixel.
-    guide : (h, GUIDES, w + 2 PAD) float32 array
-        Of this picture, see `Signal`.
-    vector : (h, w, 2) float32 array
-        `Motion.vector`, pixels.
-    expected : (h, w, 3) float32 array
-        `Motion.previous`: place of the surface in the other picture, world, m.
-    other, other_light : (h, planes, w + 2 PAD) float32 array
-        Guide and light of the other picture, see `Signal`.
-    out : (h, planes, w + 2 PAD) float32 array
-        The pixel, which is 0, is written.
-    source : (h, w + 2 PAD) float32 array
-        The pixel is written where it has a past: the surface, see `SURFACE`.
-    """
-    h, planes = out.shape[0], out.shape[1]
-    w = out.shape[2] - 2 * PAD
-    c = x + PAD
-    surface = guide[y, SURFACE, c]
-    px, py = F(x) + vector[y, x, 0], F(y) + vector[y, x, 1]
-    # A comparison that NaN fails too.
-    if not (px > -ONE and py > -ONE and px < F(w) and py < F(h)) or surface != surface:
-        return
-    left, top = math.floor(px), math.floor(py)
-    fx, fy = px - F(left), py - F(top)
-    total = ZERO
-    for j in range(2):
-        for i in range(2):
-            share = (fx if i else ONE - fx) * (fy if j else ONE - fy)
-            yy, cc = top + j, left + i + PAD
-            if share <= F(1e-3) or yy < 0 or yy >= h:
-                continue
-            if other[yy, SOURCE, cc] != surface:
-                continue
-            nx, ny, nz = guide[y, NORMAL, c], guide[y, NORMAL + 1, c], guide[y, NORMAL + 2, c]
-            if not is_same_surface(other, yy, cc, expected[y, x, 0], expected[y, x, 1], expected[y, x, 2], nx, ny, nz):
-                continue
-            total += share
-            for k in range(planes):
-                out[y, k, c] += share * other_light[yy, k, cc]
-    if total > ZERO:
-        source[y, c] = surface
-        inverse = ONE / total
-        for k in range(planes):
-            out[y, k, c] *= inverse
 
 
 @njit
@@ -366,6 +243,7 @@ def mix_pixel(y, c, least, light, past, source, change, guide, out):  # type: ig
             error = change[y, PAST + lobe, c] + change[y, BIAS + lobe, c]
             whole = error + change[y, NOW + lobe, c]
             gain = max(error / whole, least[lobe]) if whole > ZERO else ONE
+            gain = ONE - (ONE - gain) * past[y, CERTAINTY + lobe, c]
         elif known:
             gain = ZERO
         rest = ONE - gain

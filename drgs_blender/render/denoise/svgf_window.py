@@ -13,22 +13,20 @@ import numpy as np
 from ...compute.jit import inlined, njit
 from ...compute.threads import ROWS, over_range
 from .demodulation import (
+    CERTAINTY,
     LIGHT,
     LUMINANCE,
-    NORMAL,
     PAD,
-    POSITION,
-    ROUGHNESS,
     SOURCE,
     SURFACE,
     VARIANCE,
-    WIDTH,
     Signal,
     modulate,
 )
+from .svgf_reprojection import SAME_PLANE, warp
 from .svgf_residual import restore, rows_of
 from .svgf_spatial import prepare, smooth
-from .svgf_temporal import BIAS, CHANGES, NOW, SAME_PLANE, NoisyPicture, find_change, warp
+from .svgf_temporal import BIAS, CHANGES, NOW, NoisyPicture, find_change
 
 Array = np.ndarray
 
@@ -36,10 +34,6 @@ Array = np.ndarray
 MOST_WEIGHT = (1.0, 0.4)
 #: Frames before and after that `window` looks at.
 REACH = 2
-#: Widths of a lobe by which a reflection may turn with its surface until it counts 1/e, and least roughness of a lobe.
-LOBES, LEAST_ROUGHNESS = 3.0, 0.05
-#: Pixel widths up to which a surface has not moved in the world.
-STOOD = 1e-2
 #: Rounds in which the next frame is searched for a surface point.
 SEARCHES = 4
 
@@ -71,6 +65,7 @@ def window(
         raise ValueError("the middle picture is missing")
     signal = prepare(picture.components, picture.variance, picture.guides, split)
     total, weights = np.zeros_like(signal.light), np.zeros((len(signal.light), 2, signal.light.shape[2]), np.float32)
+    signal.light[:, CERTAINTY : CERTAINTY + 2] = 1.0
     still = np.zeros((len(signal.light), CHANGES, signal.light.shape[2]), np.float32)
     over_range(
         _add,
@@ -80,7 +75,6 @@ def window(
         signal.light,
         signal.guide[:, SOURCE],
         still,
-        np.ones(signal.guide[:, SOURCE].shape, np.float32),
         total,
         weights,
         fewest=ROWS,
@@ -90,8 +84,6 @@ def window(
         most = np.array(MOST_WEIGHT, np.float32) ** np.float32(distance)
         other = prepare(neighbour.components, neighbour.variance, neighbour.guides, split)
         seen, source = warp(other, signal, vector, expected)
-        turned = np.zeros(source.shape, np.float32)
-        over_range(_turn, len(turned), signal.guide, signal.spans, vector, expected, other.guide, turned, fewest=ROWS)
         over_range(
             _add,
             len(total),
@@ -100,7 +92,6 @@ def window(
             seen,
             source,
             find_change(signal, seen, source),
-            turned,
             total,
             weights,
             fewest=ROWS,
@@ -140,8 +131,8 @@ def _neighbours(pictures: Sequence[NoisyPicture | None]) -> Iterator[tuple[int, 
 
 
 @njit
-def _add(y0, y1, most, spans, light, source, change, turned, total, weights):  # type: ignore[no-untyped-def]
-    """Add a picture to the window's sums, by the variance of the present against that plus the error, and `_turn`."""
+def _add(y0, y1, most, spans, light, source, change, total, weights):  # type: ignore[no-untyped-def]
+    """Add a picture to the window's sums, by its ``CERTAINTY`` and the present's variance, against that plus bias."""
     width = (light.shape[1] - LIGHT) // 2
     zero, one = np.float32(0.0), np.float32(1.0)
     for y in range(y0, y1):
@@ -151,7 +142,7 @@ def _add(y0, y1, most, spans, light, source, change, turned, total, weights):  #
             for lobe in range(2):
                 noise, bias = change[y, NOW + lobe, c], change[y, BIAS + lobe, c]
                 weight = most[lobe] * (noise / (noise + bias) if bias > zero else one)
-                weight *= turned[y, c] if lobe == 1 else one
+                weight *= light[y, CERTAINTY + lobe, c]
                 weights[y, lobe, c] += weight
                 total[y, VARIANCE + lobe, c] += weight * weight * light[y, VARIANCE + lobe, c]
                 total[y, LUMINANCE + lobe, c] += weight * light[y, LUMINANCE + lobe, c]
@@ -196,38 +187,6 @@ def _away(seen, guides, y, x, px, py, pz):  # type: ignore[no-untyped-def]
         )
         / guides.footprint[y, x]
     )
-
-
-@njit
-def _turn(y0, y1, guide, spans, vector, expected, other, out):  # type: ignore[no-untyped-def]
-    """Part of another picture's glossy light that counts: less the further the surface turned, in widths of its lobe.
-
-    Reflections do not move with the surface, and turn by twice its angle: where dark and bright ones glide over it, the
-    mean change around a pixel, by which `_add` knows of it, may be none. What has not moved has not turned, though its
-    normals, means over a pixel's samples, differ a little.
-    """
-    h, w = vector.shape[0], vector.shape[1]
-    zero, one = np.float32(0.0), np.float32(1.0)
-    for y in range(y0, y1):
-        for c in range(spans[y, 0] + PAD, spans[y, 1] + PAD):
-            x = c - PAD
-            i, j = _nearest(np.float32(x) + vector[y, x, 0], np.float32(y) + vector[y, x, 1], w, h)
-            if i < 0:
-                continue
-            moved, both, here, there = zero, zero, zero, zero
-            for k in range(3):
-                step = expected[y, x, k] - guide[y, POSITION + k, c]
-                a, b = guide[y, NORMAL + k, c], other[j, NORMAL + k, i + PAD]
-                moved += step * step
-                both, here, there = both + a * b, here + a * a, there + b * b
-            if not moved * guide[y, WIDTH, c] * guide[y, WIDTH, c] > np.float32(STOOD * STOOD):
-                out[y, c] = one
-                continue
-            cosine = both / np.sqrt(max(here * there, np.float32(1e-12)))
-            roughness = max(guide[y, ROUGHNESS, c], np.float32(LEAST_ROUGHNESS))
-            width = np.float32(LOBES) * roughness * roughness
-            # Of a small angle t, the square of 2 t is 8 (1 - cos t).
-            out[y, c] = np.exp(-np.float32(8.0) * max(one - cosine, zero) / (width * width))
 
 
 @njit

@@ -29,6 +29,7 @@ from ..denoise.demodulation import (
     modulate_pixel,
     planes_of,
 )
+from ..denoise.svgf_reprojection import look_up_pixel
 from ..denoise.svgf_residual import (
     DIFFERENCE,
     MEASURED,
@@ -58,7 +59,6 @@ from ..denoise.svgf_temporal import (
     PAST,
     RADIUS,
     SPACING,
-    look_up_pixel,
     mix_pixel,
 )
 from ..sampling import ONE, ZERO, F
@@ -135,7 +135,7 @@ def look_up_pixels(
     thread: Any, stride: Any, scratch: Any, guide: Any, spans: Any, vector: Any, expected: Any, other: Any,
     other_light: Any, out: Any,
 ) -> None:  # fmt: skip
-    """`svgf_temporal._look_up`."""
+    """`svgf_reprojection._look_up`."""
     past, source = out
     h, w = guide.shape[0], guide.shape[2] - 2 * PAD
     for column in range(thread, h * (w + 2 * PAD), stride):
