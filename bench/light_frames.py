@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
-from light_cases import TINY, Case
-from light_variance import chosen, cycles, series
+from light_cases import TINY, Case, Reference
+from light_variance import chosen, cycles, reference_of, series
 from noise import Series
 from report import table
 
@@ -14,11 +14,11 @@ from report import table
 MEASURES = {"untrimmed": "relative variance", "shown": "in sRGB"}
 
 
-def ours(case: Case, size: int, seeds: int, counts: tuple[int, ...]) -> Series:
+def ours(case: Case, size: int, seeds: int, counts: tuple[int, ...], reference: Reference) -> Series:
     """In seconds by the clock; everything is built anew for each picture."""
     case.picture(size, 8)  # kernels and pages of files
     tiny = [case.picture(TINY, 1, seed)[1] for seed in range(seeds)]
-    return series(tiny, {n: [case.picture(size, n, seed) for seed in range(seeds)] for n in counts})
+    return series(tiny, {n: [case.picture(size, n, seed) for seed in range(seeds)] for n in counts}, reference)
 
 
 def ratios(a: Series, b: Series, of: str) -> list[float]:
@@ -33,8 +33,9 @@ def frames(options: argparse.Namespace) -> str:
     counts, spp = tuple(options.frames_samples), tuple(options.frames_spp)
     rows, verdicts = [], []
     for size in options.frames_size:
-        own = [ours(case, size, seeds, counts) for case in cases]
-        theirs = cycles(cases, size, seeds, spp, "seconds")
+        references = [reference_of(case, size, options) for case in cases]
+        own = [ours(case, size, seeds, counts, reference) for case, reference in zip(cases, references, strict=True)]
+        theirs = cycles(cases, size, seeds, spp, references, "seconds")
         found = {of: np.array([ratios(a, b, of) for a, b in zip(own, theirs, strict=True)]) for of in MEASURES}
         for i, (case, a, b) in enumerate(zip(cases, own, theirs, strict=True)):
             seconds = (" / ".join(f"{noise.seconds:.2f}" for noise in s.noise) for s in (a, b))
@@ -46,14 +47,13 @@ def frames(options: argparse.Namespace) -> str:
             verdicts.append(f"- {size}x{size}, {name}: {text}")
     columns = [f"ours, s at {' / '.join(map(str, counts))}", f"Cycles, s at {' / '.join(map(str, spp))} spp"]
     columns += [f"time Cycles / ours, {name}" for name in MEASURES.values()]
+    found_text = "\n".join(verdicts) + "\n\n" + table(("Size", "Case", *columns), rows)
     return (
         f"{seeds} seeds, noise by what they differ, materials and lights as in *Light: noise of single cases*. Seconds "
         "by the clock, median, to pixels in memory (ours, with the map's file read) or in a file (Cycles): scene, "
         "environment map and acceleration structure are made again for each picture, program and kernels were loaded "
         f"before. Time until a frame has the noise that Cycles has at {', '.join(map(str, spp))} spp: the setup, that "
         f"of a picture of {TINY}x{TINY} pixels, and sampling, log(samples) linear over log(noise). The variance is "
-        "relative to the mean of the same pictures with most samples, in which a bright dot lowers its own weight: "
-        "where few pixels make the noise (statue, glossy, facing), three seeds say little, and more of *Light: noise "
-        "of single cases* show less. Median / worst of the "
-        "cases:\n\n" + "\n".join(verdicts) + "\n\n" + table(("Size", "Case", *columns), rows)
+        f"relative to {options.reference_rays} samples of ours with another seed. Where few pixels make the noise "
+        f"(statue, glossy, facing), few seeds say little. Median / worst of the cases:\n\n{found_text}"
     )

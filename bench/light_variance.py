@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from judge import decibels, run_cycles, to_srgb
-from light_cases import FOLDER, TINY, Case, Reference
+from light_cases import FOLDER, TINY, Case, Plan, Reference, our_reference
 from light_scenes import EVERY, SHARED, Scene
 from noise import EPSILON, Noise, Series
 from report import table
@@ -45,20 +46,25 @@ def chosen(options: argparse.Namespace) -> list[Case]:
     return cases
 
 
-def series(tiny: list[float], found: dict[int, list[tuple[Array, float]]]) -> Series:
+def reference_of(case: Case, size: int, options: argparse.Namespace) -> Reference:
+    """For both programs: of none of the pictures that are judged, whose bright dots would lower their own weight."""
+    return our_reference(case, replace(Plan.of(options), size=size))
+
+
+def series(tiny: list[float], found: dict[int, list[tuple[Array, float]]], reference: Reference) -> Series:
     """Of the seconds of tiny pictures, and by number of samples the pictures that differ by their seed with theirs."""
-    reference = Reference.of(np.mean([picture for picture, _ in found[max(found)]], axis=0))
     noise = [noise_of(*map(list, zip(*pictures, strict=True)), reference) for pictures in found.values()]  # type: ignore[arg-type]
     return Series(tuple(found), noise, float(np.median(tiny)))
 
 
-def ours(case: Case, size: int, seeds: int, counts: tuple[int, ...]) -> Series:
+def ours(case: Case, size: int, seeds: int, counts: tuple[int, ...], reference: Reference) -> Series:
     """In processor seconds."""
     session = Session()
     key = session.load_asset(case.files[0])
     session.render(case.frame(key, size, 8, 0))  # kernels and tables
     tiny = [timed(session, case.frame(key, TINY, 1, seed))[1] for seed in range(seeds)]
-    return series(tiny, {n: [timed(session, case.frame(key, size, n, seed)) for seed in range(seeds)] for n in counts})
+    found = {n: [timed(session, case.frame(key, size, n, seed)) for seed in range(seeds)] for n in counts}
+    return series(tiny, found, reference)
 
 
 def timed(session: Session, frame: Frame) -> tuple[Array, float]:
@@ -69,7 +75,12 @@ def timed(session: Session, frame: Frame) -> tuple[Array, float]:
 
 
 def cycles(
-    cases: list[Case], size: int, seeds: int, counts: tuple[int, ...], clock: str = "processor_seconds"
+    cases: list[Case],
+    size: int,
+    seeds: int,
+    counts: tuple[int, ...],
+    references: list[Reference],
+    clock: str = "processor_seconds",
 ) -> list[Series]:
     """In the seconds that cycles_job.py calls `clock`."""
 
@@ -85,15 +96,19 @@ def cycles(
     def found(case: Case, n: int) -> list[tuple[Array, float]]:
         return [(np.load(path), took[str(path)]) for path in (out(case, n, seed) for seed in range(seeds))]
 
-    return [series([s for _, s in found(case, 0)], {n: found(case, n) for n in counts}) for case in cases]
+    return [
+        series([s for _, s in found(case, 0)], {n: found(case, n) for n in counts}, reference)
+        for case, reference in zip(cases, references, strict=True)
+    ]
 
 
 def variance(options: argparse.Namespace) -> str:
     """The part's text."""
     cases, size, seeds = chosen(options), options.cases_size, options.cases_seeds
     counts, spp = tuple(options.cases_samples), tuple(options.cases_spp)
-    own = [ours(case, size, seeds, counts) for case in cases]
-    theirs = cycles(cases, size, seeds, spp) if spp else [None] * len(cases)
+    references = [reference_of(case, size, options) for case in cases]
+    own = [ours(case, size, seeds, counts, reference) for case, reference in zip(cases, references, strict=True)]
+    theirs = cycles(cases, size, seeds, spp, references) if spp else [None] * len(cases)
     rows, ratios, below = [], [], 0
     for case, a, b in zip(cases, own, theirs, strict=True):
         at = a.at(EQUAL)
@@ -124,8 +139,8 @@ def variance(options: argparse.Namespace) -> str:
     about = [f"{c.name}: {c.materials}, {c.environment.name}, {getattr(c, 'bounces', 1)} bounces" for c in cases]
     return (
         f"{size}x{size}, {seeds} seeds, {', '.join(map(str, counts))} samples, noise by what "
-        f"seeds differ; relative variance at {EQUAL} samples (trimmed: without the {TRIM:.1%} of the pixels that are "
-        f"worst); processor seconds without the setup, that of a picture of {TINY}x{TINY} pixels, to the relative "
-        f"variance of ours at {EQUAL}; us a ray: of all that {EQUAL} samples take, camera rays among it.{verdict}\n\n"
+        f"seeds differ, relative to {options.reference_rays} samples of ours with another seed; at {EQUAL} samples "
+        f"(trimmed: without the {TRIM:.1%} of the pixels that are worst); processor seconds "
+        f"without the setup, that of a picture of {TINY}x{TINY} pixels, to the relative variance of ours at {EQUAL}; us a ray: of all that {EQUAL} samples take, camera rays among it.{verdict}\n\n"
         f"{table(columns, rows)}\n\n" + "\n".join(f"- {text}" for text in about)
     )
