@@ -140,7 +140,8 @@ def variance(options: argparse.Namespace) -> str:
     return (
         f"{size}x{size}, {seeds} seeds, {', '.join(map(str, counts))} samples, noise by what "
         f"seeds differ, relative to {options.reference_rays} samples of ours with another seed; at {EQUAL} samples "
-        f"(trimmed: without the {TRIM:.1%} of the pixels that are worst); processor seconds "
-        f"without the setup, that of a picture of {TINY}x{TINY} pixels, to the relative variance of ours at {EQUAL}; us a ray: of all that {EQUAL} samples take, camera rays among it.{verdict}\n\n"
+        f"(trimmed: without the {TRIM:.1%} of the pixels that are worst); processor seconds without the setup, that of "
+        f"a picture of {TINY}x{TINY} pixels, to the relative variance of ours at {EQUAL}; us a ray: of all that "
+        f"{EQUAL} samples take, camera rays among it.{verdict}\n\n"
         f"{table(columns, rows)}\n\n" + "\n".join(f"- {text}" for text in about)
     )
