@@ -17,7 +17,15 @@ from drgs_blender.capture.pictures import Picture
 from drgs_blender.capture.pipeline import Settings, make_capture
 from drgs_blender.capture.preparation import Prepared
 from drgs_blender.capture.registration import Registration, register
-from drgs_blender.capture.world_alignment import align_to_ground, align_to_markers, ground_plane, similarity
+from drgs_blender.capture.world_alignment import (
+    CIRCLE,
+    LOWEST,
+    align_to_ground,
+    align_to_markers,
+    circle_axis,
+    ground_plane,
+    similarity,
+)
 from drgs_blender.core.errors import AssetError, Cancelled, DeviceError, UsageError, WriteError
 from drgs_blender.reconstruct.readers import read_capture
 from drgs_blender.reconstruct.readers.layout import OPENCV_TO_BLENDER
@@ -118,6 +126,37 @@ def test_without_a_table_up_is_how_cameras_were_held_and_points_begin_at_zero():
     assert found.points[:1500, 2].min() == pytest.approx(0.0, abs=0.05)
     centres = np.stack([m[:3, 3] for m in found.matrices.values()])
     assert np.median(np.linalg.norm(centres, axis=1)) == pytest.approx(1.0, rel=0.15)
+
+
+def test_a_slab_through_the_foot_of_an_object_is_no_ground():
+    """A statue on a turntable, masked: all points are on it, most on its foot."""
+    random = np.random.default_rng(5)
+    angle, height = 2 * np.pi * random.random(1500), random.random(1500)
+    height[:900] *= 0.16
+    wide = np.where(height < 0.16, 0.06, 0.05)
+    statue = np.column_stack([wide * np.cos(angle), wide * np.sin(angle), 0.25 * height])
+    cameras = {}
+    for k, degrees in enumerate([0, 12, 24, 36, 48, 60, 80, 100, 120, 140, 170, 200, 230, 260, 290, 320, 340]):
+        eye = [0.5 * np.cos(np.radians(degrees)), 0.5 * np.sin(np.radians(degrees)), 0.3]
+        cameras[f"{k:02d}.jpg"] = towards(np.array(eye), roll=0.05)
+    up, centres = np.array([0, 0, 1.0]), np.stack([matrix[:3, 3] for matrix in cameras.values()])
+    assert ground_plane(statue, centres, up, 0.55) is None
+    found = moved(registration(cameras, statue), 0.2, 2)
+    alignment = align_to_ground(found)
+    alignment.apply(found)
+    assert (alignment.up_from, alignment.ground_from) == (CIRCLE, LOWEST) and "up" in alignment.guessed
+    heights = np.stack([matrix[2, 3] for matrix in found.matrices.values()])
+    assert np.ptp(heights) < 1e-6
+    assert found.points[:, 2].min() == pytest.approx(0.0, abs=0.01)
+
+
+def test_cameras_carried_around_an_object_stand_in_no_circle():
+    random = np.random.default_rng(1)
+    angle = np.linspace(0, 2 * np.pi, 30, endpoint=False)
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(30)])
+    assert abs(circle_axis(ring)[2]) == pytest.approx(1.0)
+    for centres in (ring + 0.04 * random.normal(size=ring.shape), ring[:6], ring * [1, 0.1, 1]):
+        assert circle_axis(centres) is None
 
 
 def test_a_wall_is_no_ground():
