@@ -108,7 +108,7 @@ def denoise(args: argparse.Namespace) -> int:
     with FrameLines(openjd=args.openjd and len(frames)) as lines, bar(args, "frames", len(frames)) as progress:
         for done, number in enumerate(frames, 1):
             lines.begin(number, phase="Denoising")
-            path, settings = frame_path(args.out, number), source.settings(number, args.passes)
+            path, settings = frame_path(args.out, number).absolute(), source.settings(number, args.passes)
             whole = None if args.overwrite else frame_store.read_complete(path)
             if whole is not None and whole[1].get(frame_store.SETTINGS) == settings:
                 lines.skipped(path)
@@ -161,8 +161,12 @@ class _Source:
         if self._path(number) is None:
             path = frame_path(self._template, number)
             raise AssetError(str(path), "does not exist", "Render this frame first")
-        around = range(number - self._reach, number + self._reach + 1)
-        return [k if self._path(k) is not None else None for k in around]
+        around = [self._path(k) for k in range(number - self._reach, number + self._reach + 1)]
+        if absent := [str(path) for path in around if path is not None and not path.is_file()]:
+            problem = f"{'does' if len(absent) == 1 else 'do'} not exist, but --sequence names "
+            problem += "it" if len(absent) == 1 else "them"
+            raise AssetError(", ".join(absent), problem, f"Render it first, frame {number} needs it, or shorten --sequence")
+        return [None if path is None else k for k, path in enumerate(around, number - self._reach)]
 
     def settings(self, number: int, passes: tuple[str, ...] | None) -> str:
         """SHA-256 over all that decides what the denoised frame is."""

@@ -228,7 +228,7 @@ def test_what_is_wrong_is_named(denoise, rendered, tmp_path):
     (source / "0002.exr").unlink()
     assert denoise("1", source=source)[0] == 0
     code, _, text = denoise("1", "--sequence", "1-8", source=source, out="strict")
-    assert code == 65 and "0002.exr" in text
+    assert code == 65 and "0002.exr: does not exist, but --sequence names it" in text
     assert "0002.exr: does not exist" in denoise("2", source=source)[2]
     assert denoise("1-2", "--sequence", "1", source=source)[0] == 64
     assert denoise("1", "--window", "4", source=source)[0] == 64
