@@ -163,9 +163,9 @@ class _Source:
             raise AssetError(str(path), "does not exist", "Render this frame first")
         around = [self._path(k) for k in range(number - self._reach, number + self._reach + 1)]
         if absent := [str(path) for path in around if path is not None and not path.is_file()]:
-            problem = f"{'does' if len(absent) == 1 else 'do'} not exist, but --sequence names "
-            problem += "it" if len(absent) == 1 else "them"
-            raise AssetError(", ".join(absent), problem, f"Render it first, frame {number} needs it, or shorten --sequence")
+            problem = "does not exist, but --sequence names it" if len(absent) == 1 else "are named by --sequence alone"
+            remedy = f"Frame {number} needs them: render them first, or shorten --sequence"
+            raise AssetError(", ".join(absent), problem, remedy)
         return [None if path is None else k for k, path in enumerate(around, number - self._reach)]
 
     def settings(self, number: int, passes: tuple[str, ...] | None) -> str:
