@@ -88,8 +88,9 @@ class Histories:
         )
         turned = not still and len(situation) == len(old.situation)
         turned = turned and all(a is b for a, b in zip(situation[1:], old.situation[1:]))
-        ages = old.history.ages if turned else None
-        history = History(old.history.signal, scene_state, still, turned, old.pictures, ages)
+        past = old.history
+        ages = past.ages if turned else None
+        history = History(past.signal, scene_state, still, turned, old.pictures, ages, past.world)
         return Sequence(history, old.past, fit, situation, old.pictures)
 
     def store(self, frame: Frame, sequence: Sequence, prepared: PreparedScene) -> None:

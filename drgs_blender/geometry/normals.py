@@ -253,6 +253,17 @@ def rotation_matrices(quaternions: Array) -> Array:
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
+def rotation_between(first: Array, second: Array) -> float:
+    """Angle of the rotation that leads from one (3, 3) rotation to another, radians.
+
+    Examples
+    --------
+    >>> round(rotation_between(np.diag([1.0, -1.0, -1.0]), np.diag([1.0, 1.0, 1.0])), 4)
+    3.1416
+    """
+    return float(np.arccos(np.clip((np.trace(first.T @ second) - 1) / 2, -1, 1)))
+
+
 def quaternions(matrices: Array) -> Array:
     """(n, 3, 3) rotation matrices -> (n, 4) unit quaternions wxyz with w >= 0, of the same dtype.
 

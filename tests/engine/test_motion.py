@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pictures import assert_same_bits, fresh, with_meshes
+from scipy.spatial.transform import Rotation
 
 from drgs_blender.core.errors import Cancelled, UsageError
-from drgs_blender.core.frame import MotionStep, Pose
+from drgs_blender.core.frame import MotionStep, Pose, World
 from drgs_blender.render.camera import camera_parameters
+from drgs_blender.render.denoise import svgf_temporal
 from drgs_blender.render.denoise.kept_light import SETTLED
 from drgs_blender.render.film.motion_vectors import project
 from drgs_blender.render.pipeline import Batches
@@ -190,6 +192,24 @@ def test_light_follows_what_moves(session, make_frame, asset_path):
                 clean = replace(frame, settings=make_frame(samples=128).settings, history="")
                 results[history] += noise(picture, session.render(clean))
     assert results["view"] < 0.9 * results[""]
+
+
+def test_the_denoiser_knows_by_how_much_the_world_turned(session, make_frame, monkeypatch):
+    told, real = [], svgf_temporal.mixture_rules
+
+    def rules(still, world_turn):
+        told.append((still, world_turn))
+        return real(still, world_turn)
+
+    monkeypatch.setattr(svgf_temporal, "mixture_rules", rules)
+    for k, degrees in enumerate((10, 10, 25, 22)):
+        frame = still_frame(make_frame, k)
+        turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+        frame.world = World(frame.world.environment, turn, strength=frame.world.strength)
+        session.render(frame)
+    (first, no_turn), (second, further), (third, back) = told
+    assert (first, second, third) == (True, False, False)
+    np.testing.assert_allclose([no_turn, further, back], np.radians([0, 15, 3]), atol=1e-6)
 
 
 def test_histories_are_told_apart_and_end_where_they_do_not_fit(session, make_frame, asset_path):

@@ -42,7 +42,7 @@ def nothing() -> None:
 
 
 def pictures(count: int) -> list[NoisyPicture]:
-    """The same surfaces under light that changes, seen by a camera that moves; some light is no number."""
+    """The same surfaces under light that changes, in a world that turns; the camera moves; some light is no number."""
     components, variance, guides = picture()
     found = []
     for k in range(count):
@@ -52,7 +52,7 @@ def pictures(count: int) -> list[NoisyPicture]:
         vector = np.full((H, W, 2), (1.3, -0.6), np.float32)
         vector[10, :5] = np.nan
         previous = (guides.position + np.array([1.3e-3, 0, -0.6e-3])).astype(np.float32)
-        found.append(NoisyPicture(light, variance, guides, Motion(vector, previous)))
+        found.append(NoisyPicture(light, variance, guides, Motion(vector, previous), world_turn=0.1 * k))
     return found
 
 

@@ -412,8 +412,8 @@ def test_window_follows_what_grows_and_comes_nearer() -> None:
         np.testing.assert_allclose(expected[inner], at(frame)[inner], atol=0.6 * PITCH)
 
 
-def turning_plate(roughness: float, stripes: float) -> tuple[list[NoisyPicture], np.ndarray]:
-    """A plate that turns by five degrees a frame, stripes of four pixels gliding over it by one and a half.
+def gliding(roughness: float, stripes: float, world: bool = False) -> tuple[list[NoisyPicture], np.ndarray]:
+    """A plate that turns by five degrees a frame, or its world by ten; stripes of four pixels glide by one and a half.
 
     Five pictures, and the glossy light (w,) of the middle one without its noise.
     """
@@ -423,13 +423,14 @@ def turning_plate(roughness: float, stripes: float) -> tuple[list[NoisyPicture],
 
     pictures = []
     for k in range(-2, 3):
-        guides, angle, before = wall(), np.radians(5.0 * k), np.radians(5.0 * (k - 1))
+        guides, (angle, before) = wall(), np.radians([0.0, 0.0] if world else [5.0 * k, 5.0 * (k - 1)])
         guides.normal[:] = [np.sin(angle), -np.cos(angle), 0]
         guides.position[..., 1] = -np.tan(angle) * guides.position[..., 0]
         guides.roughness[:] = roughness
         motion = still(guides)
         motion.previous[..., 1] = -np.tan(before) * guides.position[..., 0]
         one = picture(guides, 0.0, 0.0, k + 2, motion)
+        one.world_turn = np.radians(10.0) if world else 0.0
         noise = 0.03 * np.random.default_rng(k + 2).normal(size=(H, W))
         one.components[:, :, 2] = (shine(k) + noise)[..., None]
         one.variance[..., 1] = 0.03**2
@@ -437,10 +438,10 @@ def turning_plate(roughness: float, stripes: float) -> tuple[list[NoisyPicture],
     return pictures, shine(0)
 
 
-@pytest.mark.parametrize("over", ["window", "time"])
+@pytest.mark.parametrize("over", ["window", "time", "time, of a world that turns"])
 @pytest.mark.parametrize(("roughness", "stripes"), [(0.15, 0.2), (0.5, 0.0)])
 def test_reflections_that_glide_are_left_and_broad_lobes_gathered(over: str, roughness: float, stripes: float) -> None:
-    pictures, truth = turning_plate(roughness, stripes)
+    pictures, truth = gliding(roughness, stripes, "world" in over)
     alone = window([None, None, pictures[2], None, None])
     if over == "window":
         together = window(pictures)

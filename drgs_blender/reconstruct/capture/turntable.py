@@ -13,6 +13,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion, gaussian_filter
 
 from ...core.arrays import Array
+from ...geometry.normals import rotation_between
 from .capture import View
 
 log = logging.getLogger(__name__)
@@ -57,7 +58,7 @@ def likeness_of_surroundings(views: list[View]) -> float | None:
         for first in range(len(views)):
             second = (first + stride) % len(views)
             alike = shown[first].known.shape == shown[second].known.shape
-            if alike and (np.trace(facing[first].T @ facing[second]) - 1) / 2 < np.cos(np.radians(APART)):
+            if alike and rotation_between(facing[first], facing[second]) > np.radians(APART):
                 found.append(correlation(shown[first], shown[second]))
     known = [value for value in found if value is not None]
     return float(np.median(known)) if len(known) >= PAIRS else None

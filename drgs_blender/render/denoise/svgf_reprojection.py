@@ -98,29 +98,25 @@ def is_same_surface(other, y, c, px, py, pz, nx, ny, nz):  # type: ignore[no-unt
 
 
 @inlined
-def part_kept(moved, cosine, roughness):  # type: ignore[no-untyped-def]
-    """Part of a surface's earlier glossy light that counts: less the further it turned, in widths of its lobe.
+def part_kept(turn, roughness):  # type: ignore[no-untyped-def]
+    """Part of a surface's earlier glossy light that counts: less the further what it reflects turned.
 
-    Reflections do not move with the surface, and turn by twice its angle: where dark and bright ones glide over it, the
-    mean change around a pixel, which `find_change` measures, may be none. What has not moved has not turned, though its
-    normals, means over a pixel's samples, differ a little.
+    Reflections do not move with the surface: where dark and bright ones glide over it, the mean change around a pixel,
+    which `find_change` measures, may be none.
 
     Parameters
     ----------
-    moved : float32
-        Square of the distance that the surface went in the world, pixel widths.
-    cosine : float32
-        Of the angle between its normals in the two frames.
+    turn : float32
+        Square of the angle by which the reflected direction turned against the light, radians.
     roughness : float32
+        Of the surface, whose square is the width of its lobe.
 
     Returns
     -------
     float32
     """
     width = F(LOBES) * max(roughness, F(LEAST_ROUGHNESS)) * max(roughness, F(LEAST_ROUGHNESS))
-    # Of a small angle t, the square of 2 t is 8 (1 - cos t).
-    turned = F(8.0) * max(ONE - cosine, ZERO) / (width * width)
-    return F(math.exp(-turned)) if moved > F(STOOD * STOOD) else ONE
+    return F(math.exp(-turn / (width * width)))
 
 
 @njit
@@ -184,6 +180,8 @@ def look_up_pixel(y, x, guide, vector, expected, other, other_light, out, source
         here = nx * nx + ny * ny + nz * nz
         there = there_x * there_x + there_y * there_y + there_z * there_z
         both = nx * there_x + ny * there_y + nz * there_z
-        cosine = both / F(math.sqrt(max(here * there, F(1e-12))))
+        # Reflections turn by twice a small angle t between normals, whose square is 8 (1 - cos t). What has not moved
+        # has not turned, though its normals, means over a pixel's samples, differ a little.
+        turn = F(8.0) * max(ONE - both / F(math.sqrt(max(here * there, F(1e-12)))), ZERO)
         out[y, CERTAINTY, c] = ONE
-        out[y, CERTAINTY + 1, c] = part_kept(moved, cosine, guide[y, ROUGHNESS, c])
+        out[y, CERTAINTY + 1, c] = part_kept(turn, guide[y, ROUGHNESS, c]) if moved > F(STOOD * STOOD) else ONE

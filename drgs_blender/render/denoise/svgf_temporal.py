@@ -28,6 +28,7 @@ from .demodulation import (
     LIGHT,
     LUMINANCE,
     PAD,
+    ROUGHNESS,
     SOURCE,
     SURFACE,
     TILE,
@@ -36,7 +37,7 @@ from .demodulation import (
     Signal,
     modulate,
 )
-from .svgf_reprojection import warp
+from .svgf_reprojection import part_kept, warp
 from .svgf_residual import restore, rows_of
 from .svgf_spatial import FEW_TAPS, TAPS, prepare, smooth
 
@@ -57,13 +58,15 @@ NOW, PAST, BIAS, CHANGES = 0, 2, 4, 6
 class NoisyPicture:
     """One noisy picture as a frame file holds it; see `svgf_spatial.denoise` for the arrays.
 
-    ``motion`` leads to the frame before; None where there is none.
+    ``motion`` leads to the frame before, None where there is none; ``world_turn`` is the angle by which the environment
+    turned since then, radians.
     """
 
     components: Array
     variance: Array
     guides: Guides
     motion: Motion | None = None
+    world_turn: float = 0.0
 
 
 @dataclass(slots=True)
@@ -84,6 +87,8 @@ class History:
         How many have gone into it.
     ages : (h, w) uint8 array, optional
         How many into each pixel, see `kept_light.to_trace`; None: not known.
+    world : (3, 3) array, optional
+        Rotation of the environment in the last picture.
     """
 
     signal: Signal | None = None
@@ -92,6 +97,7 @@ class History:
     turned: bool = False
     pictures: int = 0
     ages: Array | None = None
+    world: Array | None = None
 
 
 def denoise_next(
@@ -129,27 +135,27 @@ def denoise_next(
     past = None if history is None else history.to_cpu()
     levels, taps = LEVELS, TAPS
     if past is not None and picture.motion is not None and past.light.shape == signal.light.shape:
-        signal = accumulate(past, signal, picture.motion, still)
+        signal = accumulate(past, signal, picture.motion, still, picture.world_turn)
         if turned:
             levels, taps = TURNED_LEVELS, FEW_TAPS
     smoothed = restore(smooth(signal, check, levels=levels, taps=taps), rows_of(signal))
     return modulate(smoothed, picture.guides), signal
 
 
-def least_gain(still: bool) -> Array:
-    """(2,) float32 least weight of the present."""
-    return np.zeros(2, np.float32) if still else np.array(LEAST_GAIN, np.float32)
+def mixture_rules(still: bool, world_turn: float) -> Array:
+    """(3,) float32: least weight of the present, diffuse and glossy; square of `NoisyPicture.world_turn`."""
+    return np.array([*((0.0, 0.0) if still else LEAST_GAIN), world_turn * world_turn], np.float32)
 
 
-def accumulate(history: Signal, signal: Signal, motion: Motion, still: bool = False) -> Signal:
+def accumulate(history: Signal, signal: Signal, motion: Motion, still: bool = False, world_turn: float = 0.0) -> Signal:
     """Mix what earlier frames saw of the same surfaces into a frame's light; see `denoise_next`."""
     past, source = warp(history, signal, motion.vector, motion.previous)
     change = find_change(signal, past, source)
     if still:
         change[:, BIAS : BIAS + 2] = 0.0
-    least = least_gain(still)
+    rules = mixture_rules(still, world_turn)
     guide, light = signal.guide.copy(), np.zeros_like(signal.light)
-    over_range(_mix, len(light), least, signal.spans, signal.light, past, source, change, guide, light, fewest=ROWS)
+    over_range(_mix, len(light), rules, signal.spans, signal.light, past, source, change, guide, light, fewest=ROWS)
     return Signal(guide, light, signal.spans)
 
 
@@ -206,22 +212,22 @@ def _compare(y0, y1, guide, spans, light, past, source, out):  # type: ignore[no
 
 
 @njit
-def _mix(y0, y1, least, spans, light, past, source, change, guide, out):  # type: ignore[no-untyped-def]
+def _mix(y0, y1, rules, spans, light, past, source, change, guide, out):  # type: ignore[no-untyped-def]
     for y in range(y0, y1):
         for c in range(spans[y, 0] + PAD, spans[y, 1] + PAD):
-            mix_pixel(y, c, least, light, past, source, change, guide, out)
+            mix_pixel(y, c, rules, light, past, source, change, guide, out)
 
 
 @njit
-def mix_pixel(y, c, least, light, past, source, change, guide, out):  # type: ignore[no-untyped-def]
+def mix_pixel(y, c, rules, light, past, source, change, guide, out):  # type: ignore[no-untyped-def]
     """Kalman's update of a pixel: its light mixed with the reprojected past; one that holds no number takes the past.
 
     Parameters
     ----------
     y, c : int64
         Row, and column, `PAD` counted.
-    least : (2,) float32 array
-        `least_gain`.
+    rules : (3,) float32 array
+        `mixture_rules`.
     light, past : (h, planes, w + 2 PAD) float32 array
         Light of this frame and of the past, see `Signal` and `warp`.
     source : (h, w + 2 PAD) float32 array
@@ -242,8 +248,11 @@ def mix_pixel(y, c, least, light, past, source, change, guide, out):  # type: ig
         if known and usable:
             error = change[y, PAST + lobe, c] + change[y, BIAS + lobe, c]
             whole = error + change[y, NOW + lobe, c]
-            gain = max(error / whole, least[lobe]) if whole > ZERO else ONE
-            gain = ONE - (ONE - gain) * past[y, CERTAINTY + lobe, c]
+            gain = max(error / whole, rules[lobe]) if whole > ZERO else ONE
+            kept = past[y, CERTAINTY + lobe, c]
+            if lobe == 1:
+                kept *= part_kept(rules[2], guide[y, ROUGHNESS, c])
+            gain = ONE - (ONE - gain) * kept
         elif known:
             gain = ZERO
         rest = ONE - gain

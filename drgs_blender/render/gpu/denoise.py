@@ -11,7 +11,7 @@ from ...compute.warp.kernels import Launcher
 from ..denoise.demodulation import GUIDES, LEVELS, PAD, Signal, planes_of
 from ..denoise.svgf_residual import TERMS
 from ..denoise.svgf_spatial import sigma_of
-from ..denoise.svgf_temporal import CHANGES, NoisyPicture, least_gain
+from ..denoise.svgf_temporal import CHANGES, NoisyPicture, mixture_rules
 from .svgf_kernels import (
     A_TROUS,
     CLAMP,
@@ -89,7 +89,8 @@ def _accumulate(launcher: Launcher, history: Signal, signal: DeviceSignal, pictu
     now = signal.guide, signal.spans, signal.light
     launcher.launch(COMPARE, pixels, (still, *now, past, source), (change,))
     seen = signal.spans, signal.light, past, source, change
-    launcher.launch(MIX, pixels, (least_gain(still), *seen), (signal.guide, mixed))
+    rules = mixture_rules(still, picture.world_turn)
+    launcher.launch(MIX, pixels, (rules, *seen), (signal.guide, mixed))
     signal.light = mixed
 
 

@@ -185,7 +185,7 @@ def compare_pixels(
 
 
 def mix_pixels(
-    thread: Any, stride: Any, scratch: Any, least: Any, spans: Any, light: Any, past: Any, source: Any, change: Any,
+    thread: Any, stride: Any, scratch: Any, rules: Any, spans: Any, light: Any, past: Any, source: Any, change: Any,
     out: Any,
 ) -> None:  # fmt: skip
     """`svgf_temporal._mix`."""
@@ -194,7 +194,7 @@ def mix_pixels(
     for pixel in range(thread, h * w, stride):
         y, x = pixel // w, pixel % w
         if x >= spans[y, 0] and x < spans[y, 1]:
-            mix_pixel(y, x + PAD, least, light, past, source, change, guide, mixed)
+            mix_pixel(y, x + PAD, rules, light, past, source, change, guide, mixed)
 
 
 def weigh_pixels(thread: Any, stride: Any, scratch: Any, sigma: Any, guide: Any, spans: Any, out: Any) -> None:
