@@ -91,7 +91,7 @@ class FractionBar:
         self._span = span
         layout = "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
         self._bar = bar(args, label, total=1.0, bar_format=layout)
-        self._counted = False
+        self._counted, self._furthest = False, 0.0
         self._for_programs = programs and lines_wanted(args)
         self._for_people = self._bar.disable and not args.quiet and args.progress is None
         self._every = every
@@ -111,9 +111,9 @@ class FractionBar:
             emit('DRGS_PROGRESS part=1.000 phase="Ready"\n', sys.stdout)
 
     def __call__(self, phase: str, fraction: float) -> None:
-        """Show what is being done and the part of it that is done, in [0, 1]."""
+        """Show what is being done and the part of it that is done, in [0, 1]; a second try takes nothing back."""
         if not is_counted(phase):
-            fraction = self.of_all(fraction)
+            fraction = self._furthest = max(self._furthest, self.of_all(fraction))
         if is_counted(phase) != self._counted:  # it has a bar of its own
             self._counted = is_counted(phase)
             self._bar.reset()

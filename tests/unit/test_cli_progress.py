@@ -66,6 +66,14 @@ def test_without_a_terminal_long_work_says_how_far_it_is(capsys):
     assert capsys.readouterr().err.splitlines() == ["drgs: matching features, 40% of all"]
 
 
+def test_a_second_try_takes_nothing_back(capsys):
+    with FractionBar(options(), "capturing", every=1e-9) as bar:
+        for part in (0.59, 0.54, 0.6):
+            bar("matching features", part)
+    said = [line.rsplit(" ", 3)[1] for line in capsys.readouterr().err.splitlines()]
+    assert said == ["59%", "59%", "60%"]
+
+
 def test_programs_read_it_with_its_fraction(capsys, monkeypatch):
     monkeypatch.setattr(progress, "PROGRAM_SECONDS", 0.0)
     with FractionBar(options(progress=False), "preparing", programs=True) as bar:

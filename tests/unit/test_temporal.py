@@ -8,7 +8,8 @@ import pytest
 from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.frame import Camera, RenderSettings
 from drgs_blender.render.camera import camera_parameters, camera_ray
-from drgs_blender.render.denoise.demodulation import LIGHT, PAD, SOURCE, Signal
+from drgs_blender.render.denoise import svgf_window
+from drgs_blender.render.denoise.demodulation import LIGHT, PAD, SOURCE, VARIANCE, Signal
 from drgs_blender.render.denoise.kept_light import SETTLED, to_trace
 from drgs_blender.render.denoise.svgf_spatial import prepare
 from drgs_blender.render.denoise.svgf_temporal import (
@@ -362,6 +363,16 @@ def test_window_gathers_five_frames_of_what_moves() -> None:
     truth = 2.0 * guides[2].albedo[:, 16:-16, 0]
     assert np.abs(both - truth).mean() < 0.62 * np.abs(alone[0] - truth).mean()
     assert abs((both / truth).mean() - 1) < 0.01
+
+
+def test_the_variance_that_a_window_reports_is_the_one_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    gathered: list[Signal] = []
+    monkeypatch.setattr(svgf_window, "smooth", lambda signal, check: gathered.append(signal) or signal.light)
+    guides = wall()
+    window([picture(guides, 2.0, 0.5, k, still(guides)) for k in range(5)])
+    (signal,) = gathered
+    reported = signal.light[:, VARIANCE, PAD : PAD + W].mean()
+    assert abs(reported / diffuse(signal).var() - 1) < 0.15
 
 
 def test_window_does_not_lag() -> None:
