@@ -367,7 +367,7 @@ def test_window_gathers_five_frames_of_what_moves() -> None:
 
 def test_the_variance_that_a_window_reports_is_the_one_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
     gathered: list[Signal] = []
-    monkeypatch.setattr(svgf_window, "smooth", lambda signal, check: gathered.append(signal) or signal.light)
+    monkeypatch.setattr(svgf_window, "smooth", lambda signal, check: gathered.append(signal) or signal)
     guides = wall()
     window([picture(guides, 2.0, 0.5, k, still(guides)) for k in range(5)])
     (signal,) = gathered
