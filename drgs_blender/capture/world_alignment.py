@@ -20,16 +20,18 @@ _LEVEL = 0.766
 _TRIALS, _THICKNESS = 2000, 0.012
 #: Part of the points within a camera's distance that the ground must have; part that may lie below it.
 _GROUND, _BELOW = 0.12, 0.06
-#: Most distance of its points from the ground in the median, in parts of `_THICKNESS`. A slab through matter has 0.5.
-_FLAT = 0.3
-#: Most distance of cameras from the plane of a circle that a turntable made, in parts of its radius (root mean square);
-#: least cosine between its normal and up as the cameras were held, 20 degrees.
-_ROUND, _UPRIGHT = 0.015, 0.94
+#: A slab through an object's foot is no ground: its points are further from the plane, in the median and in parts of
+#: `_THICKNESS` (0.5 where they fill it), than the first, and it is thicker against its width than the second.
+_FLAT, _WIDE = 0.3, 0.08
+#: Cameras before a turntable: how many at least; most difference (root mean square) between the directions in which
+#: they see its axis, radians; most length of the mean of directions across it, which cameras within 127 degrees exceed;
+#: least cosine between the axis and up as the cameras were held, 20 degrees.
+_CAMERAS, _ALIKE, _AROUND, _UPRIGHT = 8, 0.03, 0.8, 0.94
 #: What the ground rests on: points on it; the lower end of all points; nothing but the cameras.
 PLANE, LOWEST, GUESSED = "plane under the object", "lowest points", "what the cameras look at"
 #: What up rests on without a plane: phones' accelerometers; how people hold cameras; nothing.
 MEASURED = "gravity, as the phone measured it"
-CIRCLE = "the circle in which the cameras stand"
+TURNTABLE = "the axis about which the cameras turn, as before a turntable"
 HELD, UNKNOWN_UP = "how the cameras were held", "nothing: the cameras were held in all ways"
 
 
@@ -60,7 +62,7 @@ class Alignment:
         found = {}
         if self.scale_from.startswith(_UNKNOWN):
             found["scale"] = self.scale_from
-        if self.up_from in (CIRCLE, HELD, UNKNOWN_UP):
+        if self.up_from in (TURNTABLE, HELD, UNKNOWN_UP):
             found["up"] = self.up_from
         if self.ground_from in (LOWEST, GUESSED):
             found["ground"] = self.ground_from
@@ -143,8 +145,8 @@ def align_to_ground(found: Registration, distance: float | None = None, up: Arra
         held = direction_up(matrices)
         up_from = UNKNOWN_UP if held is None else HELD
         up = np.array([0.0, 0.0, 1.0]) if held is None else held
-        if held is not None and (axis := circle_axis(centres)) is not None and abs(axis @ held) > _UPRIGHT:
-            up, up_from = axis * np.sign(axis @ held), CIRCLE
+        axis = None if held is None else turntable_axis(matrices, up)
+        up, up_from = (up, up_from) if axis is None else (axis, TURNTABLE)
     near = found.points[np.linalg.norm(found.points - centre, axis=1) < away] if len(found.points) else found.points
     plane = ground_plane(near, centres, up, away)
     if plane is not None:
@@ -179,26 +181,26 @@ def look_at(matrices: Array) -> Array:
     return point
 
 
-def circle_axis(centres: Array) -> Array | None:
-    """(3,) axis of the circle in which cameras (n, 3) stand, as before a turntable; None where they stand in none.
+def turntable_axis(matrices: Array, up: Array) -> Array | None:
+    """(3,) the direction about up that cameras (n, 4, 4) see alike, as before a turntable; None where there is none.
 
-    People who walk about an object leave the plane of a circle by several hundredths of its radius.
+    Cameras that people hold differ by several degrees.
     """
-    from_middle = centres - centres.mean(axis=0)
-    _, values, vt = np.linalg.svd(from_middle, full_matrices=False)
-    if len(centres) < 8 or values[1] < 0.3 * values[0]:
+    rotations = matrices[:, :3, :3]
+    _, lengths, vt = np.linalg.svd(rotations.mean(axis=0).T)
+    axis = vt[0] if vt[0] @ up > 0 else -vt[0]
+    if len(matrices) < _CAMERAS or lengths[1] > _AROUND or axis @ up < _UPRIGHT:
         return None
-    # Three unknowns of the plane; a whole circle has half the square of its radius along each of its axes.
-    off = values[2] / np.sqrt(len(centres) - 3)
-    return vt[2] if off < _ROUND * values[0] * np.sqrt(2 / len(centres)) else None
+    seen = axis @ rotations
+    return axis if np.sqrt(((seen - seen.mean(axis=0)) ** 2).sum(axis=1).mean()) < _ALIKE else None
 
 
 def ground_plane(points: Array, cameras: Array, up: Array, away: float) -> tuple[Array, float] | None:
     """(normal, offset) of the plane on which the object stands; points on it have ``point @ normal == offset``.
 
     RANSAC (Fischler and Bolles 1981) over planes about level that have all cameras above and few points below; the one
-    with most points, refined by least squares. None where its points fill a slab instead of lying in a plane, as those
-    of an object's foot do.
+    with most points, refined by least squares. None where these fill a slab that is not wide either, as those of an
+    object's foot do; grass is thick, and wide.
 
     Parameters
     ----------
@@ -243,9 +245,11 @@ def ground_plane(points: Array, cameras: Array, up: Array, away: float) -> tuple
         offset = float(middle @ normal)
         off = np.abs(points @ normal - offset)
         limit = max(0.3 * limit, 2.5 * float(np.median(off[off < limit])))
-    off = np.abs(points @ normal - offset)
-    thickness = _THICKNESS * away
-    return (normal, offset) if np.median(off[off < thickness]) < _FLAT * thickness else None
+    heights = points @ normal - offset
+    slab = np.abs(heights) < _THICKNESS * away
+    across = np.linalg.svd(points[slab] - points[slab].mean(axis=0), compute_uv=False)
+    flat = np.median(np.abs(heights[slab])) < _FLAT * _THICKNESS * away
+    return (normal, offset) if flat or across[2] < _WIDE * across[1] else None
 
 
 def _turn_to_z(up: Array) -> Array:

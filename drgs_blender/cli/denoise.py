@@ -164,7 +164,7 @@ class _Source:
         around = [self._path(k) for k in range(number - self._reach, number + self._reach + 1)]
         if absent := [str(path) for path in around if path is not None and not path.is_file()]:
             problem = "does not exist, but --sequence names it" if len(absent) == 1 else "are named by --sequence alone"
-            remedy = f"Frame {number} needs them: render them first, or shorten --sequence"
+            remedy = f"Render what frame {number} needs, or shorten --sequence"
             raise AssetError(", ".join(absent), problem, remedy)
         return [None if path is None else k for k, path in enumerate(around, number - self._reach)]
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from ..core.arrays import same_bits
-from ..core.frame import Frame
+import numpy as np
+
+from ..core.arrays import Array, same_bits
+from ..core.frame import Frame, World
+from ..geometry.normals import rotation_between
 from ..ipc.change_detection import reuse_equal
 from ..render.camera import camera_parameters
 from ..render.denoise.svgf_temporal import History
@@ -34,6 +37,8 @@ class Sequence:
         All that decides what a picture shows; the same objects (``is``) as long as nothing changed.
     pictures : int
         How many have gone into the history.
+    world : (3, 3) array, optional
+        Rotation of the environment in the last picture.
     """
 
     history: History = field(default_factory=History)
@@ -41,6 +46,7 @@ class Sequence:
     fit: tuple[Any, ...] = ()
     situation: tuple[Any, ...] = (None, None)
     pictures: int = 0
+    world: Array | None = None
 
 
 class Histories:
@@ -90,7 +96,8 @@ class Histories:
         turned = turned and all(a is b for a, b in zip(situation[1:], old.situation[1:]))
         past = old.history
         ages = past.ages if turned else None
-        history = History(past.signal, scene_state, still, turned, old.pictures, ages, past.world)
+        turn = 0.0 if still else world_turn(old.world, frame.world)
+        history = History(past.signal, scene_state, still, turned, old.pictures, ages, turn)
         return Sequence(history, old.past, fit, situation, old.pictures)
 
     def store(self, frame: Frame, sequence: Sequence, prepared: PreparedScene) -> None:
@@ -103,8 +110,16 @@ class Histories:
             prepared.unmeshed,
         )
         sequence.history.scene_state = None  # the scene's arrays are for this picture only
+        sequence.world = np.array(frame.world.rotation, np.float64).reshape(3, 3)
         sequence.pictures += 1
         self._known.pop(frame.history, None)
         self._known[frame.history] = sequence
         while len(self._known) > MAX_HISTORIES:
             del self._known[next(iter(self._known))]
+
+
+def world_turn(before: Array | None, world: World) -> float:
+    """Angle by which the environment has turned since its rotation `before`, radians; 0 where there is no image."""
+    if before is None or world.environment is None or not world.strength:
+        return 0.0
+    return rotation_between(before, np.asarray(world.rotation, np.float64).reshape(3, 3))

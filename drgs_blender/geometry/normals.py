@@ -254,14 +254,17 @@ def rotation_matrices(quaternions: Array) -> Array:
 
 
 def rotation_between(first: Array, second: Array) -> float:
-    """Angle of the rotation that leads from one (3, 3) rotation to another, radians.
+    """Angle of the rotation that leads from one (3, 3) rotation to another, radians; 0 between equal ones.
+
+    Matrices that scale, too, count as the rotations in them.
 
     Examples
     --------
     >>> round(rotation_between(np.diag([1.0, -1.0, -1.0]), np.diag([1.0, 1.0, 1.0])), 4)
     3.1416
     """
-    return float(np.arccos(np.clip((np.trace(first.T @ second) - 1) / 2, -1, 1)))
+    a, b = (np.asarray(m, np.float64) * np.sqrt(3) / np.linalg.norm(m) for m in (first, second))
+    return float(2 * np.arcsin(min(np.linalg.norm(a - b) / np.sqrt(8), 1.0)))
 
 
 def quaternions(matrices: Array) -> Array:

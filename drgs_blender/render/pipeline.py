@@ -18,7 +18,6 @@ from ..core.errors import Cancelled, UsageError
 from ..core.frame import Camera, Frame
 from ..core.memory import give_back
 from ..core.passes import BY_NAME, pass_of
-from ..geometry.normals import rotation_between
 from .backend import CPU, RenderBackend
 from .camera import camera_parameters
 from .denoise.catchers import smooth_catchers
@@ -182,15 +181,13 @@ def render(
         components = denoised(film, frame, check, backend)
     else:
         smooth_catchers(seen.catcher, film.catchers, check)
-        world_turn = 0.0 if history.world is None else rotation_between(history.world, frame.world.rotation)
-        picture = NoisyPicture(seen.components, seen.variance, film.guides(), motions[2], world_turn)
+        picture = NoisyPicture(seen.components, seen.variance, film.guides(), motions[2], history.world_turn)
         components, signal = backend.denoise_next(
             picture, history.signal, split_light(frame), history.still, check, history.turned
         )
     report(1.0, "Done")
     if history is not None:
         history.signal, history.ages = signal, None if kept is None else ages
-        history.world = frame.world.rotation
     before, after = motions[:2]
     made = {name: values for matte in mattes for name, values in matte.passes().items()}
     made |= surfaces.passes()

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
+from scipy.spatial.transform import Rotation
 
 from drgs_blender.capture import capture_folder, features, libraries, pipeline, soundness
 from drgs_blender.capture.features import Photo, extract, pairs
@@ -18,13 +19,13 @@ from drgs_blender.capture.pipeline import Settings, make_capture
 from drgs_blender.capture.preparation import Prepared
 from drgs_blender.capture.registration import Registration, register
 from drgs_blender.capture.world_alignment import (
-    CIRCLE,
     LOWEST,
+    TURNTABLE,
     align_to_ground,
     align_to_markers,
-    circle_axis,
     ground_plane,
     similarity,
+    turntable_axis,
 )
 from drgs_blender.core.errors import AssetError, Cancelled, DeviceError, UsageError, WriteError
 from drgs_blender.reconstruct.readers import read_capture
@@ -144,19 +145,49 @@ def test_a_slab_through_the_foot_of_an_object_is_no_ground():
     found = moved(registration(cameras, statue), 0.2, 2)
     alignment = align_to_ground(found)
     alignment.apply(found)
-    assert (alignment.up_from, alignment.ground_from) == (CIRCLE, LOWEST) and "up" in alignment.guessed
+    assert (alignment.up_from, alignment.ground_from) == (TURNTABLE, LOWEST) and "up" in alignment.guessed
     heights = np.stack([matrix[2, 3] for matrix in found.matrices.values()])
     assert np.ptp(heights) < 1e-6
     assert found.points[:, 2].min() == pytest.approx(0.0, abs=0.01)
 
 
-def test_cameras_carried_around_an_object_stand_in_no_circle():
+def posed(count: int, tilt: float = 0.0, jitter: float = 0.0, elevation: float = 0.3) -> np.ndarray:
+    """(n, 4, 4) cameras around the origin; `tilt` of their circle, held upright all the same, and jitter, degrees."""
     random = np.random.default_rng(1)
-    angle = np.linspace(0, 2 * np.pi, 30, endpoint=False)
-    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(30)])
-    assert abs(circle_axis(ring)[2]) == pytest.approx(1.0)
-    for centres in (ring + 0.04 * random.normal(size=ring.shape), ring[:6], ring * [1, 0.1, 1]):
-        assert circle_axis(centres) is None
+    lean = Rotation.from_euler("x", tilt, degrees=True).as_matrix()
+    found = []
+    for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
+        eye = lean @ np.array([0.5 * np.cos(angle), 0.5 * np.sin(angle), elevation])
+        pose = towards(eye, roll=np.radians(jitter) * random.normal())
+        pose[:3, :3] = Rotation.from_rotvec(np.radians(jitter) * random.normal(size=3)).as_matrix() @ pose[:3, :3]
+        found.append(pose)
+    return np.stack(found)
+
+
+def test_only_cameras_before_a_turntable_see_its_axis_alike():
+    up = np.array([0, 0, 1.0])
+    lying = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    for held in (up, [0, 0.2, 0.98]):
+        np.testing.assert_allclose(turntable_axis(posed(17), np.array(held)), up, atol=1e-9)
+        np.testing.assert_allclose(turntable_axis(posed(17, elevation=-0.3), np.array(held)), up, atol=1e-9)
+    assert turntable_axis(posed(24, tilt=10), up) is None  # each held upright on a circle that is not level
+    assert turntable_axis(posed(24, jitter=3), up) is None  # carried by hand
+    assert turntable_axis(posed(7), up) is None
+    assert turntable_axis(posed(24)[:6], up) is None  # from one side
+    sideways = posed(17)
+    sideways[:, :3, :3] = lying @ sideways[:, :3, :3]
+    assert turntable_axis(sideways, up) is None
+
+
+@pytest.mark.parametrize("thick", [0.001, 0.01, 0.03])
+def test_grass_is_ground(thick):
+    random = np.random.default_rng(7)
+    grass = np.column_stack([2 * random.random((4000, 2)) - 1, thick * random.random(4000)])
+    statue = np.column_stack([0.1 * random.normal(size=(500, 2)), 0.3 * random.random(500)])
+    cameras = posed(24)[:, :3, 3] * 2
+    points = np.concatenate([grass, statue])
+    found = ground_plane(points[np.linalg.norm(points, axis=1) < 1], cameras, np.array([0, 0.1, 0.99]), 1.0)
+    assert found is not None and found[0][2] > np.cos(np.radians(0.3)) and -0.001 < found[1] < thick
 
 
 def test_a_wall_is_no_ground():

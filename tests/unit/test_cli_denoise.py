@@ -108,6 +108,13 @@ def test_chunks_give_the_same_files(denoise, tmp_path):
     assert files(tmp_path / "down") == whole
 
 
+def test_it_says_where_frames_lie_as_whole_paths(rendered, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for said in ("Saved: '", "skipping existing frame '"):
+        assert main(["denoise", str(rendered / "noisy" / "####.exr"), "--frames", "2", "--out", "here/####.exr"]) == 0
+        assert f"{said}{tmp_path / 'here' / '0002.exr'}'" in capsys.readouterr().out
+
+
 def test_neighbours_take_noise_away(denoise, rendered, tmp_path):
     denoise("3-4")
     denoise("3-4", "--window", "1", out="alone")

@@ -28,8 +28,8 @@ TILE, PAD = 128, 2 << (LEVELS - 1)
 #: Planes of a guide. ``SURFACE`` is the object's number, NaN where nothing is covered; ``SOURCE`` the same, and NaN
 #: where the light is no number, too. ``WIDTH`` is the inverse width of a pixel, 1/m.
 POSITION, NORMAL, ROUGHNESS, SOURCE, SURFACE, WIDTH, GUIDES = 0, 3, 6, 7, 8, 9, 10
-#: Planes of a signal, two lobes each: luminance, its variance, the inverse of the difference that counts (of light from
-#: another picture the part that does); the light.
+#: Planes of a signal, two lobes each: luminance; its variance; the inverse of the difference that counts, but of light
+#: warped from another picture the part of it that counts; the light.
 LUMINANCE, VARIANCE, CERTAINTY, LIGHT = 0, 2, 4, 6
 
 

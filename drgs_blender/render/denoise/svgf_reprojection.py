@@ -116,7 +116,8 @@ def part_kept(turn, roughness):  # type: ignore[no-untyped-def]
     float32
     """
     width = F(LOBES) * max(roughness, F(LEAST_ROUGHNESS)) * max(roughness, F(LEAST_ROUGHNESS))
-    return F(math.exp(-turn / (width * width)))
+    kept = F(math.exp(-turn / (width * width)))
+    return kept if kept > ZERO else ZERO  # a roughness that is no number keeps none
 
 
 @njit
@@ -180,8 +181,10 @@ def look_up_pixel(y, x, guide, vector, expected, other, other_light, out, source
         here = nx * nx + ny * ny + nz * nz
         there = there_x * there_x + there_y * there_y + there_z * there_z
         both = nx * there_x + ny * there_y + nz * there_z
-        # Reflections turn by twice a small angle t between normals, whose square is 8 (1 - cos t). What has not moved
-        # has not turned, though its normals, means over a pixel's samples, differ a little.
-        turn = F(8.0) * max(ONE - both / F(math.sqrt(max(here * there, F(1e-12)))), ZERO)
+        # Reflections turn by twice a small angle t between normals, whose square is 8 (1 - cos t). By what four pixels
+        # differ, which shortens their mean, a bumpy surface seems turned that only went on. Normals of what stands,
+        # means over a pixel's samples, differ a little, too.
+        spread = max(ONE - there * inverse * inverse / max(here, F(1e-12)), ZERO)
+        turn = F(8.0) * max(ONE - spread - both / F(math.sqrt(max(here * there, F(1e-12)))), ZERO)
         out[y, CERTAINTY, c] = ONE
         out[y, CERTAINTY + 1, c] = part_kept(turn, guide[y, ROUGHNESS, c]) if moved > F(STOOD * STOOD) else ONE

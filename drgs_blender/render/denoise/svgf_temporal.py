@@ -59,7 +59,7 @@ class NoisyPicture:
     """One noisy picture as a frame file holds it; see `svgf_spatial.denoise` for the arrays.
 
     ``motion`` leads to the frame before, None where there is none; ``world_turn`` is the angle by which the environment
-    turned since then, radians.
+    turned since then, radians, which `svgf_window` does not use: frame files do not hold it.
     """
 
     components: Array
@@ -87,8 +87,8 @@ class History:
         How many have gone into it.
     ages : (h, w) uint8 array, optional
         How many into each pixel, see `kept_light.to_trace`; None: not known.
-    world : (3, 3) array, optional
-        Rotation of the environment in the last picture.
+    world_turn : float
+        See `NoisyPicture`.
     """
 
     signal: Signal | None = None
@@ -97,7 +97,7 @@ class History:
     turned: bool = False
     pictures: int = 0
     ages: Array | None = None
-    world: Array | None = None
+    world_turn: float = 0.0
 
 
 def denoise_next(
@@ -144,7 +144,7 @@ def denoise_next(
 
 def mixture_rules(still: bool, world_turn: float) -> Array:
     """(3,) float32: least weight of the present, diffuse and glossy; square of `NoisyPicture.world_turn`."""
-    return np.array([*((0.0, 0.0) if still else LEAST_GAIN), world_turn * world_turn], np.float32)
+    return np.array([0.0, 0.0, 0.0] if still else [*LEAST_GAIN, world_turn * world_turn], np.float32)
 
 
 def accumulate(history: Signal, signal: Signal, motion: Motion, still: bool = False, world_turn: float = 0.0) -> Signal:
