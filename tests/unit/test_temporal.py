@@ -466,15 +466,14 @@ def test_reflections_that_glide_are_left_and_broad_lobes_gathered(over: str, rou
     assert errors[0] < (1.05 if stripes else 0.9) * errors[1] and errors[1] < 0.02
 
 
-def part_kept_of(guides: Guides, before: Guides, moved_by: float = 0.01, shift: float = 0.0) -> np.ndarray:
+def part_kept_of(guides: Guides, before: Guides, moved_by: float = 0.01) -> np.ndarray:
     """(2, h, w): part of the light of a picture before that counts, diffuse and glossy, on a wall that moved (m)."""
     now, then = (
         prepare(p.components, p.variance, p.guides, True) for p in (picture(g, 1.0, 0.0, 0) for g in (guides, before))
     )
     expected = guides.position - np.array([0, moved_by, 0], np.float32)
     then.guide[:, POSITION + 1] -= moved_by
-    vector = np.broadcast_to(np.array([shift, 0.0], np.float32), (H, W, 2)).copy()
-    light, _ = warp(then, now, vector, expected.astype(np.float32))
+    light, _ = warp(then, now, np.zeros((H, W, 2), np.float32), expected.astype(np.float32))
     return light[8:-8, CERTAINTY : CERTAINTY + 2, PAD + 8 : PAD + W - 8].swapaxes(0, 1)
 
 
@@ -492,8 +491,8 @@ def test_what_is_kept_of_glossy_light_falls_with_the_turn_in_widths_of_the_lobe(
         assert (diffuse_part == 1).all()
 
 
-def test_what_stands_still_has_not_turned_and_bumps_that_go_on_hardly() -> None:
-    """Normals of still surfaces jitter with the samples; of moving bumps those of four pixels are mixed."""
+def test_what_stands_still_has_not_turned() -> None:
+    """Though its normals, means over a pixel's samples, jitter."""
     random = np.random.default_rng(2)
 
     def bumpy() -> Guides:
@@ -503,10 +502,9 @@ def test_what_stands_still_has_not_turned_and_bumps_that_go_on_hardly() -> None:
         guides.normal[:] = normal / np.linalg.norm(normal, axis=2, keepdims=True)
         return guides
 
-    one = bumpy()
-    assert (part_kept_of(one, bumpy(), moved_by=0.0) == 1).all()
-    mixed, other = (part_kept_of(one, there, shift=0.5)[1].mean() for there in (one, bumpy()))
-    assert mixed > 0.75 and other < 0.7
+    one, other = bumpy(), bumpy()
+    assert (part_kept_of(one, other, moved_by=0.0) == 1).all()
+    assert (part_kept_of(one, other)[1] < 1).all()
 
 
 def test_a_roughness_that_is_no_number_spoils_its_own_picture_alone() -> None:

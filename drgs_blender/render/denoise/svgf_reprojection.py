@@ -181,10 +181,9 @@ def look_up_pixel(y, x, guide, vector, expected, other, other_light, out, source
         here = nx * nx + ny * ny + nz * nz
         there = there_x * there_x + there_y * there_y + there_z * there_z
         both = nx * there_x + ny * there_y + nz * there_z
-        # Reflections turn by twice a small angle t between normals, whose square is 8 (1 - cos t). By what four pixels
-        # differ, which shortens their mean, a bumpy surface seems turned that only went on. Normals of what stands,
-        # means over a pixel's samples, differ a little, too.
-        spread = max(ONE - there * inverse * inverse / max(here, F(1e-12)), ZERO)
-        turn = F(8.0) * max(ONE - spread - both / F(math.sqrt(max(here * there, F(1e-12)))), ZERO)
+        # Reflections turn by twice a small angle t between normals, whose square is 8 (1 - cos t). Normals of what
+        # stands, means over a pixel's samples, differ a little, too; so do moving bumps of a pixel's width, which lose
+        # some of their history.
+        turn = F(8.0) * max(ONE - both / F(math.sqrt(max(here * there, F(1e-12)))), ZERO)
         out[y, CERTAINTY, c] = ONE
         out[y, CERTAINTY + 1, c] = part_kept(turn, guide[y, ROUGHNESS, c]) if moved > F(STOOD * STOOD) else ONE
