@@ -165,6 +165,7 @@ def compared(options: argparse.Namespace, sequence: Sequence) -> list[tuple[str,
     """Rows of one sequence, ours and those of Cycles."""
     frames, vectors = sequence.frames, sequence.vectors
     noisy, windows, coverage = in_windows(frames)
+    _, doubled, _ = in_windows([replace(f, settings=replace(f.settings, samples=2 * options.samples)) for f in frames])
     # As many positions as there can be: those of few differ from frame to frame, which is flicker of ours.
     truth, again = (
         np.stack(rendered(frames, samples=options.reference, subpixel_samples=64, seed=seed)) for seed in (1000, 2000)
@@ -176,6 +177,7 @@ def compared(options: argparse.Namespace, sequence: Sequence) -> list[tuple[str,
         "SVGF, each frame alone": rendered(frames, denoise="svgf"),
         "SVGF, over time": rendered(frames, sequence.name, denoise="svgf"),
         "SVGF, window of 5": windows,
+        f"SVGF, window of 5, {2 * options.samples} samples": doubled,
     }
     if available():
         ways["OIDN, each frame alone"] = rendered(frames, denoise="oidn")
@@ -222,8 +224,9 @@ def main() -> None:
             f"is the difference from {options.reference} rays at 64 places of a pixel, and of the picture itself, "
             "which in a converged sequence is what moves, and blur lowers. Points that moved lie between pixels, whose "
             "mean they get: noise of single pixels flickers less by that, what is denoised hardly. PSNR: against "
-            f"{options.reference} rays, foreground, sRGB, from the third frame on. Cycles: as many samples a pixel, "
-            "against its own converged sequence.\n\n" + table(columns, rows)
+            f"{options.reference} rays, foreground, sRGB, from the third frame on. Cycles: {options.samples} samples, "
+            f"each two rays at a surface, as many as {2 * options.samples} samples of ours, against its own converged "
+            "sequence.\n\n" + table(columns, rows)
         )
         write_section(section, title, body)
 

@@ -153,7 +153,12 @@ class Reference:
         return cls(picture, foreground((picture[..., 3] > alpha).astype(np.float32)))
 
 
+def converged(case: Case, size: int, rays: int) -> Reference:
+    """Our converged picture; its seed is none that is measured."""
+    return Reference.of(case.picture(size, rays, 1000, subpixel_samples=REFERENCE_AA)[0])
+
+
 @cache
 def our_reference(case: Case, plan: Plan) -> Reference:
-    """Our converged picture; its seed is none that is measured."""
-    return Reference.of(case.picture(plan.size, plan.reference_rays, 1000, subpixel_samples=REFERENCE_AA)[0])
+    """`converged`, once."""
+    return converged(case, plan.size, plan.reference_rays)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
-from light_cases import TINY, Case, Reference
-from light_variance import chosen, cycles, reference_of, series
+from light_cases import TINY, Case, Reference, converged
+from light_variance import chosen, cycles, series
 from noise import Series
 from report import table
 
@@ -33,7 +33,7 @@ def frames(options: argparse.Namespace) -> str:
     counts, spp = tuple(options.frames_samples), tuple(options.frames_spp)
     rows, verdicts = [], []
     for size in options.frames_size:
-        references = [reference_of(case, size, options) for case in cases]
+        references = [converged(case, size, options.reference_rays) for case in cases]
         own = [ours(case, size, seeds, counts, reference) for case, reference in zip(cases, references, strict=True)]
         theirs = cycles(cases, size, seeds, spp, references, "seconds")
         found = {of: np.array([ratios(a, b, of) for a, b in zip(own, theirs, strict=True)]) for of in MEASURES}

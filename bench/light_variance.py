@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from judge import decibels, run_cycles, to_srgb
-from light_cases import FOLDER, TINY, Case, Plan, Reference, our_reference
+from light_cases import FOLDER, TINY, Case, Reference, converged
 from light_scenes import EVERY, SHARED, Scene
 from noise import EPSILON, Noise, Series
 from report import table
@@ -46,13 +45,11 @@ def chosen(options: argparse.Namespace) -> list[Case]:
     return cases
 
 
-def reference_of(case: Case, size: int, options: argparse.Namespace) -> Reference:
-    """For both programs: of none of the pictures that are judged, whose bright dots would lower their own weight."""
-    return our_reference(case, replace(Plan.of(options), size=size))
-
-
 def series(tiny: list[float], found: dict[int, list[tuple[Array, float]]], reference: Reference) -> Series:
-    """Of the seconds of tiny pictures, and by number of samples the pictures that differ by their seed with theirs."""
+    """Of the seconds of tiny pictures, and by number of samples the pictures that differ by their seed with theirs.
+
+    The reference is none of them: their bright dots would lower their own weight.
+    """
     noise = [noise_of(*map(list, zip(*pictures, strict=True)), reference) for pictures in found.values()]  # type: ignore[arg-type]
     return Series(tuple(found), noise, float(np.median(tiny)))
 
@@ -106,7 +103,7 @@ def variance(options: argparse.Namespace) -> str:
     """The part's text."""
     cases, size, seeds = chosen(options), options.cases_size, options.cases_seeds
     counts, spp = tuple(options.cases_samples), tuple(options.cases_spp)
-    references = [reference_of(case, size, options) for case in cases]
+    references = [converged(case, size, options.reference_rays) for case in cases]
     own = [ours(case, size, seeds, counts, reference) for case, reference in zip(cases, references, strict=True)]
     theirs = cycles(cases, size, seeds, spp, references) if spp else [None] * len(cases)
     rows, ratios, below = [], [], 0
