@@ -13,6 +13,7 @@ from drgs_blender.render.camera import camera_parameters, camera_ray
 from drgs_blender.render.denoise import svgf_window
 from drgs_blender.render.denoise.demodulation import CERTAINTY, LIGHT, PAD, POSITION, SOURCE, VARIANCE, Signal
 from drgs_blender.render.denoise.kept_light import SETTLED, to_trace
+from drgs_blender.render.denoise.svgf_reprojection import warp
 from drgs_blender.render.denoise.svgf_spatial import prepare
 from drgs_blender.render.denoise.svgf_temporal import (
     BIAS,
@@ -22,7 +23,6 @@ from drgs_blender.render.denoise.svgf_temporal import (
     NoisyPicture,
     denoise_next,
     find_change,
-    warp,
 )
 from drgs_blender.render.denoise.svgf_window import _neighbours, window
 from drgs_blender.render.film.guides import Guides

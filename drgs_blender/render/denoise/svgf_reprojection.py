@@ -102,7 +102,7 @@ def part_kept(turn, roughness):  # type: ignore[no-untyped-def]
     """Part of a surface's earlier glossy light that counts: less the further what it reflects turned.
 
     Reflections do not move with the surface: where dark and bright ones glide over it, the mean change around a pixel,
-    which `find_change` measures, may be none.
+    which `svgf_temporal.find_change` measures, may be none.
 
     Parameters
     ----------
